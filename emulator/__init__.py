@@ -1,0 +1,1 @@
+"""Evedrop: a network emulator for secrecy in remote state estimation."""

@@ -1,0 +1,63 @@
+"""What makes two runs comparable to the last bit: SHA-256 over all that a receiver received and believed.
+
+For each trial and each aligned block of 256 slots: over, slot by slot, γ (1 byte), x̂ (n) and P (n × n, row by row) as
+little-endian float64. A receiver's digest is that of its block digests, ordered by trial, then block.
+
+Source: docs/results.md, digests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from hashlib import sha256
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.receiver import Belief
+
+BLOCK_SLOTS = 256
+DIGEST_BYTES = 32
+_TILE = 64  # trials transposed at a time, so that a tile stays in the cache
+
+Digests = NDArray[np.uint8]
+
+
+class BlockDigester:
+    """Collects a receiver's beliefs and digests them block by block. Final; slots must be added in order from 0."""
+
+    def __init__(self, n: int, trials: int, slots: int) -> None:
+        length = min(BLOCK_SLOTS, slots)
+        self._slots = slots
+        self._gamma = np.empty((length, trials), np.uint8)
+        self._x_hat = np.empty((length, n, trials))
+        self._P = np.empty((length, n * n, trials))
+        self._record = np.dtype([("gamma", "u1"), ("x_hat", "<f8", (n,)), ("P", "<f8", (n * n,))])
+
+    def add(self, k: int, belief: Belief) -> Digests | None:
+        """Take slot k; at the end of a block, its digest for every trial, (R, 32)."""
+        row = k % BLOCK_SLOTS
+        np.not_equal(belief.action, 0, out=self._gamma[row], casting="unsafe")
+        self._x_hat[row] = belief.x_hat
+        self._P[row] = belief.P.reshape(self._P.shape[1:])
+        if row == BLOCK_SLOTS - 1 or k == self._slots - 1:
+            return self._digest(row + 1)
+        return None
+
+    def _digest(self, length: int) -> Digests:
+        trials = self._gamma.shape[1]
+        digests = np.empty((trials, DIGEST_BYTES), np.uint8)
+        for start in range(0, trials, _TILE):
+            tile = slice(start, min(start + _TILE, trials))
+            records = np.empty((tile.stop - start, length), self._record)
+            records["gamma"] = self._gamma[:length, tile].T
+            records["x_hat"] = self._x_hat[:length, :, tile].transpose(2, 0, 1)
+            records["P"] = self._P[:length, :, tile].transpose(2, 0, 1)
+            for row, record in enumerate(records, start):
+                digests[row] = np.frombuffer(sha256(record.data).digest(), np.uint8)
+        return digests
+
+
+def combined(blocks: Mapping[int, Digests]) -> str:
+    """A receiver's digest, hexadecimal, from its block digests (block number → (R, 32))."""
+    return sha256(np.stack([blocks[block] for block in sorted(blocks)], axis=1).tobytes()).hexdigest()

@@ -1,0 +1,24 @@
+"""The naive eavesdropper: takes every packet for the state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
+from emulator.model.receiver import Flags
+
+
+class Naive(Eavesdropper):
+    """b_k = 1 always; it is given nothing.
+
+    Source: the paper, naive eavesdropper.
+    """
+
+    @classmethod
+    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:  # noqa: ARG003 - it has none
+        """Certain for either type."""
+        return 1.0, 1.0
+
+    def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike
+        """Always."""
+        return None

@@ -1,0 +1,32 @@
+"""The smart eavesdropper: knows the schedule and never takes an innovation for the state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from emulator.model.receiver import Flags
+from emulator.model.schedule import Schedule
+from emulator.streams import Batch
+
+
+class Smart(Eavesdropper):
+    """b_k = 1 − ν_k; it is given the schedule. Its believed covariance is the true one.
+
+    Source: the paper, smart eavesdropper.
+    """
+
+    streams = ("schedule",)
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
+
+    @classmethod
+    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:  # noqa: ARG003 - it has none
+        """Every state, no innovation."""
+        return 1.0, 0.0
+
+    def uses(self, k: int) -> Flags | None:
+        """Where the packet is the state."""
+        return ~self._schedule.at(k)

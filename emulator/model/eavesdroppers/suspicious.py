@@ -1,0 +1,44 @@
+"""The suspicious eavesdropper: tells states from innovations, but not reliably."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from emulator.model.receiver import Flags
+from emulator.model.schedule import Schedule
+from emulator.streams import Batch, BlockReader
+
+
+class Suspicious(Eavesdropper):
+    """Uses a state with probability `use_state` (μ_b), an innovation with `use_innovation` (μ̄_b), by its own coin.
+
+    Source: the paper, suspicious eavesdropper.
+    """
+
+    streams = ("schedule", "coin")
+    parameters = ("use_state", "use_innovation")
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
+        self._use_state, self._use_innovation = self.use_probabilities(knowledge.parameters)
+        self._coins = BlockReader(knowledge.keys["coin"], batch, 1)
+        self._slots = range(0)
+
+    @classmethod
+    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:
+        """μ_b and μ̄_b."""
+        return parameters["use_state"], parameters["use_innovation"]
+
+    def uses(self, k: int) -> Flags | None:
+        """Where this slot's coin falls below the probability for the packet's type."""
+        if k not in self._slots:
+            self._slots = self._coins.block(k)
+            self._coin = self._coins.uniforms(self._slots)[:, 0, :]
+        used: Flags = self._coin[k - self._slots.start] < np.where(
+            self._schedule.at(k), self._use_innovation, self._use_state
+        )
+        return used

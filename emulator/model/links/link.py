@@ -1,0 +1,50 @@
+"""What a link model is: from random numbers to the fate of every packet. The router only carries fates out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from enum import IntEnum
+from typing import ClassVar
+
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes
+from emulator.streams import Batch, BlockReader
+
+
+class Fate(IntEnum):
+    """What becomes of a packet on a link."""
+
+    DELIVERED = 0
+    LOST = 1
+    """Erased by the link's loss model."""
+
+
+class LossModel(ABC):
+    """Decides fates from uniform numbers, for all trials at once."""
+
+    uniforms_per_slot: ClassVar[int] = 1
+
+    @abstractmethod
+    def fates(self, uniforms: Floats) -> Codes:
+        """`Fate` of each packet of the next slots, (slots, R), from uniforms (slots, uniforms_per_slot, R)."""
+
+
+class Link:
+    """The way from the router to one receiver: a loss model and its own random stream.
+
+    Final. Must be read slot by slot.
+    """
+
+    def __init__(self, loss: LossModel, key: bytes, batch: Batch) -> None:
+        self._loss = loss
+        self._reader = BlockReader(key, batch, loss.uniforms_per_slot)
+        self._slots = range(0)
+        self._fates: Codes
+
+    def at(self, k: int) -> Codes:
+        """`Fate` of slot k's packet in every trial, (R,)."""
+        if k not in self._slots:
+            self._slots = self._reader.block(k)
+            self._fates = self._loss.fates(self._reader.uniforms(self._slots))
+        fates: Codes = self._fates[k - self._slots.start]
+        return fates

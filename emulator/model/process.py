@@ -1,0 +1,257 @@
+"""The process x_{k+1} = A x_k + w_k, its checks, and its simulation over a batch of trials.
+
+Arrays of a batch have the trials as last axis: x is (n, R), P is (n, n, R). The two products below are elementwise over
+that axis, in a fixed order, so a trial's bits depend neither on the batch nor on the machine.
+
+Source: docs/mathematics.md, model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.elementary import Rows, cholesky, triangular_factor
+from emulator.streams import Batch, BlockReader
+
+Floats = NDArray[np.float64]
+
+UNIT_ROUNDOFF = 2.0**-53
+HORIZON_TOLERANCE = 0.01
+
+
+def product(M: Floats, x: Floats) -> Floats:
+    """M x for every trial: M (…, n, n), x (…, n, R) → (…, n, R)."""
+    y: Floats = M[..., :, 0, None] * x[..., None, 0, :]
+    for j in range(1, M.shape[-1]):
+        y = y + M[..., :, j, None] * x[..., None, j, :]
+    return y
+
+
+def congruence(M: Floats, P: Floats) -> Floats:
+    """M P Mᵀ for every trial: M (n, n), P (n, n, R) → (n, n, R)."""
+    n = M.shape[0]
+    left = M[:, 0, None, None] * P[0]
+    for j in range(1, n):
+        left = left + M[:, j, None, None] * P[j]
+    result: Floats = left[:, 0, None, :] * M[:, 0, None]
+    for j in range(1, n):
+        result = result + left[:, j, None, :] * M[:, j, None]
+    return result
+
+
+@dataclass(frozen=True)
+class Process:
+    """A (n, n), Q (n, n), initial_covariance Σ0 (n, n): what everybody, eavesdroppers too, may know of the process."""
+
+    A: Floats
+    Q: Floats
+    initial_covariance: Floats
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @cached_property
+    def spectral_radius(self) -> float:
+        """ρ(A): largest modulus of an eigenvalue of A."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.A))))
+
+    @cached_property
+    def _Q_column(self) -> Floats:
+        return self.Q[:, :, None]
+
+    def predict(self, x_hat: Floats) -> Floats:
+        """A x̂, (n, R)."""
+        return product(self.A, x_hat)
+
+    def carry(self, P: Floats) -> Floats:
+        """A P Aᵀ, (n, n, R): the covariance when w is known."""
+        return congruence(self.A, P)
+
+    def diffuse(self, carried: Floats) -> Floats:
+        """A P Aᵀ + Q from A P Aᵀ, (n, n, R): the covariance when w is not known."""
+        return carried + self._Q_column
+
+    def state_covariances(self, slots: int) -> Floats:
+        """Σ_k for k = 0 … slots−1, (slots, n, n): Σ_0 given, Σ_k = A Σ_{k−1} Aᵀ + Q."""
+        return np.stack(list(self._covariances(slots)))
+
+    def _covariances(self, slots: int) -> Iterator[Floats]:
+        covariance = self.initial_covariance
+        for k in range(slots):
+            if k:
+                covariance = self.A @ covariance @ self.A.T + self.Q
+            yield covariance
+
+    def horizon(self, slots: int) -> int | None:
+        """Largest k in float64's reach, if it is below slots−1; None if the whole run is.
+
+        The last k such that up to it 2⁻⁵³ √λ_max(Σ_k) ≤ 0.01 √λ_min(Q): beyond, rounding of the state drowns the
+        one-step innovation that the scheme hides in it.
+
+        Source: docs/mathematics.md, horizon.
+        """
+        limit = HORIZON_TOLERANCE * math.sqrt(float(np.linalg.eigvalsh(self.Q)[0])) / UNIT_ROUNDOFF
+        for start in range(0, slots, 4096):
+            if start == 0:
+                covariance = self.initial_covariance
+            stack = []
+            for k in range(start, min(start + 4096, slots)):
+                if k:
+                    covariance = self.A @ covariance @ self.A.T + self.Q
+                stack.append(covariance)
+                if not np.all(np.isfinite(covariance)) or np.trace(covariance) > (limit * limit) * 1e6 * self.n:
+                    break
+            largest = np.linalg.eigvalsh(np.stack([0.5 * (c + c.T) for c in stack]))[:, -1]
+            beyond = np.flatnonzero(~(np.sqrt(largest) <= limit))
+            if beyond.size:
+                return start + int(beyond[0]) - 1
+        return None
+
+
+class Trajectory:
+    """The true states of a batch: x_0 = L0 ξ_0, then x_k = A x_{k−1} + L_Q ξ_k, with ξ from the stream `process`.
+
+    Final. Must be read slot by slot.
+    """
+
+    def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
+        self._process = process
+        self._reader = BlockReader(key, batch, process.n)
+        self._initial_factor = cholesky(process.initial_covariance)
+        self._noise_factor = cholesky(process.Q)
+        self._block = range(0)
+        self._noise: Floats
+        self._next = 0
+        self.x: Floats = np.zeros((process.n, batch.trials))
+        self.predicted: Floats = self.x
+        """A x_{k−1}, (n, R): what the innovation of this slot is measured against."""
+
+    def advance(self) -> Floats:
+        """The next slot's state, (n, R)."""
+        k = self._next
+        if k not in self._block:
+            self._block = self._reader.block(k)
+            self._noise = self._draw(self._block)
+        noise = self._noise[k - self._block.start]
+        if k == 0:
+            self.x = noise
+        else:
+            self.predicted = self._process.predict(self.x)
+            self.x = self.predicted + noise
+        self._next = k + 1
+        return self.x
+
+    def _draw(self, slots: range) -> Floats:
+        factors = np.broadcast_to(self._noise_factor, (len(slots), *self._noise_factor.shape))
+        if slots.start == 0:
+            factors = factors.copy()
+            factors[0] = self._initial_factor
+        return product(factors, self._reader.normals(slots))
+
+
+class StateFactors:
+    """L_k with L_k L_kᵀ = Σ_k, lower triangular with positive diagonal, by QR of [A L_{k−1}, Q^½].
+
+    Final. Σ_k itself is never formed: in the unstable example its Cholesky factor cannot be taken from k = 45 on.
+
+    Source: docs/mathematics.md, encoding noise.
+    """
+
+    def __init__(self, process: Process) -> None:
+        self._A: Rows = process.A.tolist()
+        self._noise_factor: Rows = cholesky(process.Q).tolist()
+        self._initial: Rows = cholesky(process.initial_covariance).tolist()
+        self._k = 0
+        self._factor = self._initial
+
+    def carried(self, k: int) -> Rows:
+        """A L_{k−1}, (n, n), for k ≥ 1: a factor of the encoding noise's covariance A Σ_{k−1} Aᵀ."""
+        if k - 1 < self._k:
+            self._k, self._factor = 0, self._initial
+        while self._k < k - 1:
+            spread = zip(self._times_A(self._factor), self._noise_factor, strict=True)
+            self._factor = triangular_factor([left + right for left, right in spread])
+            self._k += 1
+        return self._times_A(self._factor)
+
+    def _times_A(self, factor: Rows) -> Rows:
+        n = len(factor)
+        product_rows: Rows = []
+        for a in self._A:
+            row = [a[0] * value for value in factor[0]]
+            for j in range(1, n):
+                weight, values = a[j], factor[j]
+                for c in range(n):
+                    row[c] += weight * values[c]
+            product_rows.append(row)
+        return product_rows
+
+
+def mistakes_of(A: Floats, Q: Floats, initial_covariance: Floats) -> list[tuple[str, str]]:
+    """Everything that keeps the three from being a process: (entry, sentence) for each mistake, none if it is one.
+
+    Source: docs/mathematics.md, model (assumptions).
+    """
+    found: list[tuple[str, str]] = []
+    for name, M in (("A", A), ("Q", Q), ("initial_covariance", initial_covariance)):
+        found += [(name, sentence) for sentence in _shape_mistakes(M, A.shape[0] if name != "A" else None)]
+    if found:
+        return found
+    for name, M in (("Q", Q), ("initial_covariance", initial_covariance)):
+        found += [(name, sentence) for sentence in _covariance_mistakes(M)]
+    if not any(name == "Q" and "symmetric" in sentence for name, sentence in found):
+        reached = _reachable(A, Q)
+        if reached < A.shape[0]:
+            found.append(
+                ("Q", f"the pair (A, √Q) is not controllable: the noise reaches {reached} of {A.shape[0]} directions; "
+                 "expected process noise that moves every state, such as Q = 1e-3 times the identity")
+            )  # fmt: skip
+    return found
+
+
+def _shape_mistakes(M: Floats, n: int | None) -> list[str]:
+    if M.ndim != 2 or M.shape[0] != M.shape[1] or M.shape[0] == 0:
+        return [f"has shape {M.shape}; expected a square matrix, such as [[1.0, 0.3], [0.5, 1.001]]"]
+    if n is not None and M.shape[0] != n:
+        return [f"is {M.shape[0]} × {M.shape[0]}; expected {n} × {n}, as A is"]
+    for i, j in np.argwhere(~np.isfinite(M)):
+        return [f"entry [{i}][{j}] is {M[i, j]}; expected finite numbers"]
+    return []
+
+
+def _covariance_mistakes(M: Floats) -> list[str]:
+    asymmetry = np.argwhere(M != M.T)
+    if asymmetry.size:
+        i, j = asymmetry[0]
+        return [f"entry [{i}][{j}] is {M[i, j]} but [{j}][{i}] is {M[j, i]}; expected a symmetric matrix"]
+    try:
+        cholesky(M)
+    except ValueError:
+        lowest = float(np.linalg.eigvalsh(M)[0])
+        return [f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix, all eigenvalues above 0"]
+    return []
+
+
+def _reachable(A: Floats, Q: Floats) -> int:
+    """Rank of [Q, A Q, …], by an orthonormal basis grown a power at a time (powers of A themselves overflow)."""
+    scale = max(1.0, float(np.abs(A).max()))
+    basis = _range(Q)
+    while 0 < basis.shape[1] < A.shape[0]:
+        grown = _range(np.hstack([basis, (A / scale) @ basis]))
+        if grown.shape[1] == basis.shape[1]:
+            break
+        basis = grown
+    return int(basis.shape[1])
+
+
+def _range(M: Floats) -> Floats:
+    u, s, _ = np.linalg.svd(M)
+    return u[:, : int(np.sum(s > 1e-12 * max(s[0], 1e-300)))]

@@ -1,0 +1,85 @@
+"""What every receiver shares: its belief, what it did with a slot, and the prediction between packets."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.process import Floats, Process
+
+Flags = NDArray[np.bool_]
+Codes = NDArray[np.uint8]
+
+
+class Action(IntEnum):
+    """What a receiver did in a slot, as far as it knows itself."""
+
+    LOST = 0
+    """Nothing was received: γ = 0."""
+    STATE = 1
+    """The packet was used as the state."""
+    INNOVATION = 2
+    """The packet was decoded as an innovation, with the secret."""
+    DISCARDED = 3
+    """The packet was received and not used."""
+
+
+class Belief(NamedTuple):
+    """A receiver's knowledge after a slot, for R trials."""
+
+    x_hat: Floats
+    """Estimate, (n, R)."""
+    P: Floats
+    """Error covariance the receiver believes, (n, n, R)."""
+    action: Codes
+    """`Action` of the slot, (R,)."""
+
+
+class Receiver(ABC):
+    """Turns deliveries into beliefs, a slot at a time. It keeps no state but what its secret streams read ahead."""
+
+    def __init__(self, process: Process, trials: int) -> None:
+        self.process = process
+        self.trials = trials
+
+    def prior(self) -> Belief:
+        """Belief before slot 0: x̂ = 0, P = Σ0 (docs/mathematics.md, legitimate estimator)."""
+        n = self.process.n
+        P = np.repeat(self.process.initial_covariance[:, :, None], self.trials, axis=2)
+        return Belief(np.zeros((n, self.trials)), P, np.zeros(self.trials, np.uint8))
+
+    @abstractmethod
+    def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
+        """Belief after slot k, from the one before it and the delivery.
+
+        gamma (R,): received or not; z (n, R): the packets, of any value where gamma is false.
+        """
+
+
+class PacketUser(Receiver):
+    """Takes a packet for the state or ignores it: the paper's class of eavesdroppers.
+
+    Its covariance is what it believes; where it took an innovation for the state, the truth is another
+    (docs/mathematics.md, eavesdroppers).
+
+    Source: Lemma 1 of the paper's section on eavesdroppers.
+    """
+
+    @abstractmethod
+    def uses(self, k: int) -> Flags | None:
+        """b_k (R,): whether a packet received in slot k is used as the state; None means always."""
+
+    def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
+        """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is used."""
+        x_hat, P = belief.x_hat, belief.P
+        if k > 0:
+            x_hat = self.process.predict(x_hat)
+            P = self.process.diffuse(self.process.carry(P))
+        uses = self.uses(k)
+        used = gamma if uses is None else gamma & uses
+        action = np.where(gamma, np.where(used, np.uint8(Action.STATE), np.uint8(Action.DISCARDED)), np.uint8(0))
+        return Belief(np.where(used, z, x_hat), np.where(used, 0.0, P), action)

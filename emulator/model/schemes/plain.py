@@ -1,0 +1,42 @@
+"""No scheme at all: every packet is the state. The baseline that keeps nothing secret."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from emulator.model.process import Floats
+from emulator.model.receiver import Flags, PacketUser, Receiver
+from emulator.model.schemes.scheme import Encoder, Packet, Scheme
+from emulator.streams import Batch
+
+
+class PlainEncoder(Encoder):
+    """z_k = x_k."""
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
+        """The packet of slot k."""
+        return Packet(x, np.zeros(x.shape[1], np.bool_))
+
+
+class PlainEstimator(PacketUser):
+    """Uses every packet it receives: E P → (1−μ) S(μ)."""
+
+    def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike
+        """Always."""
+        return None
+
+
+class Plain(Scheme):
+    """Every packet is the state, μ_d = 1; there is no secret."""
+
+    secret_streams = ()
+
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:  # noqa: ARG002 - there is no secret
+        """The sensor's side."""
+        return PlainEncoder()
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
+        """The legitimate estimator's side."""
+        return PlainEstimator(self.process, batch.trials)

@@ -1,0 +1,46 @@
+"""What a scheme is: an encoder for the sensor and the estimator that can read it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
+
+from emulator.model.process import Floats, Process
+from emulator.model.receiver import Flags, Receiver
+from emulator.streams import Batch
+
+
+class Packet(NamedTuple):
+    """What the sensor sends in a slot, for R trials."""
+
+    z: Floats
+    """Payload, (n, R)."""
+    nu: Flags
+    """ν_k, (R,): true for an innovation. Never sent; the sensor's own record."""
+
+
+class Encoder(ABC):
+    """Makes packets of states, slot by slot."""
+
+    @abstractmethod
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
+        """The packet of slot k, from x_k and A x_{k−1}, both (n, R)."""
+
+
+class Scheme(ABC):
+    """One way to fill packets. `state_probability` is μ_d, public; the keys of `secret_streams` are the secret."""
+
+    secret_streams: ClassVar[tuple[str, ...]]
+
+    def __init__(self, process: Process, state_probability: float) -> None:
+        self.process = process
+        self.state_probability = state_probability
+
+    @abstractmethod
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
+        """The sensor's side; keys holds those of `secret_streams`."""
+
+    @abstractmethod
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
+        """The legitimate estimator's side; keys holds those of `secret_streams`."""

@@ -1,0 +1,1 @@
+"""What crosses the network: sessions, who may use which key, messages, and the router."""

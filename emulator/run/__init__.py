@@ -1,0 +1,1 @@
+"""A run: its processes, its score, its results, and the same trials in memory."""
