@@ -1,0 +1,52 @@
+"""How every figure looks, and how it is saved: one raster for reading, one vector for printing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BLUE, RED, GREEN, ORANGE, GREY = "#0072b2", "#c1272d", "#009e73", "#d98200", "#5f6368"
+
+_STYLE: Any = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.labelsize": 10,
+    "axes.linewidth": 0.7,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.5,
+    "font.size": 9.5,
+    "grid.color": "#e3e5e8",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 9,
+    "legend.framealpha": 0.92,
+    "legend.edgecolor": "#d0d3d6",
+    "lines.linewidth": 1.7,
+    "mathtext.fontset": "dejavusans",
+    "pdf.fonttype": 42,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+}
+
+
+@contextmanager
+def panels(path: Path, columns: int, width: float, height: float) -> Iterator[list[Axes]]:
+    """Axes to draw on, side by side; width and height in inches. Saved as `path`.png and `path`.pdf at the end.
+
+    No windowing toolkit is touched and no global state is left changed.
+    """
+    import matplotlib as mpl  # noqa: PLC0415 - slow to import, and needed by this command alone
+    from matplotlib.figure import Figure  # noqa: PLC0415 - as above
+
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        axes = figure.subplots(1, columns, squeeze=False)
+        yield list(axes[0])
+        figure.savefig(path.with_suffix(".png"), dpi=180)
+        figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
