@@ -1,0 +1,226 @@
+"""Slots as columns of the recording: what each panel is made of, and in which style."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes
+from emulator.view import lanes, paths, plane
+from emulator.view.events import Event, Watcher
+from emulator.view.lanes import Lane
+from emulator.view.palette import TRUTH, TRUTH_CURVE, colour, dim
+from emulator.view.scene import PeerSlots, Scene, Slots
+
+_DECADES_BELOW = 2.0
+_FLOOR_WITHOUT_THEORY = 1e-6
+
+
+@dataclass(frozen=True)
+class Column:
+    """Values of one entity over some slots: the arguments of Rerun's `send_columns`."""
+
+    path: str
+    slots: NDArray[np.int64]
+    values: rr.ComponentColumnList
+
+    def send(self, to: rr.RecordingStream) -> None:
+        """Put it into a recording."""
+        to.send_columns(self.path, indexes=[rr.TimeColumn(paths.TIMELINE, sequence=self.slots)], columns=self.values)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Columns made together, and what every lane held at their first slot, for who missed the batch before."""
+
+    columns: list[Column]
+    opening: list[tuple[str, int, str]]
+    """(path, slot, word)."""
+
+
+class Columns:
+    """Turns the slots of a run, in order, into columns.
+
+    Final. Scalars and lanes are kept in full, the plane at its frames.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._floor: float | None = None
+        self._last: dict[str, int] = {}
+        every = plane.stride(scene)
+        self._trails = {name: plane.Trail(every) for name in (paths.TRUTH, *(r.name for r in scene.receivers))}
+        self._watchers = {shown.name: Watcher(shown, scene) for shown in scene.receivers}
+
+    def of(self, slots: Slots) -> Batch:
+        """The columns of the next slots."""
+        if self._floor is None:
+            self._floor = _floor(self._scene, slots)
+        k = np.arange(slots.first, slots.first + slots.count)
+        columns: list[Column] = []
+        opening: list[tuple[str, int, str]] = []
+        if self._scene.n == 1:
+            columns.append(_scalars(f"{paths.PLANE}/{paths.TRUTH}", k, slots.x[:, 0]))
+        else:
+            columns.extend(self._truth(k, slots))
+        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu), columns, opening)
+        for i, shown in enumerate(self._scene.receivers):
+            peer = slots.peers[shown.name]
+            columns.extend(self._curves(shown.name, k, peer))
+            columns.extend(self._estimate(shown.name, k, peer))
+            codes = lanes.received(peer.action, slots.nu)
+            words = lanes.LEGITIMATE if shown.role == "legitimate" else lanes.EAVESDROPPER
+            if shown.role == "legitimate":
+                codes = peer.action
+            self._lane(paths.lane(self._scene, i), words, k, codes, columns, opening)
+            events = self._watchers[shown.name].watch(slots.first, codes)
+            if events:
+                columns.append(lines(shown.name, events))
+        return Batch(columns, opening)
+
+    def _curves(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
+        curves = ((paths.ERROR, peer.squared_error), (paths.TRACE, peer.trace), (paths.THEORY, peer.expected_trace))
+        for kind, values in curves:
+            yield _scalars(paths.curve(kind, name), k, self._log10(values))
+
+    def _log10(self, values: Floats) -> Floats:
+        """log10 with everything below the floor on it: a state that was received is known exactly."""
+        assert self._floor is not None  # noqa: S101 - set before the first curve
+        with np.errstate(invalid="ignore"):
+            logarithms: Floats = np.log10(np.maximum(values, self._floor))
+        return logarithms
+
+    def _truth(self, k: NDArray[np.int64], slots: Slots) -> Iterator[Column]:
+        at = plane.frames(self._scene, slots.first, slots.count)
+        positions = plane.on_plane(slots.x)
+        yield from self._moving(paths.TRUTH, k, positions, at)
+
+    def _estimate(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
+        if self._scene.n == 1:
+            yield _scalars(f"{paths.PLANE}/{name}", k, peer.x_hat[:, 0])
+            return
+        at = plane.frames(self._scene, int(k[0]), len(k))
+        yield from self._moving(name, k, plane.on_plane(peer.x_hat), at)
+        if len(at):
+            shapes = plane.ellipses(peer.x_hat[at], peer.P[at])
+            yield Column(paths.ellipse(name), k[at], rr.LineStrips2D.columns(strips=shapes))
+
+    def _moving(
+        self, name: str, k: NDArray[np.int64], positions: plane.Points, at: NDArray[np.intp]
+    ) -> Iterator[Column]:
+        pieces = self._trails[name].pieces(positions, at)
+        if len(at):
+            yield Column(paths.trail(name), k[at], rr.LineStrips2D.columns(strips=pieces))
+            yield Column(paths.point(name), k[at], rr.Points2D.columns(positions=positions[at]))
+
+    def _lane(
+        self,
+        path: str,
+        lane: Lane,
+        k: NDArray[np.int64],
+        codes: Codes,
+        columns: list[Column],
+        opening: list[tuple[str, int, str]],
+    ) -> None:
+        before = self._last.get(path)
+        changed = np.empty(len(codes), np.bool_)
+        changed[0] = before is None or int(codes[0]) != before
+        np.not_equal(codes[1:], codes[:-1], out=changed[1:])
+        at = np.flatnonzero(changed)
+        self._last[path] = int(codes[-1])
+        opening.append((path, int(k[0]), lane.words[codes[0]]))
+        if len(at):
+            words = [lane.words[code] for code in codes[at].tolist()]
+            columns.append(Column(path, k[at], rr.StateChange.columns(state=words)))
+
+
+def opening(batch: Batch) -> list[Column]:
+    """What every lane held when the batch began: for a viewer that missed the batch before."""
+    return [Column(path, np.array([k]), rr.StateChange.columns(state=[word])) for path, k, word in batch.opening]
+
+
+def lines(name: str, events: list[Event]) -> Column:
+    """Event lines as a column."""
+    k = np.array([event.k for event in events], np.int64)
+    texts, levels = [event.text for event in events], [event.level for event in events]
+    return Column(paths.events(name), k, rr.TextLog.columns(text=texts, level=levels))
+
+
+def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
+    """Names and colours of everything, once."""
+    _log_lane_style(to, paths.lane(scene, -1), lanes.SENT)
+    for i, shown in enumerate(scene.receivers):
+        bright, label = colour(i), shown.name
+        to.log(
+            paths.curve(paths.ERROR, shown.name), rr.SeriesLines(names=label, colors=bright, widths=1.5), static=True
+        )
+        to.log(
+            paths.curve(paths.TRACE, shown.name),
+            rr.SeriesLines(names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter"),
+            static=True,
+        )
+        to.log(
+            paths.curve(paths.THEORY, shown.name),
+            rr.SeriesLines(names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0),
+            static=True,
+        )
+        _log_lane_style(
+            to, paths.lane(scene, i), lanes.LEGITIMATE if shown.role == "legitimate" else lanes.EAVESDROPPER
+        )
+        if scene.n == 1:
+            to.log(f"{paths.PLANE}/{shown.name}", rr.SeriesLines(names=label, colors=bright, widths=1.5), static=True)
+        else:
+            _log_moving_style(to, shown.name, bright, radius=5.0, order=30.0 - i)
+    if scene.n == 1:
+        to.log(
+            f"{paths.PLANE}/{paths.TRUTH}",
+            rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5),
+            static=True,
+        )
+    else:
+        _log_moving_style(to, paths.TRUTH, TRUTH, radius=3.5, order=40.0)
+
+
+def _log_moving_style(
+    to: rr.RecordingStream, name: str, bright: tuple[int, int, int], *, radius: float, order: float
+) -> None:
+    pixels = rr.Radius.ui_points
+    to.log(
+        paths.trail(name),
+        rr.LineStrips2D.from_fields(colors=[dim(bright, 0.55)], radii=pixels(0.9), draw_order=order - 20.0),
+        static=True,
+    )
+    to.log(
+        paths.ellipse(name),
+        rr.LineStrips2D.from_fields(colors=[bright], radii=pixels(0.9), draw_order=order - 10.0),
+        static=True,
+    )
+    to.log(
+        paths.point(name),
+        rr.Points2D.from_fields(colors=[bright], radii=pixels(radius), draw_order=order),
+        static=True,
+    )
+
+
+def _log_lane_style(to: rr.RecordingStream, path: str, lane: Lane) -> None:
+    # Blank labels: a slot is too narrow for a word, and the panel's title says what the colours mean.
+    style = rr.StateConfiguration(values=lane.words, labels=[" "] * len(lane.words), colors=lane.colours)
+    to.log(path, style, static=True)
+
+
+def _scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
+    return Column(path, k, rr.Scalars.columns(scalars=values))
+
+
+def _floor(scene: Scene, slots: Slots) -> float:
+    """Smallest value a curve shows: a decade or two below what the legitimate estimator's error should be."""
+    expected = slots.peers[scene.receivers[0].name].expected_trace
+    usable = expected[np.isfinite(expected) & (expected > 0.0)]
+    if not usable.size:
+        return _FLOOR_WITHOUT_THEORY
+    return float(10.0 ** (np.floor(np.log10(usable.min())) - _DECADES_BELOW))

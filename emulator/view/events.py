@@ -1,0 +1,93 @@
+"""Which moments of a run deserve a line. No Rerun in here.
+
+What happens all the time is in the lanes; a line is for a stretch without usable packets that is long for this receiver.
+How long is long adapts, so that a run of any length gets at most some hundreds of lines.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from emulator.model.receiver import Action, Codes
+from emulator.view.lanes import MISLED
+from emulator.view.scene import Scene, Shown
+
+_SHORTEST = 3  # packets in a row; fewer missed ones are everyday life
+_LINES = 200  # about how many stretches a receiver may have reported in a whole run
+_SLOTS_PER_LINE = 100  # at the least, so that the lines of a run in real time can be read
+
+
+class Event(NamedTuple):
+    """A line of the events panel."""
+
+    k: int
+    level: str
+    """INFO, WARN or ERROR."""
+    text: str
+
+
+class Watcher:
+    """Finds the events of one receiver, chunk by chunk, in its lane's codes.
+
+    Final. A good slot gives the receiver the state's worth: for the legitimate estimator any packet, for an
+    eavesdropper the state used as such. What is reported are stretches without a good slot: when one has become long,
+    and when it ends.
+    """
+
+    def __init__(self, shown: Shown, scene: Scene) -> None:
+        self._name = shown.name
+        self._legitimate = shown.role == "legitimate"
+        self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
+        self._long = _SHORTEST
+        self._reported = 0
+        self._bad = 0  # length so far of the stretch that the next chunk may continue
+        self._misled = 0  # of these, how many slots misled
+        self._told = False  # whether this stretch was reported
+        self._ever_misled = False
+
+    def watch(self, first: int, codes: Codes) -> list[Event]:
+        """Events of the chunk that starts at slot `first`, in order of slot."""
+        misled = codes == MISLED
+        good = (codes == Action.STATE) | (codes == Action.INNOVATION)
+        events: list[Event] = []
+        if not self._ever_misled and misled.any():
+            self._ever_misled = True
+            k = first + int(misled.argmax())
+            events.append(Event(k, "WARN", f"{self._name} took an innovation for the state, for the first time"))
+        start = 0
+        for end in (*np.flatnonzero(good).tolist(), len(codes)):
+            if end > start:
+                self._extend(first, start, end, misled, events)
+            if end < len(codes):
+                self._recover(first + end, events)
+            start = end + 1
+        return sorted(events, key=lambda event: event.k)
+
+    def _extend(self, first: int, start: int, end: int, misled: Codes, events: list[Event]) -> None:
+        """Lengthen the current stretch by the slots start … end−1 of the chunk."""
+        length = self._bad + end - start
+        if not self._told and length >= self._long:
+            turn = start + self._long - self._bad  # one past the slot that made it long
+            fooled = self._misled + int(np.count_nonzero(misled[start:turn]))
+            events.append(Event(first + turn - 1, "WARN", self._lost(fooled)))
+            self._told = True
+        self._bad = length
+        self._misled += int(np.count_nonzero(misled[start:end]))
+
+    def _recover(self, k: int, events: list[Event]) -> None:
+        if self._told:
+            how = "is in step again" if self._legitimate else "caught a state again"
+            events.append(Event(k, "INFO", f"{self._name} {how} after {self._bad} slots"))
+            self._told = False
+            self._reported += 1
+            if self._reported > 3 + k // self._spacing:
+                self._long += 1
+        self._bad = self._misled = 0
+
+    def _lost(self, fooled: int) -> str:
+        if self._legitimate:
+            return f"{self._name} lost {self._long} packets in a row"
+        line = f"{self._name} lost track: {self._long} slots without a state"
+        return f"{line}, misled in {fooled}" if fooled else line

@@ -1,0 +1,38 @@
+"""Colours of the view, told apart by the colour-blind, on dark and on light grounds alike: no white or black series."""
+
+from __future__ import annotations
+
+Colour = tuple[int, int, int]
+
+GROUND: Colour = (16, 18, 22)
+"""Behind the state plane, which is dark in either theme."""
+TRUTH: Colour = (226, 228, 234)
+"""Only ever drawn on `GROUND`."""
+TRUTH_CURVE: Colour = (138, 144, 156)
+"""Where the ground is the theme's."""
+
+_RECEIVERS: tuple[tuple[str, Colour], ...] = (
+    ("teal", (45, 190, 165)),
+    ("orange", (245, 130, 70)),
+    ("violet", (175, 130, 250)),
+    ("sky", (80, 170, 245)),
+    ("yellow", (222, 184, 48)),
+    ("pink", (236, 106, 168)),
+    ("olive", (142, 168, 66)),
+)
+
+
+def colour(i: int) -> Colour:
+    """Colour of the i-th receiver; the legitimate one is 0. Repeats after seven."""
+    return _RECEIVERS[i % len(_RECEIVERS)][1]
+
+
+def colour_name(i: int) -> str:
+    """What to call the i-th receiver's colour."""
+    return _RECEIVERS[i % len(_RECEIVERS)][0]
+
+
+def dim(of: Colour, share: float) -> Colour:
+    """The same colour at a share of its brightness."""
+    r, g, b = of
+    return int(r * share), int(g * share), int(b * share)

@@ -1,0 +1,47 @@
+"""Where each thing is in the recording. Entity names are what the panels show, so they are short."""
+
+from __future__ import annotations
+
+from emulator.view.scene import Scene
+
+TIMELINE = "slot"
+ERROR = "error"
+TRACE = "trace"
+THEORY = "theory"
+PACKETS = "packets"
+PLANE = "plane"
+EVENTS = "events"
+TRUTH = "truth"
+NOTES = "run"
+
+
+def lane(scene: Scene, i: int) -> str:
+    """Lane of the i-th receiver; of what was sent for i = −1. Lanes are sorted by path, hence the number."""
+    digits = len(str(len(scene.receivers)))
+    name = "sent" if i < 0 else scene.receivers[i].name
+    return f"{PACKETS}/{i + 1:0{digits}d}_{name}"
+
+
+def curve(kind: str, name: str) -> str:
+    """A receiver's curve of one kind: ERROR, TRACE or THEORY."""
+    return f"{kind}/{name}"
+
+
+def trail(name: str) -> str:
+    """Where it was."""
+    return f"{PLANE}/{name}/trail"
+
+
+def ellipse(name: str) -> str:
+    """How far from there it believes the state may be."""
+    return f"{PLANE}/{name}/cov"
+
+
+def point(name: str) -> str:
+    """Where it is."""
+    return f"{PLANE}/{name}/at"
+
+
+def events(name: str) -> str:
+    """Lines about one receiver, or `NOTES` about the run."""
+    return f"{EVENTS}/{name}"

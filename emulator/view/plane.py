@@ -1,0 +1,92 @@
+"""The state plane as arrays: points, trails and ellipses at the frames of the view. No Rerun in here.
+
+A run of any length gets a bounded number of frames. Trails lose nothing by it: between two frames every slot is drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.process import Floats
+from emulator.view.scene import Scene
+
+Points = NDArray[np.float32]
+
+_FRAMES_PER_SECOND = 30.0
+_MOST_FRAMES = 4_000
+_MOST_FRAMES_IN_REAL_TIME = 30_000  # still five a second over more than an hour
+_LARGEST = 1e30  # Rerun's points are float32
+_SIGMAS = 2.0
+_CORNERS = 40
+
+
+def stride(scene: Scene) -> int:
+    """Slots from one frame to the next."""
+    most = _MOST_FRAMES_IN_REAL_TIME if scene.pace > 0 else _MOST_FRAMES
+    smooth = math.ceil(1.0 / (_FRAMES_PER_SECOND * scene.pace) - 1e-9) if scene.pace > 0 else 1
+    return max(1, smooth, math.ceil(scene.slots / most))
+
+
+def frames(scene: Scene, first: int, count: int) -> NDArray[np.intp]:
+    """Which of `count` slots from `first` on are frames, as offsets; the run's last slot always is."""
+    every = stride(scene)
+    offsets = np.arange(-first % every, count, every)
+    if first + count == scene.slots and (first + count - 1) % every:
+        offsets = np.append(offsets, count - 1)
+    return offsets
+
+
+def on_plane(states: Floats) -> Points:
+    """The first two states, (c, 2), of states (c, n); Rerun's y axis points down, so the second is negated."""
+    return _shown(states[:, :2] * np.array([1.0, -1.0]))
+
+
+def ellipses(centres: Floats, P: Floats) -> Points:
+    """2σ ellipses of P (c, n, n) around states (c, n) as closed lines, (c, 41, 2).
+
+    A circle mapped by the Cholesky factor, written out so that a covariance of 0 is a point and not an error.
+    """
+    angle = np.linspace(0.0, 2.0 * math.pi, _CORNERS + 1)
+    with np.errstate(all="ignore"):
+        spread = np.sqrt(np.maximum(P[:, 0, 0], 0.0))
+        lean = np.where(spread > 0.0, P[:, 1, 0] / np.where(spread > 0.0, spread, 1.0), 0.0)
+        rest = np.sqrt(np.maximum(P[:, 1, 1] - lean * lean, 0.0))
+        across = spread[:, None] * np.cos(angle)
+        along = lean[:, None] * np.cos(angle) + rest[:, None] * np.sin(angle)
+        lines = centres[:, None, :2] + _SIGMAS * np.stack([across, along], axis=2)
+    return _shown(lines * np.array([1.0, -1.0]))
+
+
+def _shown(values: NDArray[Any]) -> Points:
+    points: Points = np.clip(np.nan_to_num(values, nan=_LARGEST), -_LARGEST, _LARGEST).astype(np.float32)
+    return points
+
+
+@dataclass
+class Trail:
+    """The way of one point, cut at the frames into pieces of equal length, so that they make one array.
+
+    Final. Piece i leads from the frame before to frame i through every slot between.
+    """
+
+    every: int
+    """`stride`."""
+    _since: Points | None = None
+
+    def pieces(self, positions: Points, offsets: NDArray[np.intp]) -> Points:
+        """Pieces (len(offsets), every + 1, 2) that end at these offsets of the next positions (c, 2)."""
+        since = positions[:1] if self._since is None else self._since
+        path = np.concatenate([since, positions])
+        ends = offsets + len(since)
+        # A piece that would begin before the run, or before the frame ahead of a shortened last one, repeats its start.
+        starts = np.concatenate([[len(since) - 1 if self._since is None else 0], ends[:-1]]) if len(ends) else ends
+        index = np.maximum(ends[:, None] - np.arange(self.every, -1, -1), starts[:, None])
+        pieces: Points = path[np.minimum(index, len(path) - 1)]
+        keep_from = int(ends[-1]) if len(ends) else 0
+        self._since = path[keep_from:]
+        return pieces

@@ -1,0 +1,194 @@
+"""The recording of a run: a file, and the same live to a viewer, neither of which can hold the run up.
+
+Rerun may block, for seconds or for ever, when a viewer is slow, hung or gone. So the run only ever appends to a list: one
+thread turns slots into columns and writes the file, another hands the same columns to the viewer from a bounded queue
+and leaves out what does not fit.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from emulator.view.blueprint import layout
+from emulator.view.columns import Batch, Columns, lines, log_styles, opening
+from emulator.view.events import Event
+from emulator.view.paths import NOTES
+from emulator.view.scene import PeerSlots, Scene, Shown, Slots
+
+__all__ = ["PeerSlots", "Recording", "Scene", "Shown", "Slots"]
+
+_APPLICATION = "evedrop"
+_PERIOD = 0.1  # seconds from one batch to the next, so that a batch is worth its overhead
+_MOST_SLOTS = 1024  # in a batch
+_MOST_WAITING = 20_000  # slots the file may be behind, before the run waits for it
+_LONGEST_WAIT = 10.0  # seconds the run waits for the file, before it goes on without one
+_LIVE_BATCHES = 20
+_LIVE_TIMEOUT = 1.0
+
+
+class Recording:
+    """Writes the recording of one run to `path`, and shows it in the viewer at `live`, if there is one.
+
+    Final. `live` is a viewer's gRPC address such as "rerun+http://127.0.0.1:9876/proxy". Nothing here raises because
+    of a viewer or of the disk: see `dropped` and `failure`.
+    """
+
+    def __init__(self, path: Path, scene: Scene, live: str | None) -> None:
+        self.dropped = 0
+        """Batches the viewer was too slow for. They are in the file."""
+        self.failure: str | None = None
+        """Why there is no recording on disk, or an incomplete one."""
+        self._scene = scene
+        self._columns = Columns(scene)
+        self._waiting: list[Slots] = []
+        self._waiting_slots = 0
+        self._notes: list[Event] = []
+        self._closing = False
+        self._changed = threading.Condition()
+        self._file = _stream(scene)
+        try:
+            self._file.save(path, default_blueprint=layout(scene))
+            log_styles(self._file, scene)
+        except Exception as error:
+            self.failure = str(error)
+        self._live = _Live(scene, live) if live else None
+        self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
+        self._writer.start()
+
+    def add(self, slots: Slots) -> None:
+        """Record the next slots. Waits only for the disk, and only if that is thousands of slots behind."""
+        if not slots.count:
+            return
+        with self._changed:
+            if self._waiting_slots > _MOST_WAITING:
+                in_time = self._changed.wait_for(lambda: self._waiting_slots <= _MOST_WAITING, _LONGEST_WAIT)
+                if not in_time:
+                    self._give_up("the disk did not keep up with the run")
+            if self.failure is None or self._live is not None:
+                self._waiting.append(slots)
+                self._waiting_slots += slots.count
+                self._changed.notify_all()
+
+    def note(self, k: int, level: str, text: str) -> None:
+        """Add a line to the events: level is INFO, WARN or ERROR."""
+        with self._changed:
+            self._notes.append(Event(k, level, text))
+
+    def close(self) -> bool:
+        """Finish the file, then the viewer's stream, each within a time limit.
+
+        True if the interpreter can now exit normally. If not, Rerun hangs in a thread, and only os._exit ends it.
+        """
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._writer.join(_LONGEST_WAIT)
+        if self._writer.is_alive():
+            self._give_up("the disk did not keep up with the run")
+            return False
+        return self._live.close() if self._live else True
+
+    def _give_up(self, why: str) -> None:
+        if self.failure is None:
+            self.failure = why
+
+    def _write(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or self._waiting_slots >= _MOST_SLOTS, _PERIOD)
+                chunks, self._waiting, self._waiting_slots = self._waiting, [], 0
+                notes, self._notes = self._notes, []
+                closing = self._closing
+                self._changed.notify_all()
+            self._put(chunks, notes)
+            if closing:
+                break
+        self._file.flush()
+        self._file.disconnect()
+
+    def _put(self, chunks: list[Slots], notes: list[Event]) -> None:
+        columns = [lines(NOTES, notes)] if notes else []
+        batch = self._columns.of(_joined(chunks)) if chunks else Batch([], [])
+        batch = Batch([*batch.columns, *columns], batch.opening)
+        if not batch.columns:
+            return
+        for column in batch.columns:
+            column.send(self._file)
+        if self._live is not None and not self._live.offer(batch):
+            self.dropped += 1
+
+
+class _Live:
+    """The viewer's stream, in a thread of its own: everything in it may block for ever."""
+
+    def __init__(self, scene: Scene, url: str) -> None:
+        self._scene = scene
+        self._url = url
+        self._batches: queue.Queue[tuple[Batch, bool] | None] = queue.Queue(_LIVE_BATCHES)
+        self._missed = False
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
+        self._thread.start()
+
+    def offer(self, batch: Batch) -> bool:
+        """Queue a batch; False if it was left out."""
+        try:
+            self._batches.put_nowait((batch, self._missed))
+        except queue.Full:
+            self._missed = True
+            return False
+        self._missed = False
+        return True
+
+    def close(self) -> bool:
+        """Whether the stream ended in time."""
+        deadline = time.monotonic() + _LIVE_TIMEOUT
+        try:
+            self._batches.put(None, timeout=_LIVE_TIMEOUT)
+        except queue.Full:
+            return False
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        stream = _stream(self._scene)
+        stream.connect_grpc(self._url, default_blueprint=layout(self._scene))
+        log_styles(stream, self._scene)
+        while (item := self._batches.get()) is not None:
+            batch, missed = item
+            for column in [*(opening(batch) if missed else []), *batch.columns]:
+                column.send(stream)
+        stream.flush(timeout_sec=_LIVE_TIMEOUT)
+        stream.disconnect()
+
+
+def _stream(scene: Scene) -> rr.RecordingStream:
+    return rr.RecordingStream(_APPLICATION, recording_id=scene.run)
+
+
+def _joined(chunks: list[Slots]) -> Slots:
+    if len(chunks) == 1:
+        return chunks[0]
+    peers = {
+        name: PeerSlots(
+            x_hat=np.concatenate([chunk.peers[name].x_hat for chunk in chunks]),
+            P=np.concatenate([chunk.peers[name].P for chunk in chunks]),
+            action=np.concatenate([chunk.peers[name].action for chunk in chunks]),
+            squared_error=np.concatenate([chunk.peers[name].squared_error for chunk in chunks]),
+            trace=np.concatenate([chunk.peers[name].trace for chunk in chunks]),
+            expected_trace=np.concatenate([chunk.peers[name].expected_trace for chunk in chunks]),
+        )
+        for name in chunks[0].peers
+    }
+    return Slots(
+        chunks[0].first,
+        np.concatenate([chunk.x for chunk in chunks]),
+        np.concatenate([chunk.nu for chunk in chunks]),
+        peers,
+    )

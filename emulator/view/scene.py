@@ -1,0 +1,77 @@
+"""What the view is given: the scene before the first slot, then slots in columns. No Rerun in here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes, Flags
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One receiver, for labels."""
+
+    name: str
+    """Process name, such as "legitimate" or "smart"."""
+    role: str
+    """"legitimate" or "eavesdropper"."""
+    strategy: str
+    """The scheme's name for the legitimate estimator, the strategy's for an eavesdropper."""
+    quality: float
+    """Probability that its link delivers a packet."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the view must know before the first slot."""
+
+    title: str
+    run: str
+    """Names the recording: recordings of the same run are shown as one."""
+    slots: int
+    trials: int
+    n: int
+    """Number of states."""
+    pace: float
+    """Seconds a slot; 0 as fast as it goes."""
+    receivers: tuple[Shown, ...]
+    """The legitimate one first."""
+
+
+@dataclass(frozen=True)
+class PeerSlots:
+    """One receiver over c consecutive slots."""
+
+    x_hat: Floats
+    """Estimate in the first recorded trial, (c, n)."""
+    P: Floats
+    """Covariance it believes, first recorded trial, (c, n, n)."""
+    action: Codes
+    """`Action` in the first recorded trial, (c,)."""
+    squared_error: Floats
+    """|x − x̂|², mean over trials, (c,)."""
+    trace: Floats
+    """tr P it believes, mean over trials, (c,)."""
+    expected_trace: Floats
+    """Trace of the actual error covariance by theory, (c,)."""
+
+
+@dataclass(frozen=True)
+class Slots:
+    """c consecutive slots, complete. Its arrays are kept for a while: they must not be changed afterwards."""
+
+    first: int
+    """Number of the first of them."""
+    x: Floats
+    """True state of the first recorded trial, (c, n)."""
+    nu: Flags
+    """ν of the first recorded trial, (c,): true for an innovation."""
+    peers: Mapping[str, PeerSlots]
+    """By name, one for each receiver of the scene."""
+
+    @property
+    def count(self) -> int:
+        """C."""
+        return len(self.nu)
