@@ -58,6 +58,17 @@ class BlockDigester:
         return digests
 
 
-def combined(blocks: Mapping[int, Digests]) -> str:
-    """A receiver's digest, hexadecimal, from its block digests (block number → (R, 32))."""
-    return sha256(np.stack([blocks[block] for block in sorted(blocks)], axis=1).tobytes()).hexdigest()
+class RunDigest:
+    """A receiver's digest of a whole run, from the block digests of its trials, added in trial order. Final."""
+
+    def __init__(self) -> None:
+        self._hash = sha256()
+
+    def add(self, blocks: Mapping[int, Digests]) -> None:
+        """Take the next R trials: block number → digests, (R, 32)."""
+        self._hash.update(np.stack([blocks[block] for block in sorted(blocks)], axis=1).tobytes())
+
+    @property
+    def hexadecimal(self) -> str:
+        """The digest so far."""
+        return self._hash.hexdigest()

@@ -39,6 +39,14 @@ class Belief(NamedTuple):
     """`Action` of the slot, (R,)."""
 
 
+def trace_of(P: Floats) -> Floats:
+    """Tr P of every trial: P (n, n, R) → (R,)."""
+    trace: Floats = P[0, 0].copy()
+    for i in range(1, P.shape[0]):
+        trace += P[i, i]
+    return trace
+
+
 class Receiver(ABC):
     """Turns deliveries into beliefs, a slot at a time. It keeps no state but what its secret streams read ahead."""
 

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import LossModel
+from emulator.model.links.link import Link, LossModel
+from emulator.streams import Batch
 
 LOSS_MODELS: Mapping[str, type[LossModel]] = {"bernoulli": Bernoulli}
+
+
+def link_of(spec: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
+    """The link that a scenario describes: `{"model": …, …parameters}`."""
+    parameters = {name: value for name, value in spec.items() if name != "model"}
+    return Link(LOSS_MODELS[spec["model"]](**parameters), key, batch)

@@ -6,6 +6,9 @@ from abc import ABC, abstractmethod
 from enum import IntEnum
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
 from emulator.streams import Batch, BlockReader
@@ -17,6 +20,12 @@ class Fate(IntEnum):
     DELIVERED = 0
     LOST = 1
     """Erased by the link's loss model."""
+
+
+def losses(fates: Codes) -> dict[str, NDArray[np.uint32]]:
+    """Reason → packets lost for it in each slot, (slots,), from fates (slots, R)."""
+    reasons = [reason for reason in Fate if reason is not Fate.DELIVERED]
+    return {reason.name.lower(): np.asarray((fates == reason).sum(axis=1), np.uint32) for reason in reasons}
 
 
 class LossModel(ABC):

@@ -96,6 +96,7 @@ class Innovation(Scheme):
     """The paper's scheme; needs no acknowledgements."""
 
     secret_streams = ("schedule", "noise")
+    mixes = True
 
     def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
         """The sensor's side."""

@@ -32,6 +32,7 @@ class Plain(Scheme):
     """Every packet is the state, μ_d = 1; there is no secret."""
 
     secret_streams = ()
+    mixes = False
 
     def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:  # noqa: ARG002 - there is no secret
         """The sensor's side."""

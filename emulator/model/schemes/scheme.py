@@ -32,6 +32,8 @@ class Scheme(ABC):
     """One way to fill packets. `state_probability` is μ_d, public; the keys of `secret_streams` are the secret."""
 
     secret_streams: ClassVar[tuple[str, ...]]
+    mixes: ClassVar[bool]
+    """Whether packets are of two types, so that μ_d must be given."""
 
     def __init__(self, process: Process, state_probability: float) -> None:
         self.process = process

@@ -1,0 +1,5 @@
+"""`python -m emulator` is the command `evedrop`."""
+
+from emulator.cli import main
+
+raise SystemExit(main())

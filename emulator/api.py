@@ -1,0 +1,83 @@
+"""The Python calls: `run`, `montecarlo`, `load_results`. They do what the commands of the same name do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from emulator.run.results import Results, load_results
+from emulator.scenario import Scenario, load
+
+Tell = Callable[[Mapping[str, Any]], None]
+
+
+def _silent(news: Mapping[str, Any]) -> None:
+    del news
+
+
+def default_folder(scenario: str | Path) -> Path:
+    """`runs/<scenario>-<time>`, in the current folder."""
+    stem = Path(scenario).stem if Path(scenario).suffix else Path(scenario).name
+    return Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def run(
+    scenario: str | Path | Scenario,
+    *,
+    out: str | Path | None = None,
+    view: str = "off",
+    listen: str | None = None,
+    tell: Tell = _silent,
+    **changes: Any,
+) -> Results:
+    """Run a scenario live: sensor, router, estimators and observer as processes of their own.
+
+    scenario: a shipped name, a file, or a checked `Scenario`; out: the results folder, new or empty; view: auto, native,
+    web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; changes: entries of the scenario, dotted keys
+    with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError when a
+    process failed, Interrupted on Ctrl-C; after the last two the folder holds what was measured.
+
+    >>> results = run("eavesdroppers", slots=1000, out="my-run")        # doctest: +SKIP
+    >>> results.summary["peers"]["smart"]["mean_squared_error"]         # doctest: +SKIP
+    >>> results.slots.to_pandas()                                       # doctest: +SKIP
+    """
+    from emulator.run.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
+
+    checked, folder = _prepared(scenario, out, changes)
+    ended = launch(checked, folder, view, listen, tell)
+    if ended.viewer is not None:
+        ended.viewer.stop()
+    return load_results(folder)
+
+
+def montecarlo(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 1000,
+    out: str | Path | None = None,
+    tell: Tell = _silent,
+    **changes: Any,
+) -> Results:
+    """Run the trials of a scenario in memory, to the same bits as a live run.
+
+    Arguments and errors as for `run`; trials: how many, from `first_trial` on.
+    """
+    from emulator.run.montecarlo import simulate  # noqa: PLC0415 - a live run does not need it
+
+    checked, folder = _prepared(scenario, out, {**changes, "trials": trials})
+    simulate(checked, folder, tell)
+    return load_results(folder)
+
+
+def _prepared(
+    scenario: str | Path | Scenario, out: str | Path | None, changes: Mapping[str, Any]
+) -> tuple[Scenario, Path]:
+    dotted = {name.replace("__", "."): value for name, value in changes.items()}
+    if isinstance(scenario, Scenario):
+        checked = Scenario.model_validate({**scenario.model_dump(), **dotted}) if dotted else scenario
+        return checked, Path(out) if out is not None else default_folder("run")
+    return load(scenario, dotted), Path(out) if out is not None else default_folder(scenario)

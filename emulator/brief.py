@@ -1,0 +1,121 @@
+"""What one process may know: written by the launcher, read by the process, and nothing else is handed to it.
+
+A brief is `<process>.json`, mode 0600. The keys in it are those of the streams the process owns; the scenario's seed
+is in none but the observer's.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.errors import BriefError
+from emulator.model.process import Process
+from emulator.streams import Batch
+
+ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
+
+
+@dataclass(frozen=True)
+class Flow:
+    """End-to-end flow control, both in slots."""
+
+    window: int
+    """The sensor stays at most this far ahead of the slowest receiver and of the observer."""
+    batch: int
+    """Telemetry, journal and progress are sent at least this often."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """The public model: everybody may know it."""
+
+    A: list[list[float]]
+    Q: list[list[float]]
+    initial_covariance: list[list[float]]
+    state_probability: float
+    """μ_d."""
+
+    @property
+    def process(self) -> Process:
+        """The process of the model."""
+        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
+
+
+@dataclass(frozen=True)
+class Brief:
+    """Everything one process may know."""
+
+    run: str
+    process: str
+    role: str
+    router: str
+    """Zenoh endpoint, such as tcp/127.0.0.1:17460."""
+    user: str
+    password: str
+    slots: int
+    trials: int
+    first_trial: int
+    recorded: int
+    """The first so many trials of the run are recorded in full."""
+    flow: Flow
+    model: Model
+    keys: Mapping[str, str] = field(default_factory=dict)
+    """Stream name → key, hexadecimal: the streams this process owns."""
+    part: Mapping[str, Any] = field(default_factory=dict)
+    """The role's part of the scenario."""
+    ends_with_stdin: bool = False
+    """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
+
+    @property
+    def batch(self) -> Batch:
+        """Slots and trials."""
+        return Batch(self.slots, self.trials, self.first_trial)
+
+    @property
+    def stream_keys(self) -> dict[str, bytes]:
+        """The keys of the streams this process owns."""
+        return {name: bytes.fromhex(key) for name, key in self.keys.items()}
+
+    def write(self, directory: Path) -> Path:
+        """Write `<process>.json`, readable by nobody else."""
+        path = directory / f"{self.process}.json"
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump(asdict(self), file, indent=1)
+        return path
+
+
+def read_brief(path: Path, role: str | None = None) -> Brief:
+    """The brief in a file. Raises BriefError if it is unreadable, readable by others, or another role's."""
+    try:
+        if path.stat().st_mode & 0o077:
+            raise BriefError(f"{path} is readable by others; a brief holds keys: chmod 600 {path}")
+        brief = _parsed(json.loads(path.read_text()))
+    except OSError as error:
+        raise BriefError(f"{path}: {error.strerror}; give the file that `evedrop brief` wrote") from error
+    except (ValueError, TypeError, KeyError) as error:
+        raise BriefError(
+            f"{path} is not a brief of this version ({error}); write it again with `evedrop brief`"
+        ) from error
+    if role is not None and brief.role != role:
+        raise BriefError(
+            f"{path} is the brief of a {brief.role}; expected one of a {role}: start `evedrop {brief.role}`"
+        )
+    return brief
+
+
+def _parsed(found: Any) -> Brief:
+    if not isinstance(found, dict):
+        raise TypeError("not a JSON object")
+    unknown = set(found) - {known.name for known in fields(Brief)}
+    if unknown:
+        raise TypeError(f"unknown entry {min(unknown)}")
+    if found["role"] not in ROLES:
+        raise ValueError(f"unknown role {found['role']}")
+    return Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"])})

@@ -1,0 +1,137 @@
+"""Who may use which key: one table, from which the router's access control is made. Whatever is not in it is denied.
+
+Readers name every key they read: a wildcard subscription is not covered by exact rules and receives nothing.
+
+Source: docs/protocol.md, keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+SENSOR = "sensor"
+LEGITIMATE = "legitimate"
+ROUTER = "router"
+OBSERVER = "observer"
+OPERATOR = "operator"
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR)
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys of one run."""
+
+    run: str
+
+    def _under(self, path: str) -> str:
+        return f"evedrop/{self.run}/{path}"
+
+    @property
+    def uplink(self) -> str:
+        """Packets, sensor to router."""
+        return self._under("uplink")
+
+    @property
+    def journal(self) -> str:
+        """Fates, router to observer."""
+        return self._under("journal")
+
+    def downlink(self, receiver: str) -> str:
+        """Deliveries, router to one receiver."""
+        return self._under(f"downlink/{receiver}")
+
+    def telemetry(self, process: str) -> str:
+        """What a process reports to the observer."""
+        return self._under(f"telemetry/{process}")
+
+    def progress(self, process: str) -> str:
+        """How far a receiver or the observer is, to the sensor."""
+        return self._under(f"progress/{process}")
+
+    def control(self, process: str) -> str:
+        """Commands to one process."""
+        return self._under(f"control/{process}")
+
+    def alive(self, process: str) -> str:
+        """Liveliness token of a process."""
+        return self._under(f"alive/{process}")
+
+
+@dataclass(frozen=True)
+class Grant:
+    """What one user may do; everything else is denied."""
+
+    process: str
+    writes: tuple[str, ...]
+    reads: tuple[str, ...]
+    token: str
+    watches: tuple[str, ...] = ()
+    """Liveliness tokens it may watch."""
+
+
+def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
+    """The table of docs/protocol.md for a run; the router itself needs no grant."""
+    keys = Keys(run)
+    followers = (*receivers, OBSERVER)
+    processes = (SENSOR, *receivers)
+    table = [
+        Grant(
+            SENSOR,
+            writes=(keys.uplink, keys.telemetry(SENSOR)),
+            reads=(*(keys.progress(name) for name in followers), keys.control(SENSOR)),
+            token=keys.alive(SENSOR),
+        ),
+        Grant(
+            OBSERVER,
+            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, ROUTER))),
+            reads=(*(keys.telemetry(name) for name in processes), keys.journal),
+            token=keys.alive(OBSERVER),
+            watches=tuple(keys.alive(name) for name in (*processes, ROUTER)),
+        ),
+    ]
+    for name in receivers:
+        table.append(
+            Grant(
+                name,
+                writes=(keys.telemetry(name), keys.progress(name)),
+                reads=(keys.downlink(name), keys.control(name)),
+                token=keys.alive(name),
+            )
+        )
+    return table
+
+
+def access_control(table: list[Grant]) -> dict[str, Any]:
+    """The `access_control` section of the router's Zenoh configuration."""
+    rules = [rule for grant in table for rule in _rules(grant)]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [{"id": grant.process, "usernames": [grant.process]} for grant in table],
+        "policies": [{"subjects": [grant.process], "rules": [rule["id"] for rule in _rules(grant)]} for grant in table],
+    }
+
+
+def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
+    """Both directions of every permission: a writer must also learn that its reader is there."""
+    kinds: list[tuple[str, str, str, tuple[str, ...]]] = [
+        ("write", "ingress", "put", grant.writes),
+        ("reader", "egress", "declare_subscriber", grant.writes),
+        ("subscribe", "ingress", "declare_subscriber", grant.reads),
+        ("read", "egress", "put", grant.reads),
+        ("token", "ingress", "liveliness_token", (grant.token,)),
+        ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),
+        ("watched", "egress", "liveliness_token", grant.watches),
+    ]
+    for name, flow, message, keys in kinds:
+        if keys:
+            yield {
+                "id": f"{grant.process}-{name}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": [message],
+                "key_exprs": list(keys),
+            }

@@ -1,0 +1,149 @@
+"""One Zenoh session of one process: how it is opened, what it declares, when it is ready, how it ends.
+
+Nothing here relies on the transport not to lose: it blocks when full, and what it loses all the same is seen as a gap
+in the slot numbers that every message carries.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+from zenoh.handlers import FifoChannel
+
+from emulator.brief import Brief
+from emulator.errors import BriefError, RunError
+from emulator.network.access import Keys
+from emulator.network.wire import read_control
+
+CONNECT_SECONDS = 20.0
+READY_SECONDS = 30.0
+_INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
+_POLL_SECONDS = 0.004
+
+Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
+
+
+def _transport() -> dict[str, Any]:
+    # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
+    wait = {"block": {"wait_before_close": 60_000_000}}
+    return {"link": {"tx": {"queue": {"congestion_control": wait}}}}
+
+
+def client_config(brief: Brief) -> dict[str, Any]:
+    """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
+    auth = {"usrpwd": {"user": brief.user, "password": brief.password}}
+    return {
+        "mode": "client",
+        "connect": {
+            "endpoints": [brief.router],
+            "timeout_ms": int(CONNECT_SECONDS * 1000),
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
+        },
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {**_transport(), "auth": auth},
+    }
+
+
+def router_config(endpoint: str, users_file: str, access: dict[str, Any]) -> dict[str, Any]:
+    """Configuration of the router: it listens, asks for user and password, and denies what is not granted."""
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint], "exit_on_failure": True},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {**_transport(), "auth": {"usrpwd": {"dictionary_file": users_file}}},
+        "access_control": access,
+    }
+
+
+class Session:
+    """A process's session. Final; use it as a context manager, or its threads outlive the program."""
+
+    def __init__(self, brief: Brief, config: dict[str, Any] | None = None) -> None:
+        zenoh.init_log_from_env_or("error")
+        if brief.ends_with_stdin:
+            _end_with_stdin()
+        self.keys = Keys(brief.run)
+        self._process = brief.process
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config or client_config(brief))))
+        except zenoh.ZError as error:
+            raise BriefError(
+                f"no session with the router at {brief.router}: {error}. Check that it runs, that the brief is of this "
+                "run, and that nothing else listens there"
+            ) from error
+        self._publishers: list[zenoh.Publisher] = []
+        self._token: zenoh.LivelinessToken | None = None
+        self._control = self.inbox(self.keys.control(self._process))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def inbox(self, key: str) -> Inbox:
+        """Subscribe to one exact key, to be read in order with `recv`."""
+        return self._session.declare_subscriber(key, FifoChannel(_INBOX_MESSAGES))
+
+    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+        """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
+        self._session.declare_subscriber(key, lambda sample: receive(sample.payload.to_bytes()))
+
+    def outlet(self, key: str) -> Callable[[bytes], None]:
+        """A publisher for one exact key."""
+        publisher = self._session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.BLOCK, reliability=zenoh.Reliability.RELIABLE
+        )
+        self._publishers.append(publisher)
+        return publisher.put
+
+    def watch(self, process: str, changed: Callable[[bool], None]) -> None:
+        """Call `changed` with true when a process is there, with false when it is gone; on a thread of Zenoh's."""
+        self._session.liveliness().declare_subscriber(
+            self.keys.alive(process), lambda sample: changed(sample.kind == zenoh.SampleKind.PUT), history=True
+        )
+
+    def ready(self) -> None:
+        """Wait until every publisher has a reader, then show that this process is there.
+
+        Raises RunError after 30 s, naming the keys that nobody reads.
+        """
+        deadline = time.monotonic() + READY_SECONDS
+        waiting = list(self._publishers)
+        while waiting:
+            waiting = [publisher for publisher in waiting if not publisher.matching_status.matching]  # type: ignore[attr-defined]  # the stub says bool
+            if waiting and time.monotonic() > deadline:
+                unread = ", ".join(str(publisher.key_expr) for publisher in waiting)
+                raise RunError(
+                    f"{self._process}: after {READY_SECONDS:.0f} s nobody reads {unread}; look at the other logs"
+                )
+            if waiting:
+                time.sleep(_POLL_SECONDS)
+        self._token = self._session.liveliness().declare_token(self.keys.alive(self._process))
+
+    def wait_for(self, command: str) -> None:
+        """Wait for one command of the conductor: `start` or `end`."""
+        while read_control(str(self._control.key_expr), self._control.recv().payload.to_bytes()) != command:
+            pass
+
+
+def _end_with_stdin() -> None:
+    """End this process when whoever started it is gone."""
+
+    def wait() -> None:
+        while sys.stdin.buffer.read(4096):
+            pass
+        os._exit(3)
+
+    threading.Thread(target=wait, name="launcher-watch", daemon=True).start()

@@ -1,0 +1,160 @@
+"""From one scenario to the briefs of its processes: who is told what, and who holds which key."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emulator.brief import Brief, Flow, Model
+from emulator.errors import UsageError
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.schemes import SCHEMES
+from emulator.network.access import LEGITIMATE, OBSERVER, ROUTER, SENSOR
+from emulator.run.results import new_folder
+from emulator.scenario import Scenario
+from emulator.streams import root_of_seed, stream_key
+
+_WINDOW_BYTES = 16 * 2**20
+_MOST_SLOTS_AHEAD = 1024
+
+
+@dataclass(frozen=True)
+class StreamKeys:
+    """The keys of all streams of a scenario: those of the seed, and the two of the secret."""
+
+    seed_root: bytes
+    secret_root: bytes
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> StreamKeys:
+        """From the seed; the secret from its own file if the scenario names one. Raises UsageError if it cannot be read."""
+        root = root_of_seed(scenario.seed)
+        if scenario.secret_file is None:
+            return cls(root, stream_key(root, "secret"))
+        try:
+            secret = Path(scenario.secret_file).read_bytes()
+        except OSError as error:
+            raise UsageError(
+                f"--secret {scenario.secret_file}: {error.strerror}; give a file of 32 or more bytes"
+            ) from error
+        if len(secret) < 32:
+            raise UsageError(
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected 32 or more, random ones"
+            )
+        return cls(root, stream_key(secret, "secret"))
+
+    def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
+        """Keys of the shared secret's streams."""
+        return {name: stream_key(self.secret_root, name) for name in names}
+
+    @property
+    def process(self) -> bytes:
+        """Of the sensor's process noise."""
+        return stream_key(self.seed_root, "process")
+
+    def link(self, receiver: str) -> bytes:
+        """Of a receiver's link."""
+        return stream_key(self.seed_root, f"link/{receiver}")
+
+    def eavesdropper(self, name: str, strategy: str) -> dict[str, bytes]:
+        """What an eavesdropper's strategy must be given: the schedule's key, its own coin's, or nothing."""
+        keys = {}
+        for stream in STRATEGIES[strategy].streams:
+            own = stream_key(self.seed_root, f"coin/{name}")
+            keys[stream] = own if stream == "coin" else stream_key(self.secret_root, stream)
+        return keys
+
+
+def flow_of(scenario: Scenario) -> Flow:
+    """A window of some megabytes under way, and reports four times in it."""
+    receivers = len(scenario.receivers)
+    slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
+    window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
+    return Flow(window, max(1, window // 4))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the observer is told besides the scenario."""
+
+    results: Path
+    recording: bool
+    live: str | None
+
+
+def briefs_of(
+    scenario: Scenario, endpoint: str, observation: Observation, ends_with_stdin: bool = True
+) -> dict[str, Brief]:
+    """Process name → brief, with passwords and a run name made afresh."""
+    run = f"r{secrets.token_hex(4)}"
+    keys = StreamKeys.of(scenario)
+    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, OBSERVER)}
+    model = Model(scenario.process.A, scenario.process.Q, scenario.process.initial_covariance, scenario.encoding.mu_d)
+    scheme = scenario.encoding.scheme
+    secret = keys.secret(SCHEMES[scheme].secret_streams)
+
+    def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
+        return Brief(
+            run=run,
+            process=process,
+            role=role,
+            router=endpoint,
+            user=process,
+            password=users.get(process, ""),
+            slots=scenario.slots,
+            trials=scenario.trials,
+            first_trial=scenario.first_trial,
+            recorded=scenario.record_trials,
+            flow=flow_of(scenario),
+            model=model,
+            keys={name: key.hex() for name, key in owned.items()},
+            part=part,
+            ends_with_stdin=ends_with_stdin,
+        )
+
+    links = {name: scenario.link(name).spec for name in scenario.receivers}
+    link_keys = {f"link/{name}": keys.link(name) for name in scenario.receivers}
+    made = [
+        brief(ROUTER, "router", link_keys, {"links": links, "users": users}),
+        brief(
+            SENSOR,
+            "sensor",
+            {"process": keys.process, **secret},
+            {"scheme": scheme, "pace": scenario.pace, "receivers": list(scenario.receivers)},
+        ),
+        brief(LEGITIMATE, "legitimate", secret, {"scheme": scheme}),
+        brief(
+            OBSERVER,
+            "observer",
+            {},
+            {
+                "scenario": scenario.model_dump(mode="json"),
+                "results": str(observation.results.absolute()),
+                "recording": observation.recording,
+                "live": observation.live,
+            },
+        ),
+    ]
+    for name, table in scenario.eavesdroppers.items():
+        part = {"strategy": table.strategy, "parameters": table.parameters}
+        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy), part))
+    return {one.process: one for one in made}
+
+
+def write_briefs(scenario: Scenario, endpoint: str, results: Path, folder: Path) -> list[Path]:
+    """Write the briefs into a folder, for processes that are started by hand; the observer's results go to `results`.
+
+    Raises UsageError if either folder has something in it or cannot be written.
+    """
+    new_folder(results)
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if any(folder.iterdir()):
+            raise UsageError(f"{folder} is not empty; give another --out, or empty it")
+        made = briefs_of(scenario, endpoint, Observation(results, True, None), ends_with_stdin=False)
+        return [brief.write(folder) for brief in made.values()]
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

@@ -1,0 +1,93 @@
+"""The conductor, inside the observer: waits until everybody is there, starts, reports how far the run is, ends it."""
+
+from __future__ import annotations
+
+import time
+from queue import Empty, SimpleQueue
+
+from emulator.errors import Interrupted, RunError
+from emulator.network.access import OBSERVER, ROUTER, SENSOR
+from emulator.network.session import READY_SECONDS, Session
+from emulator.network.wire import control, progress
+
+_LOOK_SECONDS = 0.05  # how soon a signal is noticed
+
+
+class Stop:
+    """Set by a signal: the run must end now. Final."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+
+    def check(self) -> None:
+        """Raise Interrupted if the end was asked for."""
+        if self.wanted:
+            raise Interrupted("interrupted; what was measured is in the results folder")
+
+
+class Conductor:
+    """Final. Its news are (source, payload): telemetry and journal as they come; everything else it keeps to itself."""
+
+    def __init__(self, session: Session, receivers: tuple[str, ...], stop: Stop) -> None:
+        self._session = session
+        self._stop = stop
+        self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
+        self._present = dict.fromkeys((ROUTER, SENSOR, *receivers), False)
+        keys = session.keys
+        self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
+        self.keys.update({name: keys.telemetry(name) for name in receivers})
+        for source, key in self.keys.items():
+            session.funnel(key, lambda payload, source=source: self._news.put((source, payload)))  # type: ignore[misc]
+        for name in self._present:
+            session.watch(name, lambda there, name=name: self._news.put((name, there)))  # type: ignore[misc]
+        self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
+        self._progress = session.outlet(keys.progress(OBSERVER))
+
+    def assemble(self) -> None:
+        """Wait for every process. Raises RunError naming those that are missing after 30 s."""
+        deadline = time.monotonic() + READY_SECONDS
+        while not all(self._present.values()):
+            self._stop.check()
+            missing = [name for name, there in self._present.items() if not there]
+            if time.monotonic() > deadline:
+                raise RunError(f"{', '.join(missing)} did not appear within {READY_SECONDS:.0f} s; look at the logs")
+            self._note(self._next())
+        self._session.ready()
+
+    def start(self) -> None:
+        """Let the sensor begin."""
+        self._commands[SENSOR](control("start"))
+
+    def news(self) -> tuple[str, bytes] | None:
+        """The next message and who sent it, or None if there was none for a moment.
+
+        Raises RunError when a process is gone, Interrupted when the end was asked for.
+        """
+        self._stop.check()
+        news = self._next()
+        if news is None or not isinstance(news[1], bytes):
+            self._note(news)
+            gone = [name for name, there in self._present.items() if not there]
+            if gone:
+                raise RunError(f"{', '.join(gone)} ended before the run did; look at its log")
+            return None
+        return news[0], news[1]
+
+    def report(self, done: int) -> None:
+        """Tell the sensor that all slots below `done` are scored."""
+        self._progress(progress(done))
+
+    def end(self) -> None:
+        """Tell everybody that the run is over."""
+        for command in self._commands.values():
+            command(control("end"))
+
+    def _next(self) -> tuple[str, bytes | bool] | None:
+        try:
+            return self._news.get(timeout=_LOOK_SECONDS)
+        except Empty:
+            return None
+
+    def _note(self, news: tuple[str, bytes | bool] | None) -> None:
+        if news is not None and isinstance(news[1], bool):
+            self._present[news[0]] = news[1]

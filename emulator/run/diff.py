@@ -1,0 +1,113 @@
+"""Where two runs part: the first slot, trial and receiver that differ, with both values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from emulator.model.digest import BLOCK_SLOTS
+from emulator.run.results import Results
+
+_COMPARED = ("sent", "action", "x", "x_hat", "P")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first difference, and whether there is one at all."""
+
+    same: bool
+    text: str
+
+
+def difference(a: Results, b: Results) -> Difference:
+    """Compare what every receiver received and believed, trial by trial, over the trials and receivers both have."""
+    blocks_a, blocks_b = _blocks(a), _blocks(b)
+    common = blocks_a.keys() & blocks_b.keys()
+    if not common:
+        return Difference(
+            False, "the runs have no slot of a trial and receiver in common; compare runs of one scenario"
+        )
+    unequal = sorted(
+        (block, trial, peer) for peer, trial, block in common if _differ(blocks_a, blocks_b, peer, trial, block)
+    )
+    only = len(blocks_a) + len(blocks_b) - 2 * len(common)
+    rest = f" ({only} blocks of 256 slots are in one run only)" if only else ""
+    if not unequal:
+        peers = ", ".join(sorted({peer for peer, _, _ in common}))
+        return Difference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
+    block, trial, peer = unequal[0]
+    first = _first_row(a.trials, b.trials)
+    if first is not None and first.slot // BLOCK_SLOTS <= block:
+        return Difference(False, first.text + rest)
+    slots = f"slots {block * BLOCK_SLOTS} to {(block + 1) * BLOCK_SLOTS - 1}"
+    remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
+    return Difference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
+
+
+def _blocks(results: Results) -> dict[tuple[str, int, int], bytes]:
+    columns = results.digests.to_pydict()
+    keys = zip(columns["peer"], columns["trial"], columns["block"], strict=True)
+    return dict(zip(keys, columns["digest"], strict=True))
+
+
+def _differ(
+    a: dict[tuple[str, int, int], bytes], b: dict[tuple[str, int, int], bytes], peer: str, trial: int, block: int
+) -> bool:
+    return a[peer, trial, block] != b[peer, trial, block]
+
+
+@dataclass(frozen=True)
+class _Row:
+    slot: int
+    text: str
+
+
+def _first_row(a: pa.Table, b: pa.Table) -> _Row | None:
+    """The first recorded row that differs."""
+    keys = ["slot", "trial", "peer"]
+    tables = [_plain(table).sort_by([(key, "ascending") for key in keys]) for table in (a, b)]
+    joined = tables[0].join(tables[1], keys, join_type="inner", right_suffix="_b")
+    unequal = None
+    for name in _COMPARED:
+        differs = pc.not_equal(joined[name], joined[f"{name}_b"])
+        unequal = differs if unequal is None else pc.or_(unequal, differs)
+    rows = joined.filter(unequal).sort_by([(key, "ascending") for key in keys]).slice(0, 1).to_pylist()
+    if not rows:
+        return None
+    row = rows[0]
+    values = "; ".join(
+        f"{name} {_shown(row[name])} against {_shown(row[f'{name}_b'])}"
+        for name in _COMPARED
+        if row[name] != row[f"{name}_b"]
+    )
+    return _Row(row["slot"], f"first difference: slot {row['slot']}, trial {row['trial']}, {row['peer']}: {values}")
+
+
+def _plain(table: pa.Table) -> pa.Table:
+    """Columns that can be joined and compared: strings for dictionaries, the numbers' bytes for lists."""
+    columns = {}
+    for name in ("slot", "trial", "peer", *_COMPARED):
+        column = table[name]
+        if pa.types.is_dictionary(column.type):
+            column = column.cast(pa.string())
+        elif pa.types.is_fixed_size_list(column.type):
+            column = _as_bytes(column)
+        columns[name] = column
+    return pa.table(columns)
+
+
+def _as_bytes(column: pa.ChunkedArray) -> pa.Array:
+    width = 8 * column.type.list_size
+    values = pa.concat_arrays([chunk.flatten() for chunk in column.chunks]).to_numpy()
+    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(width), len(column), [None, pa.py_buffer(values)]).cast(
+        pa.binary()
+    )
+
+
+def _shown(value: str | bytes) -> str:
+    if isinstance(value, str):
+        return value
+    numbers = memoryview(value).cast("d").tolist()
+    return "[" + ", ".join(repr(number) for number in numbers) + "]"

@@ -1,0 +1,43 @@
+"""What can be said of a run before it starts: is the estimator bounded, and how much will be written."""
+
+from __future__ import annotations
+
+import math
+
+from emulator.model.theory import stability_bound
+from emulator.network.access import LEGITIMATE
+from emulator.scenario import Scenario
+
+_LARGE_BYTES = 1e9
+
+
+def warnings_of(scenario: Scenario) -> list[str]:
+    """What the user should know before the run; it goes on all the same.
+
+    Source: docs/mathematics.md, secrecy and design (stability bound).
+    """
+    found = []
+    process, mu, mu_d = scenario.process.process, scenario.quality[LEGITIMATE], scenario.encoding.mu_d
+    bound = stability_bound(process, mu)
+    if not mu_d > bound and process.spectral_radius >= 1.0:
+        needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
+        found.append(
+            f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "
+            f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
+            + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
+        )
+    size = written_bytes(scenario)
+    if size > _LARGE_BYTES:
+        found.append(
+            f"this run will write about {size / 1e9:.1f} GB of results; fewer slots or record_trials write less"
+        )
+    return found
+
+
+def written_bytes(scenario: Scenario) -> float:
+    """Bytes the results folder will have, about, before compression."""
+    n, receivers = len(scenario.process.A), len(scenario.receivers)
+    recorded_row = 8 * (2 * n + n * n) + 40
+    journal_row = scenario.trials / 8 + 40
+    digest_rows = scenario.trials / 256 * 50
+    return scenario.slots * receivers * (recorded_row * scenario.record_trials + journal_row + digest_rows + 80)

@@ -1,0 +1,206 @@
+"""The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
+
+Its news go to standard output, a JSON object a line: `{"event": "started"}`, `{"event": "progress", …}` four times a
+second, and at the end `{"event": "ended", "summary": …}`. Whatever ends the run, the results folder is whole.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from emulator.brief import Brief
+from emulator.errors import EvedropError, Interrupted, RunError
+from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
+from emulator.network.session import Session
+from emulator.run.conductor import Conductor, Stop
+from emulator.run.joined import Joiner, Slots
+from emulator.run.results import ResultsWriter, write_summary
+from emulator.run.scorekeeper import Ending, Scored, Scorekeeper, digest_of, resolved, summary_of
+from emulator.scenario import Scenario
+
+if TYPE_CHECKING:
+    from emulator.view.recording import Recording
+
+_PROGRESS_SECONDS = 0.25
+
+
+def observe(brief: Brief) -> int:
+    """Run the observer of a brief; the exit status of the run."""
+    stop = Stop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    scenario = Scenario.model_validate(brief.part["scenario"])
+    observation = Observation(brief, scenario)
+    status, how = 0, "complete"
+    try:
+        (observation.folder / "scenario.toml").write_text(resolved(scenario))
+        with observation.writer():
+            try:
+                observation.conduct(stop)
+            except EvedropError as error:
+                status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
+    except OSError as error:
+        status, how = RunError.exit_status, f"the results cannot be written ({error}); free some room and run again"
+    return observation.finish(status, how)
+
+
+def tell(event: str, **news: Any) -> None:
+    """A line to the launcher; nobody has to listen."""
+    with suppress(BrokenPipeError):
+        print(json.dumps({"event": event, **news}, ensure_ascii=False), flush=True)  # noqa: T201 - the launcher reads it
+
+
+class Observation:
+    """One run as the observer sees it. Final."""
+
+    def __init__(self, brief: Brief, scenario: Scenario) -> None:
+        self.folder = Path(brief.part["results"])
+        self._brief = brief
+        self._scenario = scenario
+        self._shape = (len(scenario.process.A), scenario.trials)
+        self._joiner = Joiner(scenario.receivers, self._shape, scenario.record_trials)
+        self._keeper = Scorekeeper(scenario, scenario.trials)
+        self._recording: Recording | None = None
+        self._writer: ResultsWriter
+        self._started = self._ended = self._told = time.monotonic()
+        self._recent: tuple[float, int] = (self._started, 0)
+
+    def writer(self) -> ResultsWriter:
+        """The writer of the results folder, to be entered around `conduct`."""
+        self._writer = ResultsWriter(self.folder, self._scenario.receivers, self._shape[0])
+        return self._writer
+
+    def conduct(self, stop: Stop) -> None:
+        """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
+        with Session(self._brief) as session:
+            conductor = Conductor(session, self._scenario.receivers, stop)
+            if self._brief.part["recording"]:
+                self._recording = open_recording(
+                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
+                )
+            conductor.assemble()
+            self._started = self._ended = time.monotonic()
+            self._recent = (self._started, 0)
+            conductor.start()
+            tell("started")
+            try:
+                while self._joiner.done < self._scenario.slots:
+                    news = conductor.news()
+                    if news is not None:
+                        self._take(conductor, *news)
+            finally:
+                self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
+                self._ended = time.monotonic()
+            conductor.end()
+
+    def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
+        key = conductor.keys[source]
+        if source == ROUTER:
+            self._joiner.journal(key, payload)
+        elif source == SENSOR:
+            self._joiner.truth(key, payload)
+        else:
+            self._joiner.report(source, key, payload)
+        slots = self._joiner.take()
+        if slots is None:
+            return
+        scored = self._keeper.add(slots)
+        write_rows(self._writer, slots, scored, self._scenario.first_trial)
+        if self._recording is not None:
+            self._recording.add(shown(slots, scored))
+        conductor.report(self._joiner.done)
+        self._progress(scored)
+
+    def _progress(self, scored: Mapping[str, Scored]) -> None:
+        now = time.monotonic()
+        if now - self._told < _PROGRESS_SECONDS:
+            return
+        before, done = self._recent
+        rate = (self._joiner.done - done) / (now - before)
+        self._told, self._recent = now, (now, self._joiner.done)
+        errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
+        tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
+
+    def finish(self, status: int, how: str) -> int:
+        """Close the view, write the summary, tell the launcher; the exit status of the run."""
+        safe = self._recording.close() if self._recording is not None else True
+        digests = {name: digest_of(self._scenario, blocks) for name, blocks in self._joiner.digests.items()}
+        summary = summary_of(self._scenario, self._keeper.tallies, digests, Ending(self._ended - self._started, how))
+        if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
+            status = RunError.exit_status
+            summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+        if status == 0 and not all(expectation["held"] for expectation in summary["expectations"]):
+            status = 1
+        try:
+            write_summary(self.folder, summary)
+        except OSError as error:
+            status = RunError.exit_status
+            summary["ended"] = f"the results cannot be written ({error}); free some room and run again"
+        tell("ended", status=status, how=summary["ended"], view=self._recording.failure if self._recording else None)
+        if not safe:
+            os._exit(status)
+        return status
+
+
+def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
+    """All rows of some slots."""
+    for name, one in scored.items():
+        writer.slot_rows(slots.first, name, one.sums, one.expected)
+    writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
+    writer.journal_rows(slots)
+
+
+def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -> Recording:
+    """The run's recording, on disk and, with the address of a viewer, live."""
+    from emulator.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
+    from emulator.view.scene import Scene, Shown  # noqa: PLC0415 - the same
+
+    quality = scenario.quality
+    strategies = {name: table.strategy for name, table in scenario.eavesdroppers.items()}
+    receivers = [
+        Shown(
+            name,
+            "legitimate" if name == LEGITIMATE else "eavesdropper",
+            strategies.get(name, scenario.encoding.scheme),
+            quality[name],
+        )
+        for name in scenario.receivers
+    ]
+    scene = Scene(
+        title=scenario.title,
+        run=run,
+        slots=scenario.slots,
+        trials=scenario.trials,
+        n=len(scenario.process.A),
+        pace=scenario.pace,
+        receivers=tuple(receivers),
+    )
+    return Recording(path, scene, live)
+
+
+def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
+    """Some slots as the view takes them: the first recorded trial, and means over all."""
+    from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
+    from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
+
+    peers = {
+        name: PeerSlots(
+            x_hat=receiver.x_hat[:, :, 0],
+            P=receiver.P[:, :, :, 0],
+            action=receiver.action[:, 0],
+            squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
+            trace=receiver.trace[:, 0] / slots.trials,
+            expected_trace=scored[name].expected,
+        )
+        for name, receiver in slots.receivers.items()
+    }
+    return ShownSlots(first=slots.first, x=slots.x[:, :, 0], nu=slots.nu[:, 0], peers=peers)

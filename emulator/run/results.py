@@ -1,0 +1,297 @@
+"""The results folder: written while the run goes on, whole whenever it ends, and read back as typed tables.
+
+Source: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from emulator.errors import UsageError
+from emulator.model.digest import DIGEST_BYTES, Digests
+from emulator.model.process import Floats
+from emulator.model.receiver import Action, Codes, Flags
+from emulator.network.wire import packed_flags
+from emulator.run.joined import Slots
+from emulator.run.score import SlotSums
+
+_ROWS = 65_536  # rows of a table held back until they are worth writing
+
+SLOTS = pa.schema(
+    [
+        ("slot", pa.int64()),
+        ("peer", pa.dictionary(pa.int8(), pa.string())),
+        ("trials", pa.int64()),
+        ("mean_squared_error", pa.float64()),
+        ("standard_error", pa.float64()),
+        ("mean_trace_covariance", pa.float64()),
+        ("expected_trace_covariance", pa.float64()),
+        ("received_fraction", pa.float64()),
+        ("used_fraction", pa.float64()),
+    ]
+)
+JOURNAL = pa.schema(
+    [
+        ("slot", pa.int64()),
+        ("link", pa.dictionary(pa.int8(), pa.string())),
+        ("offered", pa.int64()),
+        ("delivered", pa.int64()),
+        ("lost", pa.int64()),
+        ("delivered_mask", pa.binary()),
+    ]
+)
+ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
+"""What a receiver did, as the observer knows it: `misled` is an innovation used as the state."""
+
+
+def _trials_schema(n: int) -> pa.Schema:
+    return pa.schema(
+        [
+            ("slot", pa.int64()),
+            ("peer", pa.dictionary(pa.int8(), pa.string())),
+            ("trial", pa.int64()),
+            ("sent", pa.dictionary(pa.int8(), pa.string())),
+            ("action", pa.dictionary(pa.int8(), pa.string())),
+            ("squared_error", pa.float64()),
+            ("trace_covariance", pa.float64()),
+            ("x", pa.list_(pa.float64(), n)),
+            ("x_hat", pa.list_(pa.float64(), n)),
+            ("P", pa.list_(pa.float64(), n * n)),
+        ]
+    )
+
+
+DIGESTS = pa.schema(
+    [
+        ("peer", pa.dictionary(pa.int8(), pa.string())),
+        ("trial", pa.int64()),
+        ("block", pa.int64()),
+        ("digest", pa.binary(DIGEST_BYTES)),
+    ]
+)
+
+
+def _coded(codes: NDArray[Any], names: tuple[str, ...]) -> pa.Array:
+    return pa.DictionaryArray.from_arrays(pa.array(np.ascontiguousarray(codes, np.int8)), pa.array(names))
+
+
+def _fixed(values: Floats) -> pa.Array:
+    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values).reshape(-1)), values.shape[-1])
+
+
+class _Table:
+    """A Parquet file that grows. Rows are held back until there are enough for a row group."""
+
+    def __init__(self, path: Path, schema: pa.Schema) -> None:
+        self._writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1)
+        self._schema = schema
+        self._held: list[pa.RecordBatch] = []
+        self._rows = 0
+
+    def add(self, columns: list[Any]) -> None:
+        batch = pa.RecordBatch.from_arrays(
+            [pa.array(c) if isinstance(c, np.ndarray) else c for c in columns], schema=self._schema
+        )
+        self._held.append(batch)
+        self._rows += batch.num_rows
+        if self._rows >= _ROWS:
+            self._write()
+
+    def _write(self) -> None:
+        if self._held:
+            self._writer.write_table(pa.Table.from_batches(self._held, self._schema).combine_chunks())
+        self._held, self._rows = [], 0
+
+    def close(self) -> None:
+        try:
+            self._write()
+        finally:
+            self._writer.close()
+
+
+class ResultsWriter:
+    """Writes a results folder. Final; use it as a context manager, so that whatever ends the run, the files are whole."""
+
+    def __init__(self, folder: Path, receivers: tuple[str, ...], n: int) -> None:
+        self._receivers = receivers
+        self._slots = _Table(folder / "slots.parquet", SLOTS)
+        self._trials = _Table(folder / "trials.parquet", _trials_schema(n))
+        self._journal = _Table(folder / "journal.parquet", JOURNAL)
+        self._digests = _Table(folder / "digests.parquet", DIGESTS)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for table in (self._slots, self._trials, self._journal, self._digests):
+            table.close()
+
+    def slot_rows(self, first: int, name: str, sums: SlotSums, expected: Floats) -> None:
+        """A row per slot: statistics over trials of one receiver; expected is the trace that theory gives, (c,)."""
+        count, trials = len(expected), sums.trials
+        mean = sums.squared_error / trials
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            variance = np.maximum(0.0, sums.squared_error_squared / trials - mean * mean) * trials / (trials - 1)
+            standard_error = np.sqrt(variance / trials) if trials > 1 else np.full(count, np.nan)
+        self._slots.add(
+            [
+                np.arange(first, first + count),
+                self._names(name, count),
+                np.full(count, trials),
+                mean,
+                standard_error,
+                sums.trace / trials,
+                expected,
+                sums.received / trials,
+                sums.used / trials,
+            ]
+        )
+
+    def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
+        """A row per slot, receiver and recorded trial, the first of which is first_trial: everything."""
+        for name, receiver in slots.receivers.items():
+            recorded = receiver.P.shape[3]
+            count = slots.count * recorded
+            nu = slots.nu[:, :recorded]
+            P = np.moveaxis(receiver.P, 3, 1).reshape(count, -1)
+            self._trials.add(
+                [
+                    np.repeat(np.arange(slots.first, slots.first + slots.count), recorded),
+                    self._names(name, count),
+                    np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
+                    _coded(nu.reshape(-1), ("state", "innovation")),
+                    _coded(seen_actions(receiver.action[:, :recorded], nu).reshape(-1), ACTIONS),
+                    np.ascontiguousarray(squared_errors[name][:, :recorded]).reshape(-1),
+                    np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
+                    _fixed(slots.x[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)),
+                    _fixed(receiver.x_hat[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)),
+                    _fixed(P),
+                ]
+            )
+
+    def journal_rows(self, slots: Slots) -> None:
+        """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
+        for name, receiver in slots.receivers.items():
+            masks = [mask.tobytes() for mask in packed_flags(receiver.delivered)]
+            self._journal.add(
+                [
+                    np.arange(slots.first, slots.first + slots.count),
+                    self._names(name, slots.count),
+                    np.full(slots.count, slots.trials),
+                    np.count_nonzero(receiver.delivered, axis=1),
+                    receiver.lost["lost"].astype(np.int64),
+                    pa.array(masks, pa.binary()),
+                ]
+            )
+
+    def _names(self, name: str, count: int) -> pa.Array:
+        return _coded(np.full(count, self._receivers.index(name)), self._receivers)
+
+    def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
+        """A row per receiver, trial and block: receiver → block → digests (R, 32) of the trials from first_trial on."""
+        for name, blocks in digests.items():
+            for block, values in sorted(blocks.items()):
+                trials = len(values)
+                digest = pa.FixedSizeBinaryArray.from_buffers(
+                    pa.binary(DIGEST_BYTES), trials, [None, pa.py_buffer(np.ascontiguousarray(values))]
+                )
+                numbers = np.arange(first_trial, first_trial + trials)
+                self._digests.add([self._names(name, trials), numbers, np.full(trials, block), digest])
+
+
+def seen_actions(action: Codes, nu: Flags) -> Codes:
+    """Indices into `ACTIONS`: what was done, with the truth about the packet's type."""
+    misled = (action == Action.STATE) & nu
+    return np.where(misled, np.uint8(ACTIONS.index("misled")), action)
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write summary.json; infinite and undefined numbers as strings, which JSON lacks."""
+    (folder / "summary.json").write_text(json.dumps(_plain(summary), indent=1, ensure_ascii=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    return value
+
+
+@dataclass(frozen=True)
+class Results:
+    """A results folder, read: `summary` as in docs/results.md, the tables as Arrow."""
+
+    folder: Path
+    summary: Mapping[str, Any]
+
+    def _table(self, name: str) -> pa.Table:
+        path = self.folder / f"{name}.parquet"
+        try:
+            return pq.read_table(path)
+        except (OSError, pa.ArrowInvalid) as error:
+            raise UsageError(f"{path} cannot be read ({error}); run the scenario again") from error
+
+    @property
+    def slots(self) -> pa.Table:
+        """A row per slot and peer: statistics over trials."""
+        return self._table("slots")
+
+    @property
+    def trials(self) -> pa.Table:
+        """A row per slot, peer and recorded trial."""
+        return self._table("trials")
+
+    @property
+    def journal(self) -> pa.Table:
+        """A row per slot and link."""
+        return self._table("journal")
+
+    @property
+    def digests(self) -> pa.Table:
+        """A row per peer, trial and block of 256 slots."""
+        return self._table("digests")
+
+
+def load_results(folder: str | Path) -> Results:
+    """Read a results folder. Raises UsageError if it is none, naming the file that is missing or broken."""
+    path = Path(folder) / "summary.json"
+    try:
+        summary = json.loads(path.read_text())
+    except OSError as error:
+        raise UsageError(
+            f"{folder} is no results folder ({path.name}: {error.strerror}); give the --out of a run"
+        ) from error
+    except ValueError as error:
+        raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
+    return Results(Path(folder), summary)
+
+
+def new_folder(folder: Path) -> Path:
+    """Create a results folder. Raises UsageError if it has something in it or cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise UsageError(f"{folder} is not empty; give another --out, or empty it")
+        (folder / "logs").mkdir()
+    except NotADirectoryError as error:
+        raise UsageError(f"{folder}: a part of it is a file; give another --out") from error
+    except FileExistsError as error:
+        raise UsageError(f"{folder} is a file; give another --out") from error
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error
+    return folder

@@ -1,0 +1,129 @@
+"""Keeps the score of a run, live or in memory: theory beside every slot, a tally per receiver, and the summary."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import tomli_w
+
+from emulator.model.digest import BLOCK_SLOTS, Digests, RunDigest
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.process import Floats
+from emulator.model.theory import ExpectedCovariance, Outcomes
+from emulator.network.access import LEGITIMATE
+from emulator.run.joined import Slots
+from emulator.run.score import SlotSums, Tally, slot_sums, squared_errors
+from emulator.run.verdict import Secrecy, secrecy
+from emulator.scenario import ExpectTable, Scenario
+
+
+def outcomes_of(scenario: Scenario) -> dict[str, Outcomes]:
+    """Receiver → the probabilities its expected covariance follows from."""
+    mu_d, quality = scenario.encoding.mu_d, scenario.quality
+    outcomes = {LEGITIMATE: Outcomes.legitimate(quality[LEGITIMATE], mu_d)}
+    for name, table in scenario.eavesdroppers.items():
+        use_state, use_innovation = STRATEGIES[table.strategy].use_probabilities(table.parameters)
+        outcomes[name] = Outcomes.eavesdropper(quality[name], mu_d, use_state, use_innovation)
+    return outcomes
+
+
+class Scored(NamedTuple):
+    """One receiver over c slots, scored."""
+
+    squared_error: Floats
+    """(c, R)."""
+    sums: SlotSums
+    expected: Floats
+    """Theory: trace of the expected actual error covariance, (c,)."""
+
+
+class Scorekeeper:
+    """Scores the slots of a batch of trials, in order. Final."""
+
+    def __init__(self, scenario: Scenario, trials: int) -> None:
+        process = scenario.process.process
+        self._theory = {name: ExpectedCovariance(process, one) for name, one in outcomes_of(scenario).items()}
+        self.tallies = {name: Tally(scenario.slots, trials) for name in scenario.receivers}
+
+    def expected(self, slots: int) -> dict[str, Floats]:
+        """Theory of the next slots alone: receiver → trace of the expected actual error covariance, (slots,)."""
+        return {name: theory.next_traces(slots) for name, theory in self._theory.items()}
+
+    def add(self, slots: Slots) -> dict[str, Scored]:
+        """Score the next slots: receiver → its errors, sums and theory."""
+        scored, expected = {}, self.expected(slots.count)
+        for name, receiver in slots.receivers.items():
+            errors = squared_errors(slots, receiver)
+            one = Scored(errors, slot_sums(receiver, errors), expected[name])
+            self.tallies[name].add(slots.first, receiver, *one)
+            scored[name] = one
+        return scored
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended."""
+
+    wall_seconds: float
+    """Start command to last row on disk."""
+    how: str = "complete"
+    """`complete`, `interrupted`, or why it failed."""
+
+
+def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
+    """The verdict on every eavesdropper."""
+    process, outcomes = scenario.process.process, outcomes_of(scenario)
+    user = (tallies[LEGITIMATE], outcomes[LEGITIMATE])
+    return [secrecy(process, user, (name, tallies[name], outcomes[name])) for name in scenario.eavesdroppers]
+
+
+def summary_of(
+    scenario: Scenario, tallies: Mapping[str, Tally], digests: Mapping[str, str | None], ending: Ending
+) -> dict[str, Any]:
+    """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
+    peers = {name: {**tally.figures, "digest": digests[name]} for name, tally in tallies.items()}
+    done = tallies[LEGITIMATE].done
+    return {
+        "scenario": scenario.title,
+        "seed": scenario.seed,
+        "slots": done,
+        "trials": scenario.trials,
+        "first_trial": scenario.first_trial,
+        "wall_seconds": ending.wall_seconds,
+        "slots_per_second": done / ending.wall_seconds if ending.wall_seconds else 0.0,
+        "ended": ending.how,
+        "peers": peers,
+        "links": {name: tally.link for name, tally in tallies.items()},
+        "secrecy": {one.eavesdropper: one.as_dict() for one in verdicts(scenario, tallies)},
+        "expectations": [_expectation(expect, peers) for expect in scenario.expect],
+    }
+
+
+def _expectation(expect: ExpectTable, peers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    receiver, figure = expect.figure.split(".")
+    found = peers[receiver][figure]
+    return {"text": expect.text, "held": expect.holds(found), "found": found}
+
+
+def digest_of(scenario: Scenario, blocks: Mapping[int, Digests]) -> str | None:
+    """A receiver's digest from all its blocks; None if the run was cut short."""
+    if len(blocks) != -(-scenario.slots // BLOCK_SLOTS):
+        return None
+    digest = RunDigest()
+    digest.add(blocks)
+    return digest.hexadecimal
+
+
+def resolved(scenario: Scenario) -> str:
+    """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
+    tables = scenario.model_dump(mode="json", exclude_none=True)
+    tables["made_with"] = {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
+    }
+    text: str = tomli_w.dumps(tables)
+    return text

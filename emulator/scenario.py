@@ -1,0 +1,422 @@
+"""The scenario file: its schema, its checks, and what it means. All mistakes are reported at once.
+
+Source: docs/scenario.md.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from emulator.errors import ScenarioError, UsageError
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.process import Process, mistakes_of
+from emulator.model.schemes import SCHEMES
+from emulator.network.access import LEGITIMATE, RESERVED
+
+NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + (" or " if len(names) > 1 else "") + names[-1]
+
+
+def _expected(what: str) -> PydanticCustomError:
+    """The error of one value: the line will say what was found and that this was expected."""
+    return PydanticCustomError("expected", "one value", {"expected": what})
+
+
+def _probability(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise _expected("a number from 0 to 1")
+    return value
+
+
+def _one_of(names: Iterable[str]) -> Callable[[str], str]:
+    def check(value: str) -> str:
+        if value not in names:
+            raise _expected(_listed(sorted(names)))
+        return value
+
+    return check
+
+
+def _process_name(name: str) -> str:
+    if name in RESERVED:
+        raise _expected(f"any name but {_listed(RESERVED)}, which are reserved")
+    if not NAME.fullmatch(name):
+        raise _expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
+    return name
+
+
+Probability = Annotated[float, Field(strict=True, examples=[0.9]), AfterValidator(_probability)]
+ProcessName = Annotated[str, AfterValidator(_process_name)]
+Matrix = Annotated[list[list[Annotated[float, Field(strict=True)]]], Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _mistakes(found: Sequence[tuple[str, str]]) -> PydanticCustomError:
+    return PydanticCustomError("mistakes", "several", {"mistakes": list(found)})
+
+
+class ProcessTable(_Table):
+    """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance)."""
+
+    A: Matrix
+    Q: Matrix
+    initial_covariance: Matrix
+
+    @model_validator(mode="after")
+    def _is_a_process(self) -> Self:
+        ragged = [
+            (name, "has rows of different lengths; expected a square matrix, such as [[1.0, 0.3], [0.5, 1.001]]")
+            for name, rows in (("A", self.A), ("Q", self.Q), ("initial_covariance", self.initial_covariance))
+            if len({len(row) for row in rows}) > 1
+        ]
+        found = ragged or mistakes_of(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
+        if found:
+            raise _mistakes(found)
+        return self
+
+    @property
+    def process(self) -> Process:
+        """The process it describes."""
+        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
+
+
+class EncodingTable(_Table):
+    """`[encoding]`: the scheme, and μ_d for those that mix states and innovations."""
+
+    scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(_one_of(SCHEMES))]
+    state_probability: Probability | None = None
+
+    @model_validator(mode="after")
+    def _fits_the_scheme(self) -> Self:
+        mixes = SCHEMES[self.scheme].mixes
+        if mixes and self.state_probability is None:
+            raise _mistakes([("state_probability", "is missing; expected a number from 0 to 1, such as 0.6")])
+        if not mixes and self.state_probability is not None:
+            what = f"is set, but the scheme {self.scheme} sends the state always; remove the line"
+            raise _mistakes([("state_probability", what)])
+        return self
+
+    @property
+    def mu_d(self) -> float:
+        """μ_d; 1 for a scheme that always sends the state."""
+        return 1.0 if self.state_probability is None else self.state_probability
+
+
+class LinkTable(_Table):
+    """`link = {…}`: how packets get from the router to one receiver."""
+
+    quality: Probability
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """What the router is told."""
+        return {"model": "bernoulli", "quality": self.quality}
+
+
+class LegitimateTable(_Table):
+    """`[legitimate]`."""
+
+    link: LinkTable
+
+
+class EavesdropperTable(_Table):
+    """`[eavesdroppers.NAME]`: a strategy with its parameters, and a link."""
+
+    strategy: Annotated[str, Field(strict=True, examples=["smart"]), AfterValidator(_one_of(STRATEGIES))]
+    link: LinkTable
+    use_state: Probability | None = None
+    use_innovation: Probability | None = None
+
+    @model_validator(mode="after")
+    def _fits_the_strategy(self) -> Self:
+        wanted = STRATEGIES[self.strategy].parameters
+        found = []
+        for name in ("use_state", "use_innovation"):
+            if name in wanted and getattr(self, name) is None:
+                found.append(
+                    (name, f"is missing; the strategy {self.strategy} needs a number from 0 to 1, such as 0.5")
+                )
+            if name not in wanted and getattr(self, name) is not None:
+                found.append((name, f"is set, but the strategy {self.strategy} has no such parameter; remove the line"))
+        if found:
+            raise _mistakes(found)
+        return self
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The strategy's parameters."""
+        return {name: getattr(self, name) for name in STRATEGIES[self.strategy].parameters}
+
+
+class ExpectTable(_Table):
+    """`[[expect]]`: what a figure of the summary must be for the run to pass."""
+
+    figure: Annotated[str, Field(examples=["legitimate.mean_squared_error"])]
+    below: Annotated[float, Field(strict=True)] | None = None
+    above: Annotated[float, Field(strict=True)] | None = None
+
+    @model_validator(mode="after")
+    def _says_something(self) -> Self:
+        if self.below is None and self.above is None:
+            raise _mistakes([("below", "and above are both missing; expected at least one, such as below = 0.01")])
+        return self
+
+    @property
+    def text(self) -> str:
+        """As a sentence."""
+        bounds = [f"below {self.below:g}"] if self.below is not None else []
+        bounds += [f"above {self.above:g}"] if self.above is not None else []
+        return f"{self.figure} {' and '.join(bounds)}"
+
+    def holds(self, found: float) -> bool:
+        """Whether the figure is within the bounds."""
+        return (self.below is None or found < self.below) and (self.above is None or found > self.above)
+
+
+FIGURES = (
+    "mean_squared_error",
+    "mean_trace_covariance",
+    "expected_trace_covariance",
+    "received_fraction",
+    "used_fraction",
+)
+
+
+class Scenario(_Table):
+    """One scenario, checked."""
+
+    title: Annotated[str, Field(min_length=1, examples=["Two eavesdroppers beside a planar vehicle"])]
+    slots: Annotated[int, Field(ge=1, le=2**32, strict=True, examples=[2000])]
+    seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
+    trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
+    first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
+    record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
+    pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
+    secret_file: str | None = None
+    process: ProcessTable
+    encoding: EncodingTable
+    legitimate: LegitimateTable
+    eavesdroppers: Annotated[dict[ProcessName, EavesdropperTable], Field(max_length=64)] = {}
+    expect: list[ExpectTable] = []
+    made_with: Annotated[dict[str, str], Field(exclude=True)] = {}
+
+    @property
+    def receivers(self) -> tuple[str, ...]:
+        """All receivers, the legitimate one first."""
+        return (LEGITIMATE, *self.eavesdroppers)
+
+    @property
+    def quality(self) -> dict[str, float]:
+        """Receiver → probability that a packet reaches it: μ, μ_e."""
+        return {name: self.link(name).quality for name in self.receivers}
+
+    def link(self, receiver: str) -> LinkTable:
+        """A receiver's link."""
+        return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].link
+
+
+def shipped() -> dict[str, Path]:
+    """The scenarios inside the package: name → file."""
+    folder = Path(str(resources.files("scenarios")))
+    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"))}
+
+
+def write_new(path: Path) -> None:
+    """Write the commented scenario to start from. Raises UsageError if the file is there or cannot be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(Path(str(resources.files("scenarios"))).joinpath("_new.toml").read_text(encoding="utf-8"))
+    except FileExistsError as error:
+        raise UsageError(f"{path} is there already; give another name") from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror}); give another place") from error
+
+
+def load(source: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
+    """The scenario of a shipped name or a file, with changes by dotted key.
+
+    Raises ScenarioError with every mistake, UsageError if there is no such scenario.
+    """
+    return parse(read(source), str(source), changes)
+
+
+def read(source: str | Path) -> str:
+    """The text of a shipped scenario or a file."""
+    path = shipped().get(str(source), Path(source))
+    try:
+        return path.read_text(encoding="utf-8")
+    except IsADirectoryError as error:
+        inner = path / "scenario.toml"
+        if inner.is_file():
+            return inner.read_text(encoding="utf-8")
+        raise UsageError(f"{source} is a folder without a scenario.toml; give a scenario's name or file") from error
+    except OSError as error:
+        near = difflib.get_close_matches(str(source), shipped(), 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise UsageError(
+            f"no scenario {source} ({error.strerror}); {hint}`evedrop list` shows the shipped ones"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{source} is not text in UTF-8 ({error.reason}); a scenario is a TOML file") from error
+
+
+def parse(text: str, source: str, changes: Mapping[str, Any] | None = None) -> Scenario:
+    """The scenario in a TOML text. Raises ScenarioError with every mistake."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(source, [f"not TOML: {error}"]) from error
+    for key, value in (changes or {}).items():
+        _set(tables, key, value)
+    try:
+        scenario = Scenario.model_validate(tables)
+    except ValidationError as error:
+        raise ScenarioError(source, [*_sentences(error), *_across_tables(tables)]) from error
+    mistakes = _across_tables(tables)
+    if mistakes:
+        raise ScenarioError(source, mistakes)
+    return scenario
+
+
+def _across_tables(tables: Mapping[str, Any]) -> list[str]:
+    """What only shows across tables, asked as far as a faulty file allows it: horizon, trials, figures."""
+    found: list[str] = []
+    slots, trials, recorded = (tables.get(name, 1) for name in ("slots", "trials", "record_trials"))
+    try:
+        process = ProcessTable.model_validate(tables.get("process")).process
+    except ValidationError:
+        process = None
+    if process is not None and type(slots) is int and 1 <= slots <= 2**32:
+        found += _horizon_mistakes(process, slots)
+    if type(trials) is int and type(recorded) is int and recorded > trials:
+        found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
+    eavesdroppers, expectations = tables.get("eavesdroppers", {}), tables.get("expect", [])
+    if isinstance(eavesdroppers, dict) and isinstance(expectations, list):
+        available = [f"{receiver}.{figure}" for receiver in (LEGITIMATE, *eavesdroppers) for figure in FIGURES]
+        for i, expectation in enumerate(expectations):
+            figure = expectation.get("figure") if isinstance(expectation, dict) else None
+            if isinstance(figure, str) and figure not in available:
+                near = difflib.get_close_matches(figure, available, 1)
+                hint = f"; did you mean {near[0]}?" if near else ""
+                names = f"RECEIVER ({', '.join((LEGITIMATE, *eavesdroppers))}).FIGURE ({', '.join(FIGURES)})"
+                found.append(f"expect.{i}.figure: is {figure!r}; expected {names}{hint}")
+    return found
+
+
+def _horizon_mistakes(process: Process, slots: int) -> list[str]:
+    """Why so many slots are too many, if they are (docs/mathematics.md, horizon)."""
+    last = process.horizon(slots)
+    if last is None:
+        return []
+    return [
+        f"slots: is {slots}; this process (spectral radius {process.spectral_radius:.4g}) can be followed up to slot "
+        f"{last}: beyond it float64 rounds off more than 1 % of the process noise inside a state this large. Ways out: "
+        f"slots = {last + 1} or fewer; a smaller initial_covariance or a larger Q; an A with a smaller spectral radius"
+    ]
+
+
+def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
+    *above, last = dotted.split(".")
+    inner: Any = tables
+    for name in above:
+        if isinstance(inner, list) and name.isdigit() and int(name) < len(inner):
+            inner = inner[int(name)]
+        elif isinstance(inner, dict):
+            inner = inner.setdefault(name, {})
+        else:
+            raise UsageError(f"--set {dotted}: {name} is not in a table; give the dotted key of a scenario entry")
+    if not isinstance(inner, dict):
+        raise UsageError(f"--set {dotted}: {last} is not in a table; give the dotted key of a scenario entry")
+    inner[last] = value
+
+
+def value_of(text: str) -> Any:
+    """A value on the command line: as TOML, else as a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+_EXPECTED: Mapping[str, str] = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "a string",
+    "list_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "bool_type": "true or false",
+    "finite_number": "a finite number",
+}
+
+
+def _sentences(error: ValidationError) -> list[str]:
+    """One line for each mistake: path, found, expected, example."""
+    lines = []
+    for detail in error.errors(include_url=False):
+        path = ".".join(str(part) for part in detail["loc"] if part != "[key]")
+        if detail["type"] == "mistakes":
+            inner: list[tuple[str, str]] = detail["ctx"]["mistakes"]
+            lines += [f"{path}.{name}: {what}" if path else f"{name}: {what}" for name, what in inner]
+        else:
+            lines.append(f"{path}: {_sentence(detail)}")
+    return lines
+
+
+def _sentence(detail: ErrorDetails) -> str:
+    kind, found, context = detail["type"], detail["input"], detail.get("ctx", {})
+    table, field = _field(detail["loc"])
+    example = f", such as {field.examples[0]}" if field is not None and field.examples else ""
+    if kind == "missing":
+        return f"is missing; expected it{example}"
+    if kind == "extra_forbidden":
+        known = [name for name in table.model_fields if name != "made_with"] if table is not None else []
+        near = difflib.get_close_matches(str(detail["loc"][-1]), known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
+        return f"is no entry of this table; {hint}"
+    if kind == "expected":
+        return f"is {found!r}; expected {context['expected']}{example}"
+    if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
+        words = {"ge": "at least", "le": "at most", "lt": "less than"}
+        bound = " and ".join(f"{words[name]} {context[name]:g}" for name in words if name in context)
+        return f"is {found!r}; expected a number {bound}{example}"
+    expected = _EXPECTED.get(kind, detail["msg"])
+    return f"is {found!r}; expected {expected}{example}"
+
+
+def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
+    """The table an error is in, and the field's description if it is a field."""
+    table: type[BaseModel] | None = Scenario
+    field = None
+    inner: Mapping[str, type[BaseModel]] = {
+        "process": ProcessTable,
+        "encoding": EncodingTable,
+        "legitimate": LegitimateTable,
+        "link": LinkTable,
+        "eavesdroppers": EavesdropperTable,
+        "expect": ExpectTable,
+    }
+    for i, part in enumerate(location):
+        if table is not None and part in table.model_fields:
+            field = table.model_fields[str(part)]
+            if part in inner and i < len(location) - 1:
+                table, field = inner[str(part)], None
+        elif i == len(location) - 1:
+            field = None
+    return table, field
