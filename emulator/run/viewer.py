@@ -38,7 +38,7 @@ def has_screen() -> bool:
 
 
 def choose(mode: str) -> str:
-    """ "native", "web" or "off", from these or "auto": native with a screen, else web.
+    """One of "native", "web" and "off", from these or "auto": native with a screen, else web.
 
     Raises UsageError for any other word, and for "native" without a screen.
     """

@@ -1,0 +1,94 @@
+"""A picture of a finished recording, taken without a screen.
+
+Needs a Vulkan driver; software will do, such as Debian's mesa-vulkan-drivers.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rerun.experimental import ViewerClient
+
+from emulator.errors import UsageError
+from emulator.run.launcher import free_port
+from emulator.run.viewer import end, spawn
+from emulator.view.paths import TIMELINE
+
+_LOAD_SECONDS = 60.0
+_SETTLE_SECONDS = 30.0
+
+
+def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950)) -> list[str]:
+    """Draw the last moment of a recording into a PNG file of this size; what the panels complain about, if anything.
+
+    Raises UsageError if there is no Vulkan driver or the recording cannot be loaded.
+    """
+    with opened(rrd, size) as viewer:
+        png.write_bytes(viewer.take_screenshot())
+        return reports(viewer)
+
+
+def reports(viewer: ViewerClient) -> list[str]:
+    """What the panels complain about: "panel: complaint"."""
+    return [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
+
+
+@contextmanager
+def opened(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
+    """A headless viewer that has loaded a recording and shows its last moment, ready to be drawn.
+
+    Raises UsageError as `picture` does.
+    """
+    if not rrd.is_file():
+        raise UsageError(f"{rrd} does not exist; give the recording.rrd of a results folder")
+    port = free_port()
+    arguments = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen", str(rrd.resolve())]
+    with tempfile.TemporaryDirectory() as folder:
+        logs = Path(folder)
+        try:
+            # The viewer would announce in the picture that it draws without a graphics card.
+            process = spawn(port, arguments, logs, environment={"RUST_LOG": "error"})
+        except UsageError as error:
+            raise UsageError(_without_driver(str(error)) or str(error)) from error
+        try:
+            viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            _show_the_end(viewer)
+            yield viewer
+        except RuntimeError as error:
+            log = (logs / "viewer.log").read_text(errors="replace")
+            raise UsageError(_without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
+        finally:
+            end(process)
+
+
+def _show_the_end(viewer: ViewerClient) -> None:
+    deadline = time.monotonic() + _LOAD_SECONDS
+    while (last := _last_slot(viewer)) is None:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"the recording was not loaded within {_LOAD_SECONDS:.0f} s")
+        time.sleep(0.05)
+    viewer.set_time(TIMELINE, sequence=last, play_state="paused")
+    deadline = time.monotonic() + _SETTLE_SECONDS
+    before, now = b"", viewer.take_screenshot()
+    while now != before and time.monotonic() < deadline:
+        time.sleep(0.2)
+        before, now = now, viewer.take_screenshot()
+
+
+def _last_slot(viewer: ViewerClient) -> int | None:
+    """The recording's last slot, once it and its layout are there."""
+    state = viewer.get_state()
+    if state.loading or not state.views:
+        return None
+    ends = [line.end for recording in state.recordings for line in recording.timelines if line.name == TIMELINE]
+    return int(ends[0]) if ends and ends[0] is not None else None
+
+
+def _without_driver(log: str) -> str | None:
+    if "adapter" not in log.lower():
+        return None
+    return "no Vulkan driver to draw with; install one, on Debian: apt-get install mesa-vulkan-drivers"
