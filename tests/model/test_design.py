@@ -1,0 +1,228 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.errors import UsageError
+from emulator.model.design import (
+    Adversary,
+    adversary_bound,
+    best_difference,
+    best_ratio,
+    design,
+    least_state_probability,
+    perfect_secrecy,
+    relative_secrecy,
+)
+from emulator.model.process import Process
+from emulator.model.theory import Outcomes, limit_trace, stability_bound
+
+EXAMPLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.eye(2))
+MICROGRID = Process(np.eye(2), 1e-5 * np.eye(2), 1e-5 * np.eye(2))
+LOW = 0.534206
+
+
+def smart(mu_e: float) -> Adversary:
+    """A smart eavesdropper behind a link of quality μ_e."""
+    return Adversary("smart", mu_e, 1.0, 0.0)
+
+
+NAIVE = Adversary("naive", 0.9, 1.0, 1.0)
+
+
+def J(process: Process, mu: float, mu_d: float) -> float:
+    """The legitimate limiting trace."""
+    return limit_trace(process, Outcomes.legitimate(mu, mu_d))
+
+
+@pytest.mark.parametrize(
+    ("mu_e", "bound", "relative", "difference", "ratio"),
+    [
+        (0.85, 0.565630, (LOW, 1.0), None, None),
+        (0.90, 0.534206, (LOW, 1.0), None, None),
+        (0.95, 0.506090, (0.54153, 0.93882), 0.55709, 0.6297),
+        (0.99, 0.485642, (0.54790, 0.89331), 0.57447, 0.6445),
+    ],
+)
+def test_numerical_illustration(
+    mu_e: float, bound: float, relative: tuple[float, float], difference: float | None, ratio: float | None
+) -> None:
+    """The four eavesdroppers of the numerical illustration, to 1e-4 and the bounds to 1e-6."""
+    found = design(EXAMPLE, 0.9, 0.6, [smart(mu_e)], slots=80)
+    against = found.eavesdroppers["smart"]
+    assert found.rho == pytest.approx(1.387799, abs=1e-6)
+    assert found.bound == pytest.approx(LOW, abs=1e-6)
+    assert against.bound == pytest.approx(bound, abs=1e-6)
+    assert len(against.relative) == 1
+    assert against.relative[0] == pytest.approx(relative, abs=1e-4)
+    assert against.best_difference == (None if difference is None else pytest.approx(difference, abs=1e-4))
+    assert against.best_ratio == (None if ratio is None else pytest.approx(ratio, abs=1e-4))
+    assert against.perfect == (pytest.approx((LOW, 0.565630), abs=1e-6) if mu_e == 0.85 else None)
+
+
+def test_optima_are_no_worse_than_any_other_choice() -> None:
+    """A plain search over a grid finds no larger J_r, nor J_r/J, than the optima."""
+    for mu_e in (0.95, 0.99, 1.0):
+        grid = np.linspace(LOW + 1e-4, 1.0, 2000)
+        ours = np.array([J(EXAMPLE, 0.9, mu_d) for mu_d in grid])
+        theirs = np.array([limit_trace(EXAMPLE, smart(mu_e).outcomes(mu_d)) for mu_d in grid])
+        for found, gains in (
+            (best_difference(EXAMPLE, 0.9, smart(mu_e)), theirs - ours),
+            (best_ratio(EXAMPLE, 0.9, smart(mu_e)), theirs / ours),
+        ):
+            assert found == pytest.approx(grid[gains.argmax()], abs=2 * (grid[1] - grid[0]))
+
+
+qualities = st.floats(0.3, 1.0)
+
+
+@given(st.floats(1.0, 1.3), st.floats(-0.5, 0.5), qualities, qualities, st.floats(0.02, 0.98))
+@settings(deadline=None, max_examples=12)
+def test_relative_secrecy_is_the_sign_of_the_difference(
+    growth: float, coupling: float, mu: float, mu_e: float, at: float
+) -> None:
+    """A μ_d lies in an interval of relative secrecy exactly when J is bounded and J < J_e there."""
+    process = Process(np.array([[growth, coupling], [0.0, 0.9]]), np.diag([1.0, 0.5]), np.eye(2))
+    low = stability_bound(process, mu)
+    intervals = relative_secrecy(process, mu, smart(mu_e))
+    if low >= 1.0:
+        assert intervals == ()
+        return
+    mu_d = low + at * (1.0 - low)
+    ours, theirs = J(process, mu, mu_d), limit_trace(process, smart(mu_e).outcomes(mu_d))
+    if math.isfinite(theirs) and abs(theirs - ours) <= 1e-6 * ours:
+        return
+    assert any(lo < mu_d < hi for lo, hi in intervals) == (ours < theirs)
+    if mu_e <= mu:
+        assert len(intervals) == 1
+        assert intervals[0] == pytest.approx((low, 1.0))
+
+
+@given(st.floats(1.0, 1.3), qualities, qualities)
+@settings(deadline=None, max_examples=30)
+def test_perfect_secrecy_is_where_one_is_bounded_and_the_other_not(growth: float, mu: float, mu_e: float) -> None:
+    """Just inside the interval J is finite and J_e infinite; beyond its upper end J_e is finite."""
+    process = Process(np.diag([growth, 0.7]), np.eye(2), np.eye(2))
+    interval = perfect_secrecy(process, mu, smart(mu_e))
+    if interval is None:
+        assert mu_e >= mu or stability_bound(process, mu) >= 1.0 or growth == 1.0
+        return
+    low, high = interval
+    middle = 0.5 * (low + high)
+    assert math.isfinite(J(process, mu, middle))
+    assert math.isinf(limit_trace(process, smart(mu_e).outcomes(middle)))
+    if high < 1.0:
+        assert math.isfinite(limit_trace(process, smart(mu_e).outcomes(high + 1e-6)))
+
+
+def test_whoever_is_misled_is_kept_out_perfectly() -> None:
+    """Naive and suspicious are unbounded on the whole admissible range; a suspicious one never misled is as smart."""
+    for adversary in (NAIVE, Adversary("suspicious", 0.95, 0.8, 0.3)):
+        found = design(EXAMPLE, 0.9, 0.6, [adversary], slots=80).eavesdroppers[adversary.name]
+        assert found.perfect == pytest.approx((LOW, 1.0), abs=1e-6)
+        assert found.relative == (pytest.approx((LOW, 1.0), abs=1e-6),)
+        assert found.best_difference is None
+        assert math.isinf(found.trace)
+    careful = Adversary("suspicious", 0.95, 0.9, 0.0)
+    assert adversary_bound(EXAMPLE, careful) == pytest.approx(stability_bound(EXAMPLE, 0.95 * 0.9))
+    assert math.isinf(adversary_bound(EXAMPLE, Adversary("weak", 0.4, 1.0, 1.0)))
+
+
+def test_secrecy_in_every_slot_can_fail_early() -> None:
+    """For a better eavesdropper the paper's "for all k" fails first; for one no better it holds from k = 1."""
+    for mu_e, last in ((0.95, 86), (0.99, 58)):
+        best = best_difference(EXAMPLE, 0.9, smart(mu_e))
+        assert best is not None
+        found = design(EXAMPLE, 0.9, best, [smart(mu_e)], slots=400).eavesdroppers["smart"]
+        assert found.violated == tuple(range(1, last + 1))
+        assert found.relative_from == last + 1
+    equal = design(EXAMPLE, 0.9, 0.6, [smart(0.9)], slots=400).eavesdroppers["smart"]
+    assert equal.violated == ()
+    assert equal.relative_from == 1
+    beaten = design(EXAMPLE, 0.9, 0.99, [smart(0.99)], slots=400).eavesdroppers["smart"]
+    assert beaten.relative_from is None
+    assert beaten.difference < 0.0
+
+
+@given(st.floats(1.0, 1.3), st.floats(0.5, 0.99), st.floats(1.001, 1e6))
+@settings(deadline=None, max_examples=40)
+def test_least_state_probability_keeps_the_trace(growth: float, mu: float, factor: float) -> None:
+    """At μ_d_min the trace is Ω."""
+    process = Process(np.diag([growth, 0.7]), np.eye(2), np.eye(2))
+    max_trace = J(process, mu, 1.0) * factor
+    if math.isinf(max_trace):
+        return
+    least = least_state_probability(process, mu, max_trace)
+    assert J(process, mu, least) == pytest.approx(max_trace, rel=1e-5)
+
+
+def test_trace_that_cannot_be_kept_is_refused() -> None:
+    """Ω at or below J(1), or no admissible μ_d at all, is one clear line."""
+    at_one = J(EXAMPLE, 0.9, 1.0)
+    for max_trace in (at_one, 0.5 * at_one, 0.0, -1.0):
+        with pytest.raises(UsageError, match=r"no μ_d keeps the legitimate trace below .* it is 0.000228372; ask for"):
+            least_state_probability(EXAMPLE, 0.9, max_trace)
+    with pytest.raises(UsageError, match="it is unbounded; ask for a larger trace, or improve the legitimate link"):
+        design(EXAMPLE, 0.4, 0.6, [smart(0.9)], slots=80, max_trace=1.0)
+
+
+def test_lossless_link() -> None:
+    """With μ = 1 nothing costs: J ≡ 0, μ_d_min is the stability bound, everybody else is kept out relatively."""
+    found = design(EXAMPLE, 1.0, 0.6, [smart(0.9), NAIVE], slots=80, max_trace=1e-6)
+    assert found.trace == found.plain_trace == 0.0
+    assert found.cost == 1.0
+    assert found.minimum == found.bound == pytest.approx(0.480785, abs=1e-6)
+    against = found.eavesdroppers["smart"]
+    assert against.relative == (pytest.approx((found.bound, 1.0)),)
+    assert against.best_ratio is None
+
+
+def test_deaf_eavesdropper() -> None:
+    """With μ_e = 0 no μ_d bounds its error, even of a marginally stable process."""
+    for process in (EXAMPLE, MICROGRID):
+        found = design(process, 0.9, 0.6, [smart(0.0)], slots=80)
+        against = found.eavesdroppers["smart"]
+        assert math.isinf(against.bound)
+        assert against.perfect == (found.bound, 1.0)
+        assert against.as_dict()["bound"] is None
+
+
+def test_marginally_stable_process() -> None:
+    """For ρ = 1 every μ_d > 0 is admissible, nobody smart is ever kept out perfectly, and the ends are closed form."""
+    found = design(MICROGRID, 0.6, 0.5, [smart(0.6)], slots=80)
+    assert found.admissible == (0.0, 1.0)
+    assert found.eavesdroppers["smart"].perfect is None
+    assert found.eavesdroppers["smart"].relative == ((0.0, 1.0),)
+    assert found.cost == pytest.approx(2.0)
+    ends = relative_secrecy(MICROGRID, 0.6, smart(0.9))
+    assert ends == (pytest.approx((0.0, 1 / 0.9 - (1 / 0.6 - 1)), abs=1e-9),)
+
+
+def test_no_admissible_choice_is_said() -> None:
+    """Below μ = 1 − ρ⁻² the design has no admissible μ_d, says why, and does not crash."""
+    found = design(EXAMPLE, 0.4, 0.6, [smart(0.9), smart(0.3)], slots=80)
+    assert found.admissible is None
+    assert found.remark is not None
+    assert "no μ_d is admissible" in found.remark
+    assert "0.480785" in found.remark
+    against = found.eavesdroppers["smart"]
+    assert (against.perfect, against.relative, against.best_difference, against.best_ratio) == (None, (), None, None)
+    assert math.isnan(against.difference)
+    assert design(EXAMPLE, 0.9, 0.6, [], slots=80).remark is None
+
+
+def test_dictionary_is_strict_json() -> None:
+    """The JSON has exactly the promised keys, and null, never Infinity, for what is unbounded."""
+    found = design(EXAMPLE, 0.9, 0.5, [smart(0.85), NAIVE], slots=80)
+    data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert set(data) == {"rho", "legitimate", "eavesdroppers"}
+    assert set(data["legitimate"]) == {"bound", "trace"}
+    assert data["legitimate"]["trace"] is None
+    for against in data["eavesdroppers"].values():
+        assert set(against) == {"bound", "perfect", "relative", "best_difference", "best_ratio", "trace"}
+    assert data["eavesdroppers"]["smart"]["perfect"] == pytest.approx([LOW, 0.565630], abs=1e-6)
+    asked = design(EXAMPLE, 0.9, 0.6, [], slots=80, max_trace=0.01).as_dict()
+    assert asked["legitimate"]["minimum"] == pytest.approx(0.540427, abs=1e-6)

@@ -1,0 +1,82 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.view import figures_microgrid as microgrid
+from emulator.view.figures import Size, figures
+
+NAMES = ("numerical", "microgrid", "strategies", "chain")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """figures.md of a small set of figures, made in a directory that did not exist."""
+    lines: list[str] = []
+    path = figures(
+        tmp_path_factory.mktemp("figures") / "new" / "folder",
+        lines.append,
+        Size(microgrid_trials=20, microgrid_slots=1000, strategy_trials=2000, chain_trials=50, chain_slots=300),
+    )
+    assert lines, "progress was never reported"
+    return path
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_figure_is_drawn(report: Path, name: str) -> None:
+    """Each figure is there as PNG with something on it, and as PDF, and figures.md shows it."""
+    from matplotlib.image import imread
+
+    picture = imread(report.parent / f"{name}.png")
+    assert picture.shape[0] > 600
+    assert picture.shape[1] > 1200
+    ink = np.mean(picture[:, :, :3].min(axis=2) < 0.9)
+    assert 0.01 < ink < 0.5
+    assert (report.parent / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+    assert f"({name}.png)" in report.read_text(encoding="utf-8")
+
+
+def test_numbers_are_judged(report: Path) -> None:
+    """The table says agree or erratum for each number of the paper, with a reason for the latter."""
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in report.read_text(encoding="utf-8").splitlines()
+        if line.startswith(("| numerical illustration |", "| microgrid |"))
+    ]
+    verdicts = {(row[1], row[2]): row[4] for row in rows}
+    assert verdicts[("ρ(A)", "1.3878")] == "agree"
+    assert verdicts[("legitimate stability bound", "0.5342")] == "agree"
+    assert verdicts[("upper end of perfect secrecy, μ_e = 0.85", "0.5656")] == "agree"
+    assert verdicts[("slots in a day of one-second slots", "86400")] == "agree"
+    errata = {what: verdict for what, verdict in verdicts.items() if verdict.startswith("erratum: ")}
+    assert len(errata) == 8
+    assert all(len(verdict) > 30 for verdict in errata.values())
+    assert sum(verdict == "agree" for verdict in verdicts.values()) == 5
+    assert sum(verdict.startswith("not checkable: ") for verdict in verdicts.values()) == 1
+
+
+def test_formulas_are_shown_as_printed_and_corrected(report: Path) -> None:
+    """The finite-k values at k = 1: printed, corrected, and the recursion that agrees with the correction."""
+    text = report.read_text(encoding="utf-8")
+    for name, printed, corrected in (
+        ("legitimate", "1.0775", "0.1079"),
+        ("smart", "0.9209", "0.1087"),
+        ("naive", "1.8864", "1.7099"),
+    ):
+        assert re.search(rf"\| {name} \| {printed} \| {corrected} \| {corrected} \|", text)
+
+
+def test_captions_state_the_size(report: Path) -> None:
+    """What was simulated, how often, and how sure it is stands beside the figure."""
+    text = report.read_text(encoding="utf-8")
+    assert "mean over 1000 slots of one second and 20 trials" in text
+    assert "2000 trials of the real model" in text
+    assert "50 trials × 300 slots" in text
+
+
+def test_simulated_microgrid_agrees_with_theory() -> None:
+    """Means over slots of the simulated covariances are within five standard errors of the finite-k theory."""
+    day = microgrid.simulate(trials=60, slots=1500, progress=lambda _: None)
+    assert np.all(np.abs(day.simulated - day.theory) <= 5.0 * day.error)
+    assert np.all(day.simulated[1] > day.simulated[0])
