@@ -15,14 +15,8 @@ def follow(brief: Brief, receiver: Receiver) -> None:
     with Session(brief) as session:
         downlink = session.keys.downlink(name)
         deliveries = session.inbox(downlink)
-        reporter = BeliefReporter(
-            shape,
-            brief.slots,
-            brief.flow.batch,
-            brief.recorded,
-            session.outlet(session.keys.telemetry(name)),
-            session.outlet(session.keys.progress(name)),
-        )
+        put_telemetry = session.outlet(session.keys.telemetry(name))
+        reporter = BeliefReporter(brief, put_telemetry, session.outlet(session.keys.progress(name)))
         session.ready()
         belief = receiver.prior()
         for k in range(brief.slots):

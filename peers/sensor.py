@@ -9,7 +9,7 @@ from emulator.brief import Brief
 from emulator.model.process import Trajectory
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import OBSERVER, SENSOR
-from emulator.network.reporting import Batcher, TruthReporter
+from emulator.network.reporting import TruthReporter
 from emulator.network.session import Session
 from emulator.network.wire import read_progress, uplink
 
@@ -44,12 +44,7 @@ def sense(brief: Brief) -> None:
     with Session(brief) as session:
         window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window)
         send = session.outlet(session.keys.uplink)
-        reporter = TruthReporter(
-            (process.n, brief.trials),
-            brief.flow.batch,
-            session.outlet(session.keys.telemetry(SENSOR)),
-            Batcher(brief.slots, brief.flow.batch),
-        )
+        reporter = TruthReporter(brief, session.outlet(session.keys.telemetry(SENSOR)))
         session.ready()
         session.wait_for("start")
         start = time.monotonic()

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from hashlib import sha256
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.receiver import Belief
+from emulator.model.process import Floats
+from emulator.model.receiver import Action, Belief, Codes
 
 BLOCK_SLOTS = 256
 DIGEST_BYTES = 32
@@ -23,36 +25,54 @@ _TILE = 64  # trials transposed at a time, so that a tile stays in the cache
 Digests = NDArray[np.uint8]
 
 
-class BlockDigester:
-    """Collects a receiver's beliefs and digests them block by block. Final; slots must be added in order from 0."""
+class Rows(NamedTuple):
+    """Beliefs of consecutive slots, one row a slot."""
+
+    x_hat: Floats
+    """(c, n, R)."""
+    P: Floats
+    """(c, n, n, R)."""
+    action: Codes
+    """(c, R)."""
+
+
+class BeliefLog:
+    """A receiver's beliefs of the block at hand, and the digests of the blocks that are over.
+
+    Final; slots must be added in order from 0.
+    """
 
     def __init__(self, n: int, trials: int, slots: int) -> None:
         length = min(BLOCK_SLOTS, slots)
         self._slots = slots
-        self._gamma = np.empty((length, trials), np.uint8)
         self._x_hat = np.empty((length, n, trials))
-        self._P = np.empty((length, n * n, trials))
-        self._record = np.dtype([("gamma", "u1"), ("x_hat", "<f8", (n,)), ("P", "<f8", (n * n,))])
+        self._P = np.empty((length, n, n, trials))
+        self._action = np.empty((length, trials), np.uint8)
+        self._record = np.dtype([("gamma", "u1"), ("x_hat", "<f8", (n,)), ("P", "<f8", (n, n))])
 
     def add(self, k: int, belief: Belief) -> Digests | None:
         """Take slot k; at the end of a block, its digest for every trial, (R, 32)."""
         row = k % BLOCK_SLOTS
-        np.not_equal(belief.action, 0, out=self._gamma[row], casting="unsafe")
-        self._x_hat[row] = belief.x_hat
-        self._P[row] = belief.P.reshape(self._P.shape[1:])
+        self._x_hat[row], self._P[row], self._action[row] = belief
         if row == BLOCK_SLOTS - 1 or k == self._slots - 1:
             return self._digest(row + 1)
         return None
 
+    def rows(self, first: int, end: int) -> Rows:
+        """The beliefs of slots first … end−1, which must be of the block at hand; overwritten as the next one fills."""
+        start = first % BLOCK_SLOTS
+        rows = slice(start, start + end - first)
+        return Rows(self._x_hat[rows], self._P[rows], self._action[rows])
+
     def _digest(self, length: int) -> Digests:
-        trials = self._gamma.shape[1]
+        trials = self._action.shape[1]
         digests = np.empty((trials, DIGEST_BYTES), np.uint8)
         for start in range(0, trials, _TILE):
             tile = slice(start, min(start + _TILE, trials))
             records = np.empty((tile.stop - start, length), self._record)
-            records["gamma"] = self._gamma[:length, tile].T
+            records["gamma"] = (self._action[:length, tile] != Action.LOST).T
             records["x_hat"] = self._x_hat[:length, :, tile].transpose(2, 0, 1)
-            records["P"] = self._P[:length, :, tile].transpose(2, 0, 1)
+            records["P"] = self._P[:length, :, :, tile].transpose(3, 0, 1, 2)
             for row, record in enumerate(records, start):
                 digests[row] = np.frombuffer(sha256(record.data).digest(), np.uint8)
         return digests

@@ -29,20 +29,36 @@ def product(M: Floats, x: Floats) -> Floats:
     """M x for every trial: M (…, n, n), x (…, n, R) → (…, n, R)."""
     y: Floats = M[..., :, 0, None] * x[..., None, 0, :]
     for j in range(1, M.shape[-1]):
-        y = y + M[..., :, j, None] * x[..., None, j, :]
+        y += M[..., :, j, None] * x[..., None, j, :]
     return y
 
 
-def congruence(M: Floats, P: Floats) -> Floats:
-    """M P Mᵀ for every trial: M (n, n), P (n, n, R) → (n, n, R)."""
-    n = M.shape[0]
-    left = M[:, 0, None, None] * P[0]
-    for j in range(1, n):
-        left = left + M[:, j, None, None] * P[j]
-    result: Floats = left[:, 0, None, :] * M[:, 0, None]
-    for j in range(1, n):
-        result = result + left[:, j, None, :] * M[:, j, None]
-    return result
+class Dynamics:
+    """A as an operator on batches: the same sums as `product`, with A's columns laid out once. Final."""
+
+    def __init__(self, A: Floats) -> None:
+        self._indices = range(1, A.shape[0])
+        self._on_rows = [np.ascontiguousarray(A[:, j, None]) for j in range(A.shape[0])]
+        self._on_matrices = [np.ascontiguousarray(A[:, j, None, None]) for j in range(A.shape[0])]
+
+    def product(self, x: Floats) -> Floats:
+        """A x for every trial: x (n, R) → (n, R)."""
+        columns = self._on_rows
+        y: Floats = columns[0] * x[0]
+        for j in self._indices:
+            y += columns[j] * x[j]
+        return y
+
+    def congruence(self, P: Floats) -> Floats:
+        """A P Aᵀ for every trial: P (n, n, R) → (n, n, R)."""
+        columns, rows = self._on_matrices, self._on_rows
+        left: Floats = columns[0] * P[0]
+        for j in self._indices:
+            left += columns[j] * P[j]
+        result: Floats = left[:, :1] * rows[0]
+        for j in self._indices:
+            result += left[:, j : j + 1] * rows[j]
+        return result
 
 
 @dataclass(frozen=True)
@@ -64,16 +80,20 @@ class Process:
         return float(np.max(np.abs(np.linalg.eigvals(self.A))))
 
     @cached_property
+    def _dynamics(self) -> Dynamics:
+        return Dynamics(self.A)
+
+    @cached_property
     def _Q_column(self) -> Floats:
         return self.Q[:, :, None]
 
     def predict(self, x_hat: Floats) -> Floats:
         """A x̂, (n, R)."""
-        return product(self.A, x_hat)
+        return self._dynamics.product(x_hat)
 
     def carry(self, P: Floats) -> Floats:
         """A P Aᵀ, (n, n, R): the covariance when w is known."""
-        return congruence(self.A, P)
+        return self._dynamics.congruence(P)
 
     def diffuse(self, carried: Floats) -> Floats:
         """A P Aᵀ + Q from A P Aᵀ, (n, n, R): the covariance when w is not known."""

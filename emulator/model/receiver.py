@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -39,6 +40,16 @@ class Belief(NamedTuple):
     """`Action` of the slot, (R,)."""
 
 
+def select(flags: Flags, yes: Callable[[], Floats], no: Callable[[], Floats]) -> Floats:
+    """`yes()` in the trials where flags (R,) is true, `no()` in the others; what no trial needs is not computed."""
+    count = np.count_nonzero(flags)
+    if count == flags.size:
+        return yes()
+    if count == 0:
+        return no()
+    return np.where(flags, yes(), no())
+
+
 def trace_of(P: Floats) -> Floats:
     """Tr P of every trial: P (n, n, R) → (R,)."""
     trace: Floats = P[0, 0].copy()
@@ -59,6 +70,18 @@ class Receiver(ABC):
         n = self.process.n
         P = np.repeat(self.process.initial_covariance[:, :, None], self.trials, axis=2)
         return Belief(np.zeros((n, self.trials)), P, np.zeros(self.trials, np.uint8))
+
+    def predicted(self, k: int, x_hat: Floats) -> Floats:
+        """A x̂, (n, R); at k = 0 the prior itself, which is already about x_0."""
+        return self.process.predict(x_hat) if k else x_hat
+
+    def carried(self, k: int, P: Floats) -> Floats:
+        """A P Aᵀ, (n, n, R); at k = 0 the prior itself."""
+        return self.process.carry(P) if k else P
+
+    def diffused(self, k: int, carried: Floats) -> Floats:
+        """A P Aᵀ + Q from A P Aᵀ, (n, n, R); at k = 0 the prior itself."""
+        return self.process.diffuse(carried) if k else carried
 
     @abstractmethod
     def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
@@ -83,11 +106,13 @@ class PacketUser(Receiver):
 
     def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is used."""
-        x_hat, P = belief.x_hat, belief.P
-        if k > 0:
-            x_hat = self.process.predict(x_hat)
-            P = self.process.diffuse(self.process.carry(P))
         uses = self.uses(k)
         used = gamma if uses is None else gamma & uses
-        action = np.where(gamma, np.where(used, np.uint8(Action.STATE), np.uint8(Action.DISCARDED)), np.uint8(0))
-        return Belief(np.where(used, z, x_hat), np.where(used, 0.0, P), action)
+        return Belief(
+            select(used, lambda: z, lambda: self.predicted(k, belief.x_hat)),
+            select(used, lambda: np.zeros_like(belief.P), lambda: self.diffused(k, self.carried(k, belief.P))),
+            _USER_ACTIONS[gamma.view(np.uint8) + used.view(np.uint8)],
+        )
+
+
+_USER_ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)

@@ -1,113 +1,71 @@
-"""When and what a process reports: columns of many slots, never a message per number."""
+"""What a process reports, and when: columns of many slots, never a message per number.
+
+Reports end at the same slots everywhere: at the end of every `flow.batch` slots, and at the last. So a window that is
+full always holds a reported slot, and nobody can wait for a report that itself waits for a packet.
+"""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 
-from emulator.model.digest import BLOCK_SLOTS, BlockDigester, Digests
+from emulator.brief import Brief
+from emulator.model.digest import BLOCK_SLOTS, BeliefLog
 from emulator.model.process import Floats
 from emulator.model.receiver import Belief, Flags, trace_of
 from emulator.network.wire import Report, Truth, progress
 
-_REPORT_SECONDS = 0.04
 
-
-class Batcher:
-    """Says when a report is due: at the end of a batch of slots, at the last slot, or when the last one is 40 ms old.
-
-    Final. The ends of batches are the same for everybody, so a full window always holds a reported one: nobody can wait
-    for a report that waits for a packet.
-    """
-
-    def __init__(self, slots: int, batch: int) -> None:
-        self._slots = slots
-        self._batch = batch
-        self._last = time.monotonic()
-
-    def due(self, k: int) -> bool:
-        """Whether to report after slot k."""
-        now = time.monotonic()
-        if (k + 1) % self._batch and k + 1 != self._slots and now - self._last < _REPORT_SECONDS:
-            return False
-        self._last = now
-        return True
+def is_due(brief: Brief, k: int) -> bool:
+    """Whether slot k ends a report."""
+    return (k + 1) % brief.flow.batch == 0 or k + 1 == brief.slots
 
 
 class TruthReporter:
     """The sensor's reports: states and schedule. Final."""
 
-    def __init__(self, shape: tuple[int, int], batch: int, put: Callable[[bytes], None], batcher: Batcher) -> None:
-        self._x = np.empty((batch, *shape))
-        self._nu = np.empty((batch, shape[1]), np.bool_)
+    def __init__(self, brief: Brief, put: Callable[[bytes], None]) -> None:
+        self._brief = brief
         self._put = put
-        self._batcher = batcher
-        self._count = 0
+        self._x = np.empty((brief.flow.batch, len(brief.model.A), brief.trials))
+        self._nu = np.empty((brief.flow.batch, brief.trials), np.bool_)
 
     def add(self, k: int, x: Floats, nu: Flags) -> None:
         """Take slot k, and report if it is time."""
-        self._x[self._count] = x
-        self._nu[self._count] = nu
-        self._count += 1
-        if self._batcher.due(k):
-            count = self._count
-            self._put(Truth(k + 1 - count, self._x[:count], self._nu[:count]).pack())
-            self._count = 0
+        row = k % self._brief.flow.batch
+        self._x[row] = x
+        self._nu[row] = nu
+        if is_due(self._brief, k):
+            self._put(Truth(k - row, self._x[: row + 1], self._nu[: row + 1]).pack())
 
 
 class BeliefReporter:
-    """A receiver's reports: estimates, actions, covariances of the recorded trials, digests, and its progress. Final."""
+    """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress. Final."""
 
-    def __init__(
-        self,
-        shape: tuple[int, int],
-        slots: int,
-        batch: int,
-        recorded: int,
-        put: Callable[[bytes], None],
-        put_progress: Callable[[bytes], None],
-    ) -> None:
-        n, trials = shape
-        self._x_hat = np.empty((batch, n, trials))
-        self._action = np.empty((batch, trials), np.uint8)
-        self._P = np.empty((batch, n, n, recorded))
-        self._trace = np.empty((batch, 2))
-        self._recorded = recorded
-        self._digester = BlockDigester(n, trials, slots)
-        self._digests: dict[int, Digests] = {}
+    def __init__(self, brief: Brief, put: Callable[[bytes], None], put_progress: Callable[[bytes], None]) -> None:
+        self._brief = brief
         self._put = put
         self._put_progress = put_progress
-        self._batcher = Batcher(slots, batch)
-        self._count = 0
+        self._log = BeliefLog(len(brief.model.A), brief.trials, brief.slots)
+        self._first = 0
 
     def add(self, k: int, belief: Belief) -> None:
-        """Take slot k, and report if it is time."""
-        row = self._count
-        self._x_hat[row] = belief.x_hat
-        self._action[row] = belief.action
-        self._P[row] = belief.P[:, :, : self._recorded]
-        trace = trace_of(belief.P)
-        self._trace[row] = trace.sum(), (trace * trace).sum()
-        digests = self._digester.add(k, belief)
-        if digests is not None:
-            self._digests[k // BLOCK_SLOTS] = digests
-        self._count += 1
-        if self._batcher.due(k):
-            self._report(k + 1)
-
-    def _report(self, end: int) -> None:
-        rows = slice(0, self._count)
-        self._put(
-            Report(
-                end - self._count,
-                self._x_hat[rows],
-                self._action[rows],
-                self._P[rows],
-                self._trace[rows],
-                self._digests,
-            ).pack()
+        """Take slot k, and report if it is time: also at the end of a digest's block, where the log starts anew."""
+        digests = self._log.add(k, belief)
+        if digests is None and not is_due(self._brief, k):
+            return
+        log = self._log.rows(self._first, k + 1)
+        trace = trace_of(log.P.transpose(1, 2, 0, 3))
+        report = Report(
+            self._first,
+            log.x_hat,
+            log.action,
+            np.ascontiguousarray(log.P[..., : self._brief.recorded]),
+            np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
+            {} if digests is None else {k // BLOCK_SLOTS: digests},
         )
-        self._put_progress(progress(end))
-        self._count, self._digests = 0, {}
+        self._put(report.pack())
+        self._first = k + 1
+        if is_due(self._brief, k):
+            self._put_progress(progress(k + 1))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,41 +20,50 @@ import numpy as np
 
 from emulator.brief import Brief
 from emulator.model.links import link_of
-from emulator.model.links.link import Fate, losses
-from emulator.model.receiver import Codes
+from emulator.model.links.link import Fate, Link, losses
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes, Flags
 from emulator.network.access import access_control, grants
-from emulator.network.reporting import Batcher
 from emulator.network.session import Session, router_config
 from emulator.network.wire import Journal, delivery, packed_flags, read_uplink
 
 _FAREWELL_SECONDS = 10.0
 
 
-class JournalKeeper:
-    """Collects fates and makes journal messages of them. Final."""
+class Downlink:
+    """One receiver's link, decided a batch of slots ahead, and its outlet. Final."""
 
-    def __init__(self, receivers: tuple[str, ...], trials: int, flow_batch: int) -> None:
-        self._fates = {name: np.empty((flow_batch, trials), np.uint8) for name in receivers}
+    def __init__(self, link: Link, put: Callable[[bytes], None]) -> None:
+        self._link = link
+        self._put = put
         self._first = 0
-        self._count = 0
+        self.fates: Codes
+        """Of the batch at hand, (c, R)."""
+        self._delivered: Flags
+        self._masks: list[bytes]
+        self._received: list[int]
 
-    def add(self, fates: Mapping[str, Codes]) -> None:
-        """Take one slot's fates."""
-        for name, codes in fates.items():
-            self._fates[name][self._count] = codes
-        self._count += 1
+    def plan(self, slots: range) -> None:
+        """Decide the next batch of slots."""
+        self._first = slots.start
+        self.fates = self._link.fates(slots)
+        self._delivered = self.fates == Fate.DELIVERED
+        self._masks = [mask.tobytes() for mask in packed_flags(self._delivered)]
+        self._received = np.count_nonzero(self._delivered, axis=1).tolist()
 
-    def take(self) -> bytes:
-        """A message with all that was added since the last one."""
-        fates = {name: codes[: self._count] for name, codes in self._fates.items()}
-        message = Journal(
-            self._first,
-            self._count,
-            {name: codes == Fate.DELIVERED for name, codes in fates.items()},
-            {name: losses(codes) for name, codes in fates.items()},
-        ).pack()
-        self._first, self._count = self._first + self._count, 0
-        return message
+    def deliver(self, k: int, z: Floats, whole: bytes) -> None:
+        """Send slot k's delivery: the packets z (n, R), or as bytes the whole of them, that the link does not erase."""
+        row = k - self._first
+        received = self._received[row]
+        payload = whole if received == z.shape[1] else z[:, self._delivered[row]].tobytes() if received else b""
+        self._put(delivery(k, self._masks[row], payload))
+
+
+def journal_of(slots: range, downlinks: Mapping[str, Downlink]) -> bytes:
+    """The journal message of the batch at hand."""
+    fates = {name: downlink.fates for name, downlink in downlinks.items()}
+    delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
+    return Journal(slots.start, len(slots), delivered, {name: losses(codes) for name, codes in fates.items()}).pack()
 
 
 def route(brief: Brief) -> None:
@@ -73,22 +82,18 @@ def route(brief: Brief) -> None:
             session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
         uplink = session.inbox(session.keys.uplink)
         put_journal = session.outlet(session.keys.journal)
-        downlinks = {name: session.outlet(session.keys.downlink(name)) for name in receivers}
+        downlinks = {name: Downlink(link, session.outlet(session.keys.downlink(name))) for name, link in links.items()}
         session.ready()
-        journal = JournalKeeper(receivers, brief.trials, brief.flow.batch)
-        batcher = Batcher(brief.slots, brief.flow.batch)
-        for k in range(brief.slots):
-            z = read_uplink(session.keys.uplink, uplink.recv().payload.to_bytes(), k, shape)
-            whole = z.tobytes()
-            fates = {name: link.at(k) for name, link in links.items()}
-            for name, codes in fates.items():
-                delivered = codes == Fate.DELIVERED
-                received = int(np.count_nonzero(delivered))
-                payload = whole if received == brief.trials else z[:, delivered].tobytes() if received else b""
-                downlinks[name](delivery(k, packed_flags(delivered).tobytes(), payload))
-            journal.add(fates)
-            if batcher.due(k):
-                put_journal(journal.take())
+        for first in range(0, brief.slots, brief.flow.batch):
+            slots = range(first, min(first + brief.flow.batch, brief.slots))
+            for downlink in downlinks.values():
+                downlink.plan(slots)
+            for k in slots:
+                z = read_uplink(session.keys.uplink, uplink.recv().payload.to_bytes(), k, shape)
+                whole = z.tobytes()
+                for downlink in downlinks.values():
+                    downlink.deliver(k, z, whole)
+            put_journal(journal_of(slots, downlinks))
         session.wait_for("end")
         deadline = time.monotonic() + _FAREWELL_SECONDS
         while any(present.values()) and time.monotonic() < deadline:

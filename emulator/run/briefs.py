@@ -19,6 +19,7 @@ from emulator.streams import root_of_seed, stream_key
 
 _WINDOW_BYTES = 16 * 2**20
 _MOST_SLOTS_AHEAD = 1024
+_REPORT_SECONDS = 0.04
 
 
 @dataclass(frozen=True)
@@ -69,11 +70,14 @@ class StreamKeys:
 
 
 def flow_of(scenario: Scenario) -> Flow:
-    """A window of some megabytes under way, and reports four times in it."""
+    """A window of some megabytes under way, and reports four times in it; in real time, some tens of milliseconds apart."""
     receivers = len(scenario.receivers)
     slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
     window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
-    return Flow(window, max(1, window // 4))
+    batch = max(1, window // 4)
+    if scenario.pace:
+        batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
+    return Flow(window, batch)
 
 
 @dataclass(frozen=True)

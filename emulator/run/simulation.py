@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
-from emulator.model.digest import BLOCK_SLOTS, BlockDigester, Digests
+from emulator.model.digest import BLOCK_SLOTS, BeliefLog, Digests
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.links import link_of
 from emulator.model.links.link import Fate, losses
 from emulator.model.process import Trajectory
-from emulator.model.receiver import Belief, Codes, Receiver, trace_of
+from emulator.model.receiver import Flags, Receiver, trace_of
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.run.briefs import StreamKeys
@@ -21,29 +22,6 @@ from emulator.scenario import Scenario
 from emulator.streams import Batch
 
 _CHUNK_NUMBERS = 131_072  # states of a chunk of slots: about a megabyte an array
-
-
-class _Rows:
-    """One receiver's columns of a chunk, filled slot by slot."""
-
-    def __init__(self, count: int, n: int, trials: int, recorded: int) -> None:
-        self._fates = np.empty((count, trials), np.uint8)
-        self._x_hat = np.empty((count, n, trials))
-        self._action = np.empty((count, trials), np.uint8)
-        self._P = np.empty((count, n, n, recorded))
-        self._trace = np.empty((count, 2))
-
-    def fill(self, row: int, fates: Codes, belief: Belief) -> None:
-        self._fates[row] = fates
-        self._x_hat[row] = belief.x_hat
-        self._action[row] = belief.action
-        self._P[row] = belief.P[:, :, : self._P.shape[3]]
-        trace = trace_of(belief.P)
-        self._trace[row] = trace.sum(), (trace * trace).sum()
-
-    def slots(self) -> ReceiverSlots:
-        delivered = self._fates == Fate.DELIVERED
-        return ReceiverSlots(self._x_hat, self._action, self._P, self._trace, delivered, losses(self._fates))
 
 
 class Simulation:
@@ -69,7 +47,7 @@ class Simulation:
         return STRATEGIES[table.strategy](knowledge, self._batch)
 
     def chunks(self) -> Iterator[Slots]:
-        """All slots, some tens or hundreds at a time."""
+        """All slots, some tens or hundreds at a time; a chunk's arrays are overwritten when the next one is made."""
         n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
         names = self._scenario.receivers
         trajectory = Trajectory(self._process, self._keys.process, self._batch)
@@ -77,24 +55,36 @@ class Simulation:
         receivers = {name: self._receiver(name) for name in names}
         links = {name: link_of(self._scenario.link(name).spec, self._keys.link(name), self._batch) for name in names}
         beliefs = {name: receivers[name].prior() for name in names}
-        digesters = {name: BlockDigester(n, trials, slots) for name in names}
-        length = max(1, min(slots, _CHUNK_NUMBERS // (n * trials)))
-        for first in range(0, slots, length):
-            count = min(length, slots - first)
-            rows = {name: _Rows(count, n, trials, self._recorded) for name in names}
-            x = np.empty((count, n, trials))
-            nu = np.empty((count, trials), np.bool_)
-            for row in range(count):
-                k = first + row
-                x[row] = trajectory.advance()
-                packet = encoder.encode(k, x[row], trajectory.predicted)
-                nu[row] = packet.nu
-                for name in names:
-                    fates = links[name].at(k)
-                    delivered = fates == Fate.DELIVERED
-                    beliefs[name] = receivers[name].step(k, beliefs[name], delivered, packet.z)
-                    digests = digesters[name].add(k, beliefs[name])
-                    if digests is not None:
-                        self.digests[name][k // BLOCK_SLOTS] = digests
-                    rows[name].fill(row, fates, beliefs[name])
-            yield Slots(first, x, nu, {name: rows[name].slots() for name in names})
+        logs = {name: BeliefLog(n, trials, slots) for name in names}
+        length = max(1, min(slots, BLOCK_SLOTS, _CHUNK_NUMBERS // (n * trials)))
+        for block in range(0, slots, BLOCK_SLOTS):
+            end = min(block + BLOCK_SLOTS, slots)
+            for first in range(block, end, length):
+                chunk = range(first, min(first + length, end))
+                x = np.empty((len(chunk), n, trials))
+                nu = np.empty((len(chunk), trials), np.bool_)
+                fates = {name: links[name].fates(chunk) for name in names}
+                delivered = {name: fates[name] == Fate.DELIVERED for name in names}
+                for row, k in enumerate(chunk):
+                    x[row] = trajectory.advance()
+                    packet = encoder.encode(k, x[row], trajectory.predicted)
+                    nu[row] = packet.nu
+                    for name in names:
+                        beliefs[name] = receivers[name].step(k, beliefs[name], delivered[name][row], packet.z)
+                        digests = logs[name].add(k, beliefs[name])
+                        if digests is not None:
+                            self.digests[name][k // BLOCK_SLOTS] = digests
+                yield Slots(
+                    chunk.start,
+                    x,
+                    nu,
+                    {name: self._slots(logs[name], chunk, delivered[name], losses(fates[name])) for name in names},
+                )
+
+    def _slots(
+        self, log: BeliefLog, slots: range, delivered: Flags, lost: Mapping[str, NDArray[np.uint32]]
+    ) -> ReceiverSlots:
+        rows = log.rows(slots.start, slots.stop)
+        trace = trace_of(rows.P.transpose(1, 2, 0, 3))
+        sums = np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1)
+        return ReceiverSlots(rows.x_hat, rows.action, rows.P[..., : self._recorded], sums, delivered, lost)

@@ -41,19 +41,13 @@ class LossModel(ABC):
 class Link:
     """The way from the router to one receiver: a loss model and its own random stream.
 
-    Final. Must be read slot by slot.
+    Final. Must be read in order, any number of slots at a time.
     """
 
     def __init__(self, loss: LossModel, key: bytes, batch: Batch) -> None:
         self._loss = loss
         self._reader = BlockReader(key, batch, loss.uniforms_per_slot)
-        self._slots = range(0)
-        self._fates: Codes
 
-    def at(self, k: int) -> Codes:
-        """`Fate` of slot k's packet in every trial, (R,)."""
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            self._fates = self._loss.fates(self._reader.uniforms(self._slots))
-        fates: Codes = self._fates[k - self._slots.start]
-        return fates
+    def fates(self, slots: range) -> Codes:
+        """`Fate` of the packets of the next slots in every trial, (slots, R)."""
+        return self._loss.fates(self._reader.uniforms(slots))

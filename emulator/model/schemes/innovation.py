@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emulator.model.process import Floats, Process, StateFactors, product
-from emulator.model.receiver import Action, Belief, Flags, Receiver
+from emulator.model.receiver import Action, Belief, Flags, Receiver, select
 from emulator.model.schedule import Schedule
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.streams import Batch, BlockReader
@@ -62,7 +62,7 @@ class InnovationEncoder(Encoder):
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The packet of slot k."""
         nu, chi = self._secret.at(k)
-        return Packet(np.where(nu, (x - predicted) + chi, x), nu)
+        return Packet(select(nu, lambda: (x - predicted) + chi, lambda: x), nu)
 
 
 class InnovationEstimator(Receiver):
@@ -78,18 +78,24 @@ class InnovationEstimator(Receiver):
     def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
         nu, chi = self._secret.at(k)
-        if k == 0:
-            x_hat, carried, diffused = belief.x_hat, belief.P, belief.P
-        else:
-            x_hat = self.process.predict(belief.x_hat)
-            carried = self.process.carry(belief.P)
-            diffused = self.process.diffuse(carried)
-        received = np.where(nu, np.uint8(Action.INNOVATION), np.uint8(Action.STATE))
+        state, innovation = gamma & ~nu, gamma & nu
+
+        def estimate() -> Floats:
+            predicted = self.predicted(k, belief.x_hat)
+            return select(innovation, lambda: predicted + (z - chi), lambda: predicted)
+
+        def covariance() -> Floats:
+            carried = self.carried(k, belief.P)
+            return select(innovation, lambda: carried, lambda: self.diffused(k, carried))
+
         return Belief(
-            np.where(gamma, np.where(nu, x_hat + (z - chi), z), x_hat),
-            np.where(gamma, np.where(nu, carried, 0.0), diffused),
-            np.where(gamma, received, np.uint8(Action.LOST)),
+            select(state, lambda: z, estimate),
+            select(state, lambda: np.zeros_like(belief.P), covariance),
+            _ACTIONS[gamma.view(np.uint8) + innovation.view(np.uint8)],
         )
+
+
+_ACTIONS = np.array([Action.LOST, Action.STATE, Action.INNOVATION], np.uint8)
 
 
 class Innovation(Scheme):
