@@ -6,21 +6,25 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from emulator.view import lanes, paths, plane
-from emulator.view.palette import GROUND, colour_name
+from emulator.view.palette import GROUND
 from emulator.view.scene import Scene
 
-_WINDOW = 130  # slots; in a longer one a slot is below four pixels, and Rerun merges it with its neighbours to grey
-_TRAIL = 45
+_WINDOW = 105  # slots; with a slot below four pixels, Rerun merges it with its neighbours to grey
+_LANES_OF_A_SCREEN = 23.0  # lanes that would fill the usual window from top to bottom
+_ROOM = 25  # slots right of the present, kept free for the legend
+_TRAIL = 30
 _TRUTH_TRAIL = 130
 
 
 def layout(scene: Scene) -> rrb.Blueprint:
     """The panels of a run."""
     left = rrb.Vertical(
-        _curves("Squared error |x − x̂|²   (log10)", scene, [paths.ERROR]),
-        _curves("tr P believed, dim: theory   (log10)", scene, [paths.TRACE, paths.THEORY]),
+        _curves("Squared error |x − x̂|²   log10, bottom: exact", scene, [paths.ERROR], legend=True),
+        _curves(
+            "tr P   log10, bright: believed · dim: theory · bottom: 0", scene, [paths.TRACE, paths.THEORY], legend=False
+        ),
         rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=paths.PACKETS, time_view=_axis(scene)),
-        row_shares=[1.0, 1.0, 0.9],
+        row_shares=_left_shares(scene),
     )
     right = rrb.Vertical(_plane(scene), _events(), row_shares=[1.75, 1.0])
     return rrb.Blueprint(
@@ -34,20 +38,27 @@ def layout(scene: Scene) -> rrb.Blueprint:
     )
 
 
-def _curves(title: str, scene: Scene, kinds: list[str]) -> rrb.TimeSeriesView:
+def _left_shares(scene: Scene) -> list[float]:
+    """Heights on the left: as much as the lanes need, at most half; the rest to the curves, in equal parts."""
+    lanes_share = min(0.5, (2.0 + len(scene.receivers) + 1) / _LANES_OF_A_SCREEN)
+    return [0.5 - lanes_share / 2, 0.5 - lanes_share / 2, lanes_share]
+
+
+def _curves(title: str, scene: Scene, kinds: list[str], *, legend: bool) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         name=title,
         origin="/",
         contents=[f"/{kind}/**" for kind in kinds],
         axis_x=_axis(scene),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+        # One legend serves all panels: a receiver has the same colour in each.
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
     )
 
 
 def _axis(scene: Scene) -> rrb.TimeAxis:
     recent = rrb.TimeRange(
         start=rrb.TimeRangeBoundary.cursor_relative(seq=-min(_WINDOW, scene.slots)),
-        end=rrb.TimeRangeBoundary.cursor_relative(seq=2),
+        end=rrb.TimeRangeBoundary.cursor_relative(seq=_ROOM),
     )
     return rrb.TimeAxis(view_range=recent, zoom_lock=True)
 
@@ -55,18 +66,17 @@ def _axis(scene: Scene) -> rrb.TimeAxis:
 def _plane(scene: Scene) -> rrb.View:
     if scene.n == 1:
         return rrb.TimeSeriesView(
-            name="State",
+            name="State and estimates",
             origin=paths.PLANE,
             axis_x=_axis(scene),
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
         )
-    colours = " · ".join(f"{colour_name(i)}: {shown.name}" for i, shown in enumerate(scene.receivers))
     trails: dict[str, rrb.VisibleTimeRanges] = {
         paths.trail(shown.name): _past(scene, _TRAIL) for shown in scene.receivers
     }
     trails[paths.trail(paths.TRUTH)] = _past(scene, _TRUTH_TRAIL)
     return rrb.Spatial2DView(
-        name=f"States 1, 2   white: truth · {colours} · ellipses: 2σ believed",
+        name="State plane   white: truth · others coloured as their curves · ellipses: 2σ believed",
         origin=paths.PLANE,
         background=list(GROUND),
         overrides=trails,  # type: ignore[arg-type]

@@ -14,10 +14,10 @@ from emulator.model.receiver import Codes
 from emulator.view import lanes, paths, plane
 from emulator.view.events import Event, Watcher
 from emulator.view.lanes import Lane
-from emulator.view.palette import TRUTH, TRUTH_CURVE, colour, dim
+from emulator.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
 from emulator.view.scene import PeerSlots, Scene, Slots
 
-_DECADES_BELOW = 2.0
+_DECADES_BELOW = 1.0
 _FLOOR_WITHOUT_THEORY = 1e-6
 
 
@@ -53,6 +53,7 @@ class Columns:
         self._scene = scene
         self._floor: float | None = None
         self._last: dict[str, int] = {}
+        self._frame = plane.Frame()
         every = plane.stride(scene)
         self._trails = {name: plane.Trail(every) for name in (paths.TRUTH, *(r.name for r in scene.receivers))}
         self._watchers = {shown.name: Watcher(shown, scene) for shown in scene.receivers}
@@ -99,6 +100,10 @@ class Columns:
         at = plane.frames(self._scene, slots.first, slots.count)
         positions = plane.on_plane(slots.x)
         yield from self._moving(paths.TRUTH, k, positions, at)
+        everybody = np.stack([positions, *(plane.on_plane(peer.x_hat) for peer in slots.peers.values())])
+        boxes = self._frame.boxes(everybody.min(axis=0), everybody.max(axis=0), at)
+        if len(at):
+            yield Column(paths.FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
 
     def _estimate(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
         if self._scene.n == 1:
@@ -184,6 +189,8 @@ def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
         )
     else:
         _log_moving_style(to, paths.TRUTH, TRUTH, radius=3.5, order=40.0)
+        # Not to be seen: it is there for the panel to fit to.
+        to.log(paths.FRAME, rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1)), static=True)
 
 
 def _log_moving_style(
@@ -218,7 +225,7 @@ def _scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
 
 
 def _floor(scene: Scene, slots: Slots) -> float:
-    """Smallest value a curve shows: a decade or two below what the legitimate estimator's error should be."""
+    """Smallest value a curve shows: one to two decades below what the legitimate estimator's error should be."""
     expected = slots.peers[scene.receivers[0].name].expected_trace
     usable = expected[np.isfinite(expected) & (expected > 0.0)]
     if not usable.size:

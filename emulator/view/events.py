@@ -28,6 +28,16 @@ class Event(NamedTuple):
     text: str
 
 
+def introduction(scene: Scene) -> list[Event]:
+    """What the run is about, and who takes part."""
+    trials = "" if scene.trials == 1 else f"; curves: mean of {scene.trials} trials"
+    about = [Event(0, "INFO", f"{scene.title}{trials}")]
+    for shown in scene.receivers:
+        kind = "scheme" if shown.role == "legitimate" else "strategy"
+        about.append(Event(0, "INFO", f"{shown.name}: {kind} {shown.strategy}, link quality {shown.quality:.4g}"))
+    return about
+
+
 class Watcher:
     """Finds the events of one receiver, chunk by chunk, in its lane's codes.
 
@@ -90,4 +100,4 @@ class Watcher:
         if self._legitimate:
             return f"{self._name} lost {self._long} packets in a row"
         line = f"{self._name} lost track: {self._long} slots without a state"
-        return f"{line}, misled in {fooled}" if fooled else line
+        return f"{line}, {fooled} misled" if fooled else line

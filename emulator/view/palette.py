@@ -11,25 +11,20 @@ TRUTH: Colour = (226, 228, 234)
 TRUTH_CURVE: Colour = (138, 144, 156)
 """Where the ground is the theme's."""
 
-_RECEIVERS: tuple[tuple[str, Colour], ...] = (
-    ("teal", (45, 190, 165)),
-    ("orange", (245, 130, 70)),
-    ("violet", (175, 130, 250)),
-    ("sky", (80, 170, 245)),
-    ("yellow", (222, 184, 48)),
-    ("pink", (236, 106, 168)),
-    ("olive", (142, 168, 66)),
+_RECEIVERS: tuple[Colour, ...] = (
+    (45, 190, 165),  # teal
+    (245, 130, 70),  # orange
+    (175, 130, 250),  # violet
+    (80, 170, 245),  # sky
+    (222, 184, 48),  # yellow
+    (236, 106, 168),  # pink
+    (142, 168, 66),  # olive
 )
 
 
 def colour(i: int) -> Colour:
     """Colour of the i-th receiver; the legitimate one is 0. Repeats after seven."""
-    return _RECEIVERS[i % len(_RECEIVERS)][1]
-
-
-def colour_name(i: int) -> str:
-    """What to call the i-th receiver's colour."""
-    return _RECEIVERS[i % len(_RECEIVERS)][0]
+    return _RECEIVERS[i % len(_RECEIVERS)]
 
 
 def dim(of: Colour, share: float) -> Colour:

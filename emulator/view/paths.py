@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from emulator.view.scene import Scene
 
-TIMELINE = "slot"
+TIMELINE = "slot_number"
+"""Rerun makes the events' first column as wide as this name, and "slot" is too narrow for a number."""
 ERROR = "error"
 TRACE = "trace"
 THEORY = "theory"
 PACKETS = "packets"
 PLANE = "plane"
 EVENTS = "events"
+FRAME = f"{PLANE}/frame"
 TRUTH = "truth"
 NOTES = "run"
 

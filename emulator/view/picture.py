@@ -58,7 +58,7 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
             viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             _show_the_end(viewer)
             yield viewer
-        except RuntimeError as error:
+        except (RuntimeError, ConnectionError) as error:
             log = (logs / "viewer.log").read_text(errors="replace")
             raise UsageError(_without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
         finally:

@@ -6,7 +6,7 @@ A run of any length gets a bounded number of frames. Trails lose nothing by it: 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ _FRAMES_PER_SECOND = 30.0
 _MOST_FRAMES = 4_000
 _MOST_FRAMES_IN_REAL_TIME = 30_000  # still five a second over more than an hour
 _LARGEST = 1e30  # Rerun's points are float32
+_FRAMED_SLOTS = 256
 _SIGMAS = 2.0
 _CORNERS = 40
 
@@ -65,6 +66,32 @@ def ellipses(centres: Floats, P: Floats) -> Points:
 def _shown(values: NDArray[Any]) -> Points:
     points: Points = np.clip(np.nan_to_num(values, nan=_LARGEST), -_LARGEST, _LARGEST).astype(np.float32)
     return points
+
+
+@dataclass
+class Frame:
+    """What the plane must show: a box around everything of the last while, with some room.
+
+    Final. Its sides lie on a grid that is coarse against its size, so that the view does not tremble.
+    """
+
+    _lows: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    _highs: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+
+    def boxes(self, lows: Points, highs: Points, offsets: NDArray[np.intp]) -> Points:
+        """Closed boxes (len(offsets), 5, 2) at these offsets of the next slots, which reach from lows to highs (c, 2)."""
+        before = len(self._lows)
+        self._lows = np.concatenate([self._lows, lows])
+        self._highs = np.concatenate([self._highs, highs])
+        low, high = np.empty((len(offsets), 2)), np.empty((len(offsets), 2))
+        for i, end in enumerate((offsets + before + 1).tolist()):
+            recent = slice(max(0, end - _FRAMED_SLOTS), end)
+            low[i], high[i] = self._lows[recent].min(axis=0), self._highs[recent].max(axis=0)
+        self._lows, self._highs = self._lows[-_FRAMED_SLOTS:], self._highs[-_FRAMED_SLOTS:]
+        step = np.exp2(np.floor(np.log2(np.maximum(high - low, 1e-30).max(axis=1, keepdims=True, initial=1e-30)))) / 8
+        low, high = (np.floor(low / step) - 0.5) * step, (np.ceil(high / step) + 0.5) * step
+        corners = [(low, low), (high, low), (high, high), (low, high), (low, low)]
+        return _shown(np.stack([np.stack([x[:, 0], y[:, 1]], axis=1) for x, y in corners], axis=1))
 
 
 @dataclass

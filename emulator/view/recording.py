@@ -17,7 +17,7 @@ import rerun as rr
 
 from emulator.view.blueprint import layout
 from emulator.view.columns import Batch, Columns, lines, log_styles, opening
-from emulator.view.events import Event
+from emulator.view.events import Event, introduction
 from emulator.view.paths import NOTES
 from emulator.view.scene import PeerSlots, Scene, Shown, Slots
 
@@ -48,7 +48,7 @@ class Recording:
         self._columns = Columns(scene)
         self._waiting: list[Slots] = []
         self._waiting_slots = 0
-        self._notes: list[Event] = []
+        self._notes = introduction(scene)
         self._closing = False
         self._changed = threading.Condition()
         self._file = _stream(scene)

@@ -10,8 +10,6 @@ import pytest
 
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.links import Bernoulli
-from emulator.model.links.link import Fate, Link
 from emulator.model.process import Floats, Process, Trajectory
 from emulator.model.receiver import Receiver
 from emulator.model.schemes import SCHEMES
@@ -75,7 +73,7 @@ def simulate(
         name: max(0.1, QUALITY["legitimate" if name == "legitimate" else strategy] - 0.2 * name.endswith("2"))
         for name, (strategy, _) in receivers.items()
     }
-    links = {name: Link(Bernoulli(q), stream_key(root, f"link/{name}"), batch) for name, q in qualities.items()}
+    arrivals = np.random.default_rng(seed)
     beliefs = {name: receiver.prior() for name, (_, receiver) in receivers.items()}
     truth, nus = [], []
     seen: dict[str, list[tuple[Floats, ...]]] = {name: [] for name in receivers}
@@ -85,7 +83,7 @@ def simulate(
         truth.append(x[:, 0])
         nus.append(nu[0])
         for name, (_, receiver) in receivers.items():
-            gamma = links[name].at(k) == Fate.DELIVERED
+            gamma = arrivals.random(trials) < qualities[name]
             beliefs[name] = b = receiver.step(k, beliefs[name], gamma, z)
             error = np.sum((x - b.x_hat) ** 2, axis=0).mean()
             trace = np.trace(b.P).mean()
