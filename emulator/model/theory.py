@@ -17,7 +17,7 @@ import numpy as np
 
 from emulator.model.process import Floats, Process
 
-_BLOCK = 1024  # slots computed from one starting point: long enough to hide Python, short enough for the cache
+_BLOCK = 256  # slots computed from one starting point: long enough to hide Python, few enough to set up in 3 ms
 _LARGEST_POWER = 1e100  # of A's entries within a block, far from overflow
 _ROUNDING = 1e-12  # a spectral radius this little below 1 is 1, computed
 

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import Fate, Link
+from emulator.model.links.link import Link
 from emulator.model.markov import step_probabilities, word_probability
 from emulator.model.process import Floats
 from emulator.model.schedule import Schedule
 from emulator.streams import Batch, root_of_seed, stream_key
+from emulator.view.figures_links import deliveries
 from emulator.view.figures_style import BLUE, RED, panels
 
 CASES = ((0.9, 0.6), (0.6, 0.3))
@@ -46,8 +47,8 @@ def simulate(mu: float, mu_d: float, trials: int, slots: int, progress: Callable
     steps, words = np.zeros((STEPS, trials)), np.zeros((len(WORDS), trials))
     word = np.zeros(trials, np.int64)
     progress(f"Markov chain: μ = {mu}, μ_d = {mu_d}")
-    for k in range(batch.slots):
-        lost = link.at(k) != Fate.DELIVERED
+    for k, gamma in enumerate(deliveries(link, batch.slots)):
+        lost = ~gamma
         nu = schedule.at(k)
         grown = np.minimum(2 * word + lost, _LONGEST)
         word = np.where(lost | (nu & (word > 0)), grown, 0)

@@ -13,11 +13,12 @@ import numpy as np
 
 from emulator.model.ensemble import initial_covariance, legitimate_step, packet_user_step
 from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import Fate, Link
+from emulator.model.links.link import Link
 from emulator.model.process import Floats, Process
 from emulator.model.schedule import Schedule
 from emulator.model.theory import Outcomes, expected_traces, misled_covariances
 from emulator.streams import Batch, root_of_seed, stream_key
+from emulator.view.figures_links import deliveries
 from emulator.view.figures_style import BLUE, GREEN, GREY, RED, panels
 
 MU = 0.6
@@ -78,9 +79,9 @@ def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
     misled = misled_covariances(uncertain, slots)
     width = len(schedules)
     sums = np.zeros((len(RECEIVERS), width * trials))
-    for k in range(slots):
+    for k, received in enumerate(zip(*(deliveries(link, slots) for link in links), strict=True)):
         nu = np.concatenate([schedule.at(k) for schedule in schedules])
-        gamma, gamma_e = (np.tile(link.at(k) == Fate.DELIVERED, width) for link in links)
+        gamma, gamma_e = (np.tile(flags, width) for flags in received)
         if k == 0:
             P, P_smart = initial_covariance(certain, gamma), initial_covariance(certain, gamma_e)
             P_naive = initial_covariance(uncertain, gamma_e)

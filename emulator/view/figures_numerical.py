@@ -45,16 +45,19 @@ def gain(mu_e: float, mu_d: float) -> float:
 def draw(path: Path, found: dict[float, Against]) -> str:
     """Draw the figure; its caption."""
     low = stability_bound(process(), MU)
+    curves = {}
+    for mu_e, against in found.items():
+        start = max(low, against.bound)
+        mu_d = start + (1.0 - start) * np.geomspace(1e-4, 1.0, 240)
+        curves[mu_e] = mu_d, [gain(mu_e, value) for value in mu_d]
     with panels(path, 2, 9.6, 4.1) as (whole, close):
         for axes in (whole, close):
             axes.axhline(0.0, color="#888888", linewidth=0.8)
             axes.axvline(low, color="#888888", linewidth=0.8)
             for mu_e, against in found.items():
                 colour, line, word = _LOOKS[mu_e]
-                start = max(low, against.bound)
-                mu_d = start + (1.0 - start) * np.geomspace(1e-4, 1.0, 240)
                 label = f"$\\mu_e = {mu_e:.2f}$ ({word})"
-                axes.plot(mu_d, [gain(mu_e, value) for value in mu_d], line, color=colour, label=label)
+                axes.plot(*curves[mu_e], line, color=colour, label=label)
                 if against.best_ratio is not None:
                     axes.plot(against.best_ratio, gain(mu_e, against.best_ratio), "o", color=colour, markersize=5)
                 if against.best_difference is not None:

@@ -14,12 +14,13 @@ import numpy as np
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import Fate, Link
+from emulator.model.links.link import Link
 from emulator.model.process import Floats, Process, Trajectory
 from emulator.model.receiver import Receiver
 from emulator.model.schemes.innovation import Innovation
 from emulator.model.theory import Outcomes, expected_traces
 from emulator.streams import Batch, root_of_seed, stream_key
+from emulator.view.figures_links import deliveries
 from emulator.view.figures_style import BLUE, GREEN, ORANGE, RED, panels
 
 MU, MU_D, SLOTS = 0.9, 0.85, 26
@@ -109,12 +110,11 @@ def _simulate_batch(batch: Batch, sums: dict[str, Floats]) -> None:
     for name in ("smart", "suspicious", "naive"):
         receivers[name] = STRATEGIES[name](Knowledge(model, MU_D, _SUSPICIOUS, keys), batch)
     trajectory = Trajectory(model, keys["process"], batch)
-    ours, theirs = (Link(Bernoulli(MU), keys[name], batch) for name in ("link/l", "link/e"))
+    links = (Link(Bernoulli(MU), keys[name], batch) for name in ("link/l", "link/e"))
     beliefs = {name: receiver.prior() for name, receiver in receivers.items()}
-    for k in range(batch.slots):
+    for k, gammas in enumerate(zip(*(deliveries(link, batch.slots) for link in links), strict=True)):
         x = trajectory.advance()
         z = encoder.encode(k, x, trajectory.predicted).z
-        gammas = ours.at(k) == Fate.DELIVERED, theirs.at(k) == Fate.DELIVERED
         for name, receiver in receivers.items():
             beliefs[name] = receiver.step(k, beliefs[name], gammas[name != "legitimate"], z)
             squared_error = np.sum((x - beliefs[name].x_hat) ** 2, axis=0)
