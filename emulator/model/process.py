@@ -188,19 +188,19 @@ class StateFactors:
     def __init__(self, process: Process) -> None:
         self._A: Rows = process.A.tolist()
         self._noise_factor: Rows = cholesky(process.Q).tolist()
-        self._initial: Rows = cholesky(process.initial_covariance).tolist()
-        self._k = 0
-        self._factor = self._initial
+        self._initial = self._times_A(cholesky(process.initial_covariance).tolist())
+        self._k = 1
+        self._carried = self._initial
 
     def carried(self, k: int) -> Rows:
         """A L_{k−1}, (n, n), for k ≥ 1: a factor of the encoding noise's covariance A Σ_{k−1} Aᵀ."""
-        if k - 1 < self._k:
-            self._k, self._factor = 0, self._initial
-        while self._k < k - 1:
-            spread = zip(self._times_A(self._factor), self._noise_factor, strict=True)
-            self._factor = triangular_factor([left + right for left, right in spread])
+        if k < self._k:
+            self._k, self._carried = 1, self._initial
+        while self._k < k:
+            spread = zip(self._carried, self._noise_factor, strict=True)
+            self._carried = self._times_A(triangular_factor([left + right for left, right in spread]))
             self._k += 1
-        return self._times_A(self._factor)
+        return self._carried
 
     def _times_A(self, factor: Rows) -> Rows:
         n = len(factor)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -73,11 +75,12 @@ def closing_table(summary: News) -> Table:
     """Per receiver: what it received, its error, and what it believed of it."""
     trials = f"{summary['trials']} trials" if summary["trials"] > 1 else "1 trial"
     rate = f"{summary['slots_per_second']:,.0f} slots/s"
-    table = Table(title=f"{summary['scenario']} · {summary['slots']} slots · {trials} · {rate}", title_justify="left")
-    table.add_column("receiver")
-    for head in ("received", "used", "mean squared error", "tr P believed", "tr P expected"):
-        table.add_column(head, justify="right")
-    table.add_column("digest")
+    title = f"{summary['scenario']} · {summary['slots']} slots · {trials} · {rate}"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.add_column("receiver", no_wrap=True)
+    for head in ("received", "used", "mean |x−x̂|²", "believed tr P", "expected tr P"):
+        table.add_column(head, justify="right", no_wrap=True)
+    table.add_column("digest", no_wrap=True)
     for name, peer in summary["peers"].items():
         table.add_row(
             name,
@@ -93,7 +96,7 @@ def closing_table(summary: News) -> Table:
 
 def print_summary(summary: News, folder: str) -> None:
     """The closing report on standard output."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 100)
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
     console.print(closing_table(summary))

@@ -93,7 +93,8 @@ class _Table:
     """A Parquet file that grows. Rows are held back until there are enough for a row group."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
-        self._writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1)
+        named = [field.name for field in schema if pa.types.is_dictionary(field.type)]
+        self._writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1, use_dictionary=named)
         self._schema = schema
         self._held: list[pa.RecordBatch] = []
         self._rows = 0
