@@ -1,0 +1,258 @@
+"""Every golden block of docs/protocol.md, against the program, in both directions."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.brief import read_brief
+from emulator.errors import MalformedMessage
+from emulator.model.digest import BeliefLog, RunDigest
+from emulator.model.elementary import normal_quantile
+from emulator.model.receiver import Belief
+from emulator.network import wire
+from emulator.network.access import Keys, grants
+from emulator.streams import normals, root_of_seed, stream_key, uniforms, words
+
+TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
+GOLDEN = {name: block for name, block in re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M)}
+MESSAGES = [name for name in GOLDEN if "\nbytes " in GOLDEN[name]]
+KEY = "evedrop/golden"
+
+
+def parts_of(block: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
+    """Shape, value and bytes of a message's golden block."""
+    shape, value, raw = re.fullmatch(r"(?:shape (.*?)\n)?value (.*)\nbytes (.*)", block, re.S).groups()
+    return json.loads(shape or "{}"), json.loads(value), bytes.fromhex(raw)
+
+
+def flags(rows: Any) -> np.ndarray:
+    """Flags of zeros and ones."""
+    return np.array(rows, np.bool_)
+
+
+def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the router makes it."""
+    mask = wire.packed_flags(flags(value["gamma"])).tobytes()
+    return wire.delivery(value["k"], mask, np.array(value["z"], float).tobytes())
+
+
+def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As a receiver reads it: z is (n, R), with 0 for the lost."""
+    gamma, z = wire.read_delivery(KEY, raw, value["k"], (shape["n"], shape["trials"]))
+    assert not z[:, ~gamma].any()
+    return {"k": value["k"], "gamma": gamma.astype(int).tolist(), "z": z[:, gamma].tolist()}
+
+
+def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As a receiver makes it."""
+    digests = {
+        int(block): np.array([list(bytes.fromhex(one)) for one in rows], np.uint8)
+        for block, rows in value["digests"].items()
+    }
+    columns = (np.array(value[name], float) for name in ("P", "trace"))
+    x_hat, action = np.array(value["x_hat"], float), np.array(value["action"], np.uint8)
+    return wire.Report(value["k"], x_hat, action, *columns, digests).pack()
+
+
+def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    report = wire.read_report(KEY, raw, value["k"], (shape["n"], shape["trials"]), shape["recorded"])
+    columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
+    digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in report.digests.items()}
+    return {"k": report.first, "c": report.count, **columns, "digests": digests}
+
+
+def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the sensor makes it."""
+    return wire.Truth(value["k"], np.array(value["x"], float), flags(value["nu"])).pack()
+
+
+def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    truth = wire.read_truth(KEY, raw, value["k"], (shape["n"], shape["trials"]))
+    return {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
+
+
+def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the router makes it."""
+    delivered = {name: flags(link["delivered"]) for name, link in value["links"].items()}
+    lost = {
+        name: {reason: np.array(counts, np.uint32) for reason, counts in link["lost"].items()}
+        for name, link in value["links"].items()
+    }
+    return wire.Journal(value["k"], value["c"], delivered, lost).pack()
+
+
+def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    journal = wire.read_journal(KEY, raw, value["k"], tuple(shape["receivers"]), shape["trials"])
+    links = {
+        name: {
+            "delivered": journal.delivered[name].astype(int).tolist(),
+            "lost": {reason: counts.tolist() for reason, counts in journal.lost[name].items()},
+        }
+        for name in shape["receivers"]
+    }
+    return {"k": journal.first, "c": journal.count, "links": links}
+
+
+def decode_packet(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the router reads it."""
+    z = wire.read_uplink(KEY, raw, value["k"], (shape["n"], shape["trials"]))
+    return {"k": value["k"], "z": z.tolist()}
+
+
+Encode = Callable[[dict[str, Any], dict[str, Any]], bytes]
+Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
+CODECS: dict[str, tuple[Encode, Decode]] = {
+    "packet": (lambda shape, value: wire.uplink(value["k"], np.array(value["z"])), decode_packet),
+    "delivery": (encode_delivery, decode_delivery),
+    "progress": (
+        lambda shape, value: wire.progress(value["k"]),
+        lambda shape, value, raw: {"k": wire.read_progress(KEY, raw)},
+    ),
+    "control": (
+        lambda shape, value: wire.control(value["do"]),
+        lambda shape, value, raw: {"do": wire.read_control(KEY, raw)},
+    ),
+    "truth": (encode_truth, decode_truth),
+    "report": (encode_report, decode_report),
+    "journal": (encode_journal, decode_journal),
+}
+
+
+def test_the_document_has_every_block() -> None:
+    """Every kind of message is there, and everything else that is pinned: a renamed block is not silently skipped."""
+    assert {name.split(",")[0] for name in MESSAGES} == set(CODECS)
+    others = {"brief", "keys", "words", "uniforms", "normals", "far words", "quantile", "digest"}
+    assert set(GOLDEN) - set(MESSAGES) == others
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_message_encodes_to_these_bytes(name: str) -> None:
+    """The values of a golden block give exactly its bytes."""
+    shape, value, raw = parts_of(GOLDEN[name])
+    assert CODECS[name.split(",")[0]][0](shape, value).hex(" ") == raw.hex(" ")
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_bytes_decode_to_these_values(name: str) -> None:
+    """The bytes of a golden block give exactly its values."""
+    shape, value, raw = parts_of(GOLDEN[name])
+    assert CODECS[name.split(",")[0]][1](shape, value, raw) == value
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_cut_message_is_refused(name: str) -> None:
+    """A golden message without its last byte is malformed, and the error shows where it came from and its bytes."""
+    shape, value, raw = parts_of(GOLDEN[name])
+    with pytest.raises(MalformedMessage, match=f"malformed message on {KEY}.*{raw[:4].hex(' ')}"):
+        CODECS[name.split(",")[0]][1](shape, value, raw[:-1])
+
+
+def test_brief_is_read_and_written_as_documented(tmp_path: Path) -> None:
+    """The golden brief reads, and writes back to the same text."""
+    path = tmp_path / "eve.json"
+    path.write_text(GOLDEN["brief"])
+    path.chmod(0o600)
+    brief = read_brief(path, "eavesdropper")
+    assert (brief.flow.window, brief.flow.batch, brief.model.state_probability) == (64, 16, 0.6)
+    (tmp_path / "again").mkdir()
+    assert brief.write(tmp_path / "again").read_text().strip() == GOLDEN["brief"].strip()
+
+
+def test_keys_of_streams() -> None:
+    """Roots and stream keys derive as documented."""
+    golden = json.loads(GOLDEN["keys"])
+    root = root_of_seed(golden["seed"])
+    secret = stream_key(root, "secret")
+    found = {"seed": golden["seed"], "root": root.hex(), "secret": secret.hex()}
+    found |= {name: stream_key(root, name).hex() for name in ("process", "link/legitimate", "coin/eve")}
+    found |= {name: stream_key(secret, name).hex() for name in ("schedule", "noise")}
+    assert found == golden
+
+
+def golden_words() -> dict[str, np.ndarray]:
+    """The golden words: "slot trial" → (m,)."""
+    golden = json.loads(GOLDEN["words"])
+    key = stream_key(root_of_seed(golden["seed"]), golden["stream"])
+    drawn = words(key, range(2), range(2), golden["per_trial"])
+    return {f"{k} {r}": drawn[k, r] for k in range(2) for r in range(2)}
+
+
+def test_words_uniforms_and_normals() -> None:
+    """The first words of a stream, and what becomes of them, to the last bit."""
+    raw = golden_words()
+    golden = json.loads(GOLDEN["words"])
+    assert {name: [f"{word:016x}" for word in row.tolist()] for name, row in raw.items()} == {
+        name: golden[name] for name in raw
+    }
+    assert {name: uniforms(row).tolist() for name, row in raw.items()} == json.loads(GOLDEN["uniforms"])
+    assert {name: normals(row).tolist() for name, row in raw.items()} == json.loads(GOLDEN["normals"])
+
+
+def test_words_far_away() -> None:
+    """Counters of large slots and trials are as documented."""
+    golden = json.loads(GOLDEN["far words"])
+    key = stream_key(root_of_seed(golden["seed"]), golden["stream"])
+    k, r = golden["slot"], golden["trial"]
+    drawn = words(key, range(k, k + 1), range(r, r + 1), golden["per_trial"])
+    assert [f"{word:016x}" for word in drawn[0, 0].tolist()] == golden["words"]
+
+
+def test_quantiles() -> None:
+    """Φ⁻¹ in its centre and both kinds of tails, to the last bit."""
+    u, value = zip(*json.loads(GOLDEN["quantile"]), strict=True)
+    assert normal_quantile(np.array(u)).tolist() == list(value)
+
+
+def test_digest() -> None:
+    """Block digests and the receiver's digest are as documented."""
+    golden = json.loads(GOLDEN["digest"])
+    gamma, x_hat = np.array(golden["gamma"], np.uint8), np.array(golden["x_hat"])
+    P = np.array(golden["P"]).reshape(3, 2, 2, 2)
+    log = BeliefLog(2, 2, 3)
+    blocks = [log.add(k, Belief(x_hat[k], P[k], gamma[k])) for k in range(3)]
+    assert blocks[:2] == [None, None]
+    assert [bytes(row).hex() for row in blocks[2]] == golden["blocks"]
+    whole = RunDigest()
+    whole.add({0: blocks[2]})
+    assert whole.hexadecimal == golden["receiver"]
+
+
+def test_table_of_keys_is_the_access_table() -> None:
+    """Who writes and reads which key, as the document's table says it and as the router grants it."""
+    receivers = ("legitimate", "eve")
+    prefix = f"evedrop/{'r'}/"
+    documented: dict[tuple[str, str], set[str]] = {}
+    everybody = {"sensor": ["sensor"], "router": ["router"], "observer": ["observer"], "receiver": list(receivers)}
+    rows = re.findall(r"^\| (`[a-z]+(?:/.*?)?`.*?) \| (.*?) \| (.*?) \| (.*?) \|$", TEXT.split("## A run")[0], re.M)
+    assert len(rows) == 8
+    for paths, _, writers, readers in rows:
+        for path in re.findall(r"`(.*?)`", paths):
+            names = [*receivers, "sensor", "router", "observer"] if "<process>" in path else receivers
+            for name in names if "<" in path else [""]:
+                key = prefix + re.sub(r"<\w+>", name, path)
+                for what, who in (("writes", writers), ("reads", readers)):
+                    own = "that" in who and ("receiver" in who or "process" in who)
+                    users = {name or path.split("/")[-1]} if own else {u for u in everybody if re.search(u, who)}
+                    documented.setdefault((what, key), set()).update(users - {"router"})
+    granted: dict[tuple[str, str], set[str]] = {}
+    for grant in grants("r", receivers):
+        for what, keys in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
+            for key in keys:
+                granted.setdefault((what, key), set()).add(grant.process)
+    keys = Keys("r")
+    no_row = {
+        ("writes", keys.control("observer")),
+        ("reads", keys.control("observer")),
+        ("reads", keys.alive("observer")),
+    }
+    assert {entry: users for entry, users in documented.items() if users and entry not in no_row} == granted
