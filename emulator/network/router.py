@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -73,10 +74,7 @@ def route(brief: Brief) -> None:
     links = {name: link_of(spec, keys[f"link/{name}"], batch) for name, spec in brief.part["links"].items()}
     shape = (len(brief.model.A), brief.trials)
     table = grants(brief.run, receivers)
-    with (
-        _users_file(brief.part["users"]) as users,
-        Session(brief, router_config(brief.router, str(users), access_control(table))) as session,
-    ):
+    with _opened(brief, access_control(table)) as session:
         present = {grant.process: False for grant in table}
         for name in present:
             session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
@@ -100,9 +98,14 @@ def route(brief: Brief) -> None:
             time.sleep(0.005)
 
 
+def _opened(brief: Brief, access: dict[str, Any]) -> Session:
+    with _users_file(brief.part["users"]) as users:
+        return Session(brief, router_config(brief.router, str(users), access))
+
+
 @contextmanager
 def _users_file(users: Mapping[str, str]) -> Iterator[Path]:
-    """The dictionary of users and passwords that Zenoh reads once, when the session opens; gone with the router."""
+    """The dictionary of users and passwords that Zenoh reads once, when the session opens; then it must not stay."""
     handle, name = tempfile.mkstemp(prefix="evedrop-users-")
     path = Path(name)
     try:

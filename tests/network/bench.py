@@ -1,0 +1,175 @@
+"""A router process of a real brief with everybody else played by the test, and a whole live run with its briefs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from emulator.brief import Brief, Flow, read_brief
+from emulator.network.access import Keys
+from emulator.network.session import client_config
+from emulator.run.briefs import Observation, briefs_of
+from emulator.run.launcher import free_port
+from emulator.scenario import Scenario
+
+LIMIT_SECONDS = 20.0
+Message = tuple[str, bytes]
+
+
+def until(condition: Callable[[], Any], what: str, seconds: float = LIMIT_SECONDS) -> Any:
+    """The first true value of a condition; fails, saying what was waited for, if it stays false."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain: {what}"
+        time.sleep(0.005)
+    return value
+
+
+def scenario_of(**changes: Any) -> Scenario:
+    """A small scenario: legitimate estimator, a smart, a suspicious and a naive eavesdropper."""
+    tables: dict[str, Any] = {
+        "title": "Network test",
+        "slots": 64,
+        "trials": 5,
+        "seed": 91,
+        "process": {"A": [[1.0, 0.05], [0.0, 1.0]], "Q": [[1e-3, 0.0], [0.0, 1e-4]]},
+        "encoding": {"scheme": "innovation", "state_probability": 0.4},
+        "legitimate": {"link": {"quality": 0.8}},
+        "eavesdroppers": {
+            "eve": {"strategy": "smart", "link": {"quality": 0.7}},
+            "mallory": {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.2, "link": {"quality": 0.6}},
+            "nadia": {"strategy": "naive", "link": {"quality": 0.9}},
+        },
+        **changes,
+    }
+    tables["process"]["initial_covariance"] = [[1.0, 0.0], [0.0, 0.01]]
+    return Scenario.model_validate(tables)
+
+
+@dataclass
+class Ear:
+    """What arrived at one subscription, in order."""
+
+    messages: SimpleQueue[Message] = field(default_factory=SimpleQueue)
+
+    def __call__(self, sample: zenoh.Sample) -> None:
+        """Take what Zenoh hands over, on its thread."""
+        kind = "" if sample.kind == zenoh.SampleKind.PUT else "deleted "
+        self.messages.put((kind + str(sample.key_expr), sample.payload.to_bytes()))
+
+    def hear(self) -> Message:
+        """The next message."""
+        try:
+            return self.messages.get(timeout=LIMIT_SECONDS)
+        except Empty:
+            raise AssertionError(f"nothing arrived within {LIMIT_SECONDS:.0f} s") from None
+
+    def all(self) -> list[Message]:
+        """Everything that has arrived by now."""
+        found = []
+        while not self.messages.empty():
+            found.append(self.messages.get())
+        return found
+
+
+def connect(brief: Brief, **changes: Any) -> zenoh.Session:
+    """A session with a brief's credentials; changes replace top-level entries of its configuration."""
+    return zenoh.open(zenoh.Config.from_json5(json.dumps({**client_config(brief), **changes})))
+
+
+class Bench:
+    """A router process, and sessions with everybody else's credentials in the test's hands."""
+
+    def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack) -> None:
+        observation = Observation(folder / "results", False, None)
+        made = briefs_of(scenario, f"tcp/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
+        self.briefs: Mapping[str, Brief] = {
+            name: replace(brief, flow=Flow(window=32, batch=8)) for name, brief in made.items()
+        }
+        self.scenario = scenario
+        self.keys = Keys(self.briefs["router"].run)
+        self.log = folder / "router.log"
+        self.private = folder / "private"
+        self.private.mkdir()
+        with self.log.open("wb") as log:
+            self.router = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", "emulator", "router", str(self.briefs["router"].write(folder))],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    env={**os.environ, "TMPDIR": str(self.private)},
+                )
+            )
+        stack.callback(self.router.kill)
+        names = ("sensor", *scenario.receivers, "observer")
+        self.sessions = {name: stack.enter_context(connect(self.briefs[name])) for name in names}
+        self.downlinks = {name: self.listen(name, self.keys.downlink(name)) for name in scenario.receivers}
+        self.controls = {name: self.listen(name, self.keys.control(name)) for name in ("sensor", *scenario.receivers)}
+        self.progress = {n: self.listen("sensor", self.keys.progress(n)) for n in (*scenario.receivers, "observer")}
+        processes = ("sensor", *scenario.receivers)
+        self.telemetry = {name: self.listen("observer", self.keys.telemetry(name)) for name in processes}
+        self.journal = self.listen("observer", self.keys.journal)
+        self.tokens = Ear()
+        for name in (*processes, "router"):
+            self.sessions["observer"].liveliness().declare_subscriber(self.keys.alive(name), self.tokens, history=True)
+        assert self.tokens.hear() == (self.keys.alive("router"), b"")
+        self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
+
+    def listen(self, process: str, key: str) -> Ear:
+        """Subscribe with a process's credentials."""
+        ear = Ear()
+        self.sessions[process].declare_subscriber(key, ear)
+        return ear
+
+    def put(self, process: str, key: str, payload: bytes) -> None:
+        """Publish with a process's credentials on a key it may write, in the order of all its other puts."""
+        if (process, key) not in self._publishers:
+            publisher = self.sessions[process].declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+            until(lambda: publisher.matching_status.matching, f"a reader of {key}")
+            self._publishers[process, key] = publisher
+        self._publishers[process, key].put(payload)
+
+    def settle(self, process: str) -> None:
+        """Return when the router has dealt with everything that a process put before."""
+        key = self.keys.telemetry(process)
+        self.put(process, key, b"settled")
+        assert self.telemetry[process].hear() == (key, b"settled")
+
+    def packet(self, k: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """The payloads of slot k: any numbers that tell slots, states and trials apart."""
+        n, trials = 2, self.scenario.trials
+        return np.arange(n * trials, dtype=float).reshape(n, trials) + 100.0 * (k + 1)
+
+
+@contextmanager
+def bench_of(scenario: Scenario, folder: Path) -> Iterator[Bench]:
+    """A bench that is gone when the block ends."""
+    with ExitStack() as stack:
+        yield Bench(scenario, folder, stack)
+
+
+def parts_of(pid: int) -> dict[str, tuple[int, Brief]]:
+    """Process name → (pid, brief) of the children of a launcher."""
+    found = {}
+    for line in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        try:
+            arguments = Path(f"/proc/{line}/cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if len(arguments) > 4 and arguments[1:3] == [b"-m", b"emulator"]:
+            brief = read_brief(Path(arguments[4].decode()))
+            found[brief.process] = (int(line), brief)
+    return found
