@@ -15,6 +15,7 @@ import numpy as np
 
 from emulator.errors import UsageError
 from emulator.model.process import Process
+from emulator.model.receiver import Flags
 from emulator.model.theory import Outcomes, expected_traces, limit_trace, stability_bound
 
 Interval = tuple[float, float]
@@ -60,8 +61,9 @@ class Against:
     """J_e at the scenario's own μ_d."""
     difference: float
     """J_r = J_e − J there: the gain. nan if both are unbounded."""
-    violated: tuple[int, ...]
-    """Slots k ≥ 1 of the run in which tr E P_k < tr E Pᵉ_k does not hold at the scenario's own μ_d."""
+    violated: tuple[tuple[int, int], ...]
+    """(first, last) of each stretch of the run's slots k ≥ 1 in which tr E P_k < tr E Pᵉ_k does not hold at the
+    scenario's own μ_d."""
     relative_from: int | None
     """First slot k ≥ 1 from which on it holds to the end of the run; None if not in the last slot. 1 is the paper's
     "for all k"."""
@@ -101,8 +103,8 @@ class Design:
 
     @property
     def cost(self) -> float:
-        """J(μ_d) / J(1), by which factor secrecy raises the legitimate error. 1 for a lossless link."""
-        return 1.0 if self.trace == self.plain_trace else self.trace / self.plain_trace
+        """J(μ_d) / J(1), by which factor secrecy raises the legitimate error: 1 for a lossless link, nan for a bad one."""
+        return 1.0 if self.plain_trace == 0.0 else self.trace / self.plain_trace
 
     @property
     def remark(self) -> str | None:
@@ -148,8 +150,8 @@ def design(
 
     def against(adversary: Adversary) -> Against:
         theirs = expected_traces(process, adversary.outcomes(mu_d), slots)
-        violated = np.flatnonzero(~(ours[1:] < theirs[1:])) + 1
-        held_from = int(violated[-1]) + 1 if violated.size else 1
+        violated = _stretches(~(ours[1:] < theirs[1:]))
+        held_from = violated[-1][1] + 1 if violated else 1
         its_trace = limit_trace(process, adversary.outcomes(mu_d))
         return Against(
             bound=adversary_bound(process, adversary),
@@ -159,7 +161,7 @@ def design(
             best_ratio=best_ratio(process, mu, adversary),
             trace=its_trace,
             difference=math.nan if math.isinf(trace) and math.isinf(its_trace) else its_trace - trace,
-            violated=tuple(violated.tolist()),
+            violated=violated,
             relative_from=held_from if held_from < slots else None,
         )
 
@@ -323,6 +325,12 @@ def _between(low: float, high: float) -> np.ndarray[tuple[int], np.dtype[np.floa
     steps = np.concatenate([np.geomspace(_NEAREST, 0.02, 60), np.linspace(0.02, 1.0, 99)[1:]])
     points: np.ndarray[tuple[int], np.dtype[np.float64]] = low + steps * (high - low)
     return points
+
+
+def _stretches(flags: Flags) -> tuple[tuple[int, int], ...]:
+    """(first, last) of each stretch of true flags; the first flag is that of slot 1."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))) + 1
+    return tuple((int(first), int(end) - 1) for first, end in edges.reshape(-1, 2))
 
 
 def _finite(value: float) -> float | None:

@@ -19,7 +19,8 @@ from emulator.model.process import Floats, Process
 
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python, few enough to set up in 3 ms
 _LARGEST_POWER = 1e100  # of A's entries within a block, far from overflow
-_ROUNDING = 1e-12  # a spectral radius this little below 1 is 1, computed
+_MARGINAL = 1e-7  # a spectral radius this close to 1 is 1, computed: a double eigenvalue has errors of 1e-8
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -185,9 +186,10 @@ def stability_bound(process: Process, mu: float) -> float:
 
     Source: equations (decisionvariableminbound) and (eavesdroppernetworkcorrect); docs/mathematics.md, limits.
     """
-    if mu == 0.0:
-        return math.inf if _is_persistent(process) else 0.0
-    return max(0.0, 1.0 - process.spectral_radius**-2.0) / mu if process.spectral_radius > 0.0 else 0.0
+    rho = _radius(process)
+    if rho < 1.0:
+        return 0.0
+    return (1.0 - rho**-2.0) / mu if mu > 0.0 else math.inf
 
 
 def lyapunov(process: Process, kept: float) -> Floats:
@@ -205,7 +207,7 @@ def limit(process: Process, outcomes: Outcomes) -> Floats:
     """
     source = outcomes.predicted * process.Q
     if outcomes.misled:
-        if _is_persistent(process):
+        if _radius(process) >= 1.0:
             return np.full_like(process.Q, np.inf)
         source = source + 2.0 * outcomes.misled * (process.A @ lyapunov(process, 1.0) @ process.A.T)
     elif outcomes.predicted == 0.0 and outcomes.initial == 0.0:
@@ -228,10 +230,10 @@ def tail_index(process: Process, outcomes: Outcomes) -> float:
 
     Source: docs/mathematics.md, heavy tails.
     """
-    growth = 2.0 * math.log(process.spectral_radius) if process.spectral_radius > 0.0 else 0.0
-    if growth <= _ROUNDING or outcomes.misled or outcomes.predicted == 0.0 or outcomes.state >= 1.0:
+    rho = _radius(process)
+    if rho <= 1.0 or outcomes.misled or outcomes.predicted == 0.0 or outcomes.state >= 1.0:
         return math.inf
-    return -math.log1p(-outcomes.state) / growth
+    return -math.log1p(-outcomes.state) / (2.0 * math.log(rho))
 
 
 def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
@@ -242,15 +244,17 @@ def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
     return tail_index(process, outcomes) <= 2.0
 
 
-def _is_persistent(process: Process) -> bool:
-    return process.spectral_radius >= 1.0 - _ROUNDING
+def _radius(process: Process) -> float:
+    """ρ(A), exactly 1 for a marginally stable process whatever its eigenvalues' rounding."""
+    rho = process.spectral_radius
+    return 1.0 if abs(rho - 1.0) <= _MARGINAL else rho
 
 
 def _stationary(process: Process, kept: float, source: Floats) -> Floats:
     from scipy.linalg import LinAlgError, LinAlgWarning, solve_discrete_lyapunov  # noqa: PLC0415 - slow to import
 
     unbounded = np.full_like(source, np.inf)
-    if kept * process.spectral_radius**2 >= 1.0:
+    if kept * _radius(process) ** 2 >= 1.0 - _ROUNDING:
         return unbounded
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LinAlgWarning)  # near the bound; the definiteness below decides

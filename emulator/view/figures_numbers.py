@@ -89,7 +89,7 @@ def numerical_illustration(designs: dict[float, Against]) -> list[Number]:
         Number(
             where, "J_r > 0 for μ_e = 0.99", '"not apparent" in the figure',
             f"J_r/J up to {numerical.gain(0.99, peak):.3f}" if peak is not None else "none",
-            "erratum: plotted as J_r/J, which the text names, it is plain to see",
+            "not checkable: the paper's axis is not known; of the J_r/J that the text names it would be plain to see",
         )
     )  # fmt: skip
     return numbers

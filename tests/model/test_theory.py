@@ -327,6 +327,14 @@ def test_second_moment_diverges_where_variance_is_said_infinite(mu_d: float) -> 
     assert diverges == has_infinite_variance(scalar, Outcomes.legitimate(mu, mu_d))
 
 
+@pytest.mark.parametrize(("b0", "b1"), [(1.0, 1.0), (0.8, 0.3)])
+def test_misled_error_grows_in_proportion_to_the_state(b0: float, b1: float) -> None:
+    """The ratio tr E P_k / tr Σ_k tends to 2 p_i / (p_i + p_r), for naive 2 (1 − μ_d)."""
+    outcomes = Outcomes.eavesdropper(0.9, 0.6, b0, b1)
+    ratio = expected_traces(EXAMPLE, outcomes, 300)[-1] / np.trace(EXAMPLE.state_covariances(300)[-1])
+    assert ratio == pytest.approx(2 * 0.4 * b1 / (0.4 * b1 + 0.6 * b0), rel=1e-9)
+
+
 def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
     """Why whoever is misled has no heavy tail: no sequence of events gives more than a fixed multiple of E tr P_k."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, 1, 1)
