@@ -269,7 +269,7 @@ def best_difference(process: Process, mu: float, adversary: Adversary) -> float 
 
     None for smart with μ_e ≤ μ, where J_r → ∞ at the lower end.
 
-    Source: equation (optimisationfunction).
+    Source: docs/mathematics.md, design.
     """
     return _argmax(process, mu, adversary, lambda ours, theirs: theirs - ours)
 

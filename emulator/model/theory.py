@@ -184,7 +184,7 @@ def stability_bound(process: Process, mu: float) -> float:
 
     0 for ρ = 1: any μ_d > 0 will do. 1 or more: no μ_d ≤ 1 lies above it. inf for μ = 0 and ρ ≥ 1: none at all.
 
-    Source: equations (decisionvariableminbound) and (eavesdroppernetworkcorrect); docs/mathematics.md, limits.
+    Source: docs/mathematics.md, limits.
     """
     rho = _radius(process)
     if rho < 1.0:
@@ -195,7 +195,7 @@ def stability_bound(process: Process, mu: float) -> float:
 def lyapunov(process: Process, kept: float) -> Floats:
     """S = kept · A S Aᵀ + Q, (n, n): S(q) of the paper with kept = 1 − q. All inf where kept · ρ² ≥ 1: unbounded.
 
-    Source: equation (solnlyap), Theorem IV.3.
+    Source: Theorem IV.3.
     """
     return _stationary(process, kept, process.Q)
 
