@@ -10,12 +10,23 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
+import tomli_w
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from emulator.errors import ScenarioError, UsageError
 from emulator.model.eavesdroppers import STRATEGIES
@@ -24,6 +35,8 @@ from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE, RESERVED
 
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+SECRET_BYTES = 32
+_SHOWN = 60  # characters of a wrong value that a message repeats
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -58,37 +71,89 @@ def _process_name(name: str) -> str:
     return name
 
 
-Probability = Annotated[float, Field(strict=True, examples=[0.9]), AfterValidator(_probability)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
-Matrix = Annotated[list[list[Annotated[float, Field(strict=True)]]], Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
+Matrix = list[list[Annotated[float, Field(strict=True)]]]
+Found = tuple[str, str]
+"""A mistake in a table: the entry, and what is wrong with it."""
 
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """What only shows when entries are seen together; entries that are wrong by themselves may be in the table."""
+        del table
+        return []
 
-def _mistakes(found: Sequence[tuple[str, str]]) -> PydanticCustomError:
-    return PydanticCustomError("mistakes", "several", {"mistakes": list(found)})
+    @model_validator(mode="wrap")
+    @classmethod
+    def _all_at_once(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        """Entries by themselves and together, so that one mistake does not hide another."""
+        together = cls.mistakes(found) if isinstance(found, Mapping) else []
+        mistakes = PydanticCustomError("mistakes", "several", {"mistakes": together})
+        try:
+            table = check(found)
+        except ValidationError as error:
+            if not together:
+                raise
+            lines = [_again(detail) for detail in error.errors(include_url=False)]
+            lines.append(InitErrorDetails(type=mistakes, input=found))
+            raise ValidationError.from_exception_data(cls.__name__, lines) from None
+        if together:
+            raise mistakes
+        return table
+
+
+def _again(detail: ErrorDetails) -> InitErrorDetails:
+    """An error that was reported, to be reported once more with others."""
+    kind, context = detail["type"], detail.get("ctx", {})
+    own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
+    return InitErrorDetails(type=own, loc=detail["loc"], input=detail["input"], ctx=context)
+
+
+def _numbers(rows: Any) -> bool:
+    """Whether these are rows of numbers, of any lengths."""
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_number, row)) for row in rows)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)
 
 
 class ProcessTable(_Table):
     """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance)."""
 
-    A: Matrix
-    Q: Matrix
-    initial_covariance: Matrix
+    A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
+    Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
+    initial_covariance: Annotated[Matrix, Field(examples=[[[1.0, 0.0], [0.0, 1.0]]])]
 
-    @model_validator(mode="after")
-    def _is_a_process(self) -> Self:
-        ragged = [
-            (name, "has rows of different lengths; expected a square matrix, such as [[1.0, 0.3], [0.5, 1.001]]")
-            for name, rows in (("A", self.A), ("Q", self.Q), ("initial_covariance", self.initial_covariance))
-            if len({len(row) for row in rows}) > 1
-        ]
-        found = ragged or mistakes_of(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
-        if found:
-            raise _mistakes(found)
-        return self
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Whether the three are a process; what is missing or no matrix at all is left out of the question."""
+        found: list[Found] = []
+        matrices: dict[str, NDArray[np.float64]] = {}
+        for name, field in cls.model_fields.items():
+            rows = table.get(name)
+            if not _numbers(rows) or rows is None:
+                continue
+            lengths = {len(row) for row in rows}
+            if lengths == {len(rows)} and rows:
+                matrices[name] = np.array(rows, np.float64)
+            else:
+                count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
+                shape = f"{count} of {_listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
+                found.append(
+                    (name, f"has {shape}; expected a square matrix, such as {_toml((field.examples or [0])[0])}")
+                )
+        if matrices:
+            known = matrices.get("A", next(iter(matrices.values())))
+            stand_in = np.eye(len(known))
+            all_three = [matrices.get(name, stand_in) for name in cls.model_fields]
+            found += [(name, what) for name, what in mistakes_of(*all_three) if name in matrices]
+        return found
 
     @property
     def process(self) -> Process:
@@ -100,17 +165,19 @@ class EncodingTable(_Table):
     """`[encoding]`: the scheme, and μ_d for those that mix states and innovations."""
 
     scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(_one_of(SCHEMES))]
-    state_probability: Probability | None = None
+    state_probability: Annotated[Probability | None, Field(examples=[0.6])] = None
 
-    @model_validator(mode="after")
-    def _fits_the_scheme(self) -> Self:
-        mixes = SCHEMES[self.scheme].mixes
-        if mixes and self.state_probability is None:
-            raise _mistakes([("state_probability", "is missing; expected a number from 0 to 1, such as 0.6")])
-        if not mixes and self.state_probability is not None:
-            what = f"is set, but the scheme {self.scheme} sends the state always; remove the line"
-            raise _mistakes([("state_probability", what)])
-        return self
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Whether μ_d is there for a scheme that has it, and for no other."""
+        scheme = SCHEMES.get(str(table.get("scheme")))
+        given = table.get("state_probability") is not None
+        if scheme is not None and scheme.mixes and not given:
+            return [("state_probability", "is missing; expected a number from 0 to 1, such as 0.6")]
+        if scheme is not None and not scheme.mixes and given:
+            what = f"is set, but the scheme {table['scheme']} sends the state always; remove the line"
+            return [("state_probability", what)]
+        return []
 
     @property
     def mu_d(self) -> float:
@@ -121,7 +188,7 @@ class EncodingTable(_Table):
 class LinkTable(_Table):
     """`link = {…}`: how packets get from the router to one receiver."""
 
-    quality: Probability
+    quality: Annotated[Probability, Field(examples=[0.9])]
 
     @property
     def spec(self) -> dict[str, Any]:
@@ -129,34 +196,39 @@ class LinkTable(_Table):
         return {"model": "bernoulli", "quality": self.quality}
 
 
+LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
+
+
 class LegitimateTable(_Table):
     """`[legitimate]`."""
 
-    link: LinkTable
+    link: LinkField
 
 
 class EavesdropperTable(_Table):
     """`[eavesdroppers.NAME]`: a strategy with its parameters, and a link."""
 
     strategy: Annotated[str, Field(strict=True, examples=["smart"]), AfterValidator(_one_of(STRATEGIES))]
-    link: LinkTable
-    use_state: Probability | None = None
-    use_innovation: Probability | None = None
+    link: LinkField
+    use_state: Annotated[Probability | None, Field(examples=[0.8])] = None
+    use_innovation: Annotated[Probability | None, Field(examples=[0.2])] = None
 
-    @model_validator(mode="after")
-    def _fits_the_strategy(self) -> Self:
-        wanted = STRATEGIES[self.strategy].parameters
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Whether the strategy has all its parameters and no others."""
+        strategy = STRATEGIES.get(str(table.get("strategy")))
+        if strategy is None:
+            return []
         found = []
         for name in ("use_state", "use_innovation"):
-            if name in wanted and getattr(self, name) is None:
-                found.append(
-                    (name, f"is missing; the strategy {self.strategy} needs a number from 0 to 1, such as 0.5")
-                )
-            if name not in wanted and getattr(self, name) is not None:
-                found.append((name, f"is set, but the strategy {self.strategy} has no such parameter; remove the line"))
-        if found:
-            raise _mistakes(found)
-        return self
+            wanted, given = name in strategy.parameters, table.get(name) is not None
+            if wanted and not given:
+                what = f"is missing; the strategy {table['strategy']} needs a number from 0 to 1, such as 0.5"
+                found.append((name, what))
+            if given and not wanted:
+                what = f"is set, but the strategy {table['strategy']} has no such parameter; remove the line"
+                found.append((name, what))
+        return found
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -168,14 +240,15 @@ class ExpectTable(_Table):
     """`[[expect]]`: what a figure of the summary must be for the run to pass."""
 
     figure: Annotated[str, Field(examples=["legitimate.mean_squared_error"])]
-    below: Annotated[float, Field(strict=True)] | None = None
-    above: Annotated[float, Field(strict=True)] | None = None
+    below: Annotated[Number | None, Field(examples=[0.01])] = None
+    above: Annotated[Number | None, Field(examples=[0.01])] = None
 
-    @model_validator(mode="after")
-    def _says_something(self) -> Self:
-        if self.below is None and self.above is None:
-            raise _mistakes([("below", "and above are both missing; expected at least one, such as below = 0.01")])
-        return self
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Whether it says something."""
+        if table.get("below") is None and table.get("above") is None:
+            return [("below", "and above are both missing; expected at least one, such as below = 0.01")]
+        return []
 
     @property
     def text(self) -> str:
@@ -208,12 +281,17 @@ class Scenario(_Table):
     first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
     record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
     pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
-    secret_file: str | None = None
+    secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
     process: ProcessTable
-    encoding: EncodingTable
-    legitimate: LegitimateTable
-    eavesdroppers: Annotated[dict[ProcessName, EavesdropperTable], Field(max_length=64)] = {}
-    expect: list[ExpectTable] = []
+    encoding: Annotated[EncodingTable, Field(examples=[{"scheme": "innovation", "state_probability": 0.6}])]
+    legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
+    eavesdroppers: Annotated[
+        dict[ProcessName, EavesdropperTable],
+        Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
+    ] = {}
+    expect: Annotated[
+        list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
+    ] = []
     made_with: Annotated[dict[str, str], Field(exclude=True)] = {}
 
     @property
@@ -315,8 +393,22 @@ def _across_tables(tables: Mapping[str, Any]) -> list[str]:
                 near = difflib.get_close_matches(figure, available, 1)
                 hint = f"; did you mean {near[0]}?" if near else ""
                 names = f"RECEIVER ({', '.join((LEGITIMATE, *eavesdroppers))}).FIGURE ({', '.join(FIGURES)})"
-                found.append(f"expect.{i}.figure: is {figure!r}; expected {names}{hint}")
+                found.append(f"expect.{i}.figure: is {_toml(figure)}; expected {names}{hint}")
+    if isinstance(tables.get("secret_file"), str):
+        found += _secret_mistakes(tables["secret_file"])
     return found
+
+
+def _secret_mistakes(file: str) -> list[str]:
+    """Why a file cannot hold a secret."""
+    try:
+        size = len(Path(file).read_bytes())
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        return [f"secret_file: {file} cannot be read ({why}); expected a file of {SECRET_BYTES} or more random bytes"]
+    if size < SECRET_BYTES:
+        return [f"secret_file: {file} has {size} bytes; expected {SECRET_BYTES} or more, random ones"]
+    return []
 
 
 def _horizon_mistakes(process: Process, slots: int) -> list[str]:
@@ -332,18 +424,34 @@ def _horizon_mistakes(process: Process, slots: int) -> list[str]:
 
 
 def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
-    *above, last = dotted.split(".")
+    """Put a value at a dotted key: names of tables that may be new, and numbers of list entries, the next one included."""
+    names = dotted.split(".")
     inner: Any = tables
-    for name in above:
-        if isinstance(inner, list) and name.isdigit() and int(name) < len(inner):
+    for name, after in pairwise(names):
+        new: Any = [] if after == "0" else {}
+        if isinstance(inner, dict) and name:
+            inner = inner.setdefault(name, new)
+        elif isinstance(inner, list) and name.isdecimal() and int(name) <= len(inner):
+            if int(name) == len(inner):
+                inner.append(new)
             inner = inner[int(name)]
-        elif isinstance(inner, dict):
-            inner = inner.setdefault(name, {})
         else:
-            raise UsageError(f"--set {dotted}: {name} is not in a table; give the dotted key of a scenario entry")
-    if not isinstance(inner, dict):
-        raise UsageError(f"--set {dotted}: {last} is not in a table; give the dotted key of a scenario entry")
-    inner[last] = value
+            raise _no_such_key(dotted, name, inner)
+    last = names[-1]
+    if isinstance(inner, dict) and last:
+        inner[last] = value
+    elif isinstance(inner, list) and last.isdecimal() and int(last) <= len(inner):
+        inner[int(last) : int(last) + 1] = [value]
+    else:
+        raise _no_such_key(dotted, last, inner)
+
+
+def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
+    if isinstance(inner, list):
+        return UsageError(f"--set {dotted}: {name} is no entry of a list of {len(inner)}; give 0 to {len(inner)}")
+    if isinstance(inner, dict):
+        return UsageError(f"--set {dotted}: it has an empty part; give a dotted key such as legitimate.link.quality")
+    return UsageError(f"--set {dotted}: {name} is not in a table or list; give the dotted key of a scenario entry")
 
 
 def value_of(text: str) -> Any:
@@ -358,6 +466,7 @@ _EXPECTED: Mapping[str, str] = {
     "float_type": "a number",
     "int_type": "a whole number",
     "string_type": "a string",
+    "string_too_short": "a string of at least one character",
     "list_type": "a list",
     "dict_type": "a table",
     "model_type": "a table",
@@ -366,13 +475,24 @@ _EXPECTED: Mapping[str, str] = {
 }
 
 
+def _toml(value: Any) -> str:
+    """A value as a scenario writes it, cut where it is long."""
+    if isinstance(value, dict):
+        text = "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }" if value else "{}"
+    elif isinstance(value, list):
+        text = f"[{', '.join(_toml(inner) for inner in value)}]"
+    else:
+        text = tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
 def _sentences(error: ValidationError) -> list[str]:
     """One line for each mistake: path, found, expected, example."""
     lines = []
     for detail in error.errors(include_url=False):
         path = ".".join(str(part) for part in detail["loc"] if part != "[key]")
         if detail["type"] == "mistakes":
-            inner: list[tuple[str, str]] = detail["ctx"]["mistakes"]
+            inner: list[Found] = detail["ctx"]["mistakes"]
             lines += [f"{path}.{name}: {what}" if path else f"{name}: {what}" for name, what in inner]
         else:
             lines.append(f"{path}: {_sentence(detail)}")
@@ -382,22 +502,25 @@ def _sentences(error: ValidationError) -> list[str]:
 def _sentence(detail: ErrorDetails) -> str:
     kind, found, context = detail["type"], detail["input"], detail.get("ctx", {})
     table, field = _field(detail["loc"])
-    example = f", such as {field.examples[0]}" if field is not None and field.examples else ""
+    name = str(detail["loc"][-1]) if detail["loc"] else ""
+    example = f", such as {_toml(field.examples[0])}" if field is not None and field.examples else ""
     if kind == "missing":
-        return f"is missing; expected it{example}"
+        return f"is missing; expected {name}" + (f" = {_toml(field.examples[0])}" if example else "")
     if kind == "extra_forbidden":
-        known = [name for name in table.model_fields if name != "made_with"] if table is not None else []
-        near = difflib.get_close_matches(str(detail["loc"][-1]), known, 1)
+        known = [known for known in table.model_fields if known != "made_with"] if table is not None else []
+        near = difflib.get_close_matches(name, known, 1)
         hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
         return f"is no entry of this table; {hint}"
     if kind == "expected":
-        return f"is {found!r}; expected {context['expected']}{example}"
+        return f"is {_toml(found)}; expected {context['expected']}{example}"
     if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
-        bound = " and ".join(f"{words[name]} {context[name]:g}" for name in words if name in context)
-        return f"is {found!r}; expected a number {bound}{example}"
+        bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
+        return f"is {_toml(found)}; expected a number {bound}{example}"
+    if kind == "too_long":
+        return f"has {context['actual_length']} entries; expected at most {context['max_length']}"
     expected = _EXPECTED.get(kind, detail["msg"])
-    return f"is {found!r}; expected {expected}{example}"
+    return f"is {_toml(found)}; expected {expected}{example}"
 
 
 def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
