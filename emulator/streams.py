@@ -23,6 +23,7 @@ Words = NDArray[np.uint64]
 Floats = NDArray[np.float64]
 
 KEY_BYTES = 32
+_AES_BLOCK = 16
 _BLOCK_WORDS = 16_384  # words drawn ahead at once: large enough to hide the cost of a call, small enough for the cache
 
 
@@ -36,29 +37,48 @@ def stream_key(root: bytes, name: str) -> bytes:
     return blake2b(name.encode(), key=blake2b(root, digest_size=KEY_BYTES).digest(), digest_size=KEY_BYTES).digest()
 
 
-def words(key: bytes, slots: range, trials: range, per_trial: int) -> Words:
-    """Raw 64-bit words of a stream, shape (slots, trials, per_trial); both ranges have step 1.
+class Stream:
+    """A stream over a range of trials (step 1), `per_trial` words for each in every slot.
 
-    AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots.
+    Final. AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots. The
+    blocks are kept between calls; only their slot numbers change.
     """
-    blocks = (per_trial + 1) // 2
-    counters = np.empty((len(slots), len(trials) * blocks, 2), dtype=">u8")
-    counters[:, :, 0] = np.arange(slots.start, slots.stop, dtype=np.uint64)[:, None]
-    counters[:, :, 1] = np.arange(trials.start * blocks, trials.stop * blocks, dtype=np.uint64)
-    encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()  # noqa: S305 - counter mode, see above
-    keystream = encryptor.update(counters.data.cast("B"))
-    drawn = np.frombuffer(keystream, dtype="<u8").reshape(len(slots), len(trials), 2 * blocks)
-    return drawn[:, :, :per_trial]
+
+    def __init__(self, key: bytes, trials: range, per_trial: int) -> None:
+        self._encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()  # noqa: S305 - counter mode, see above
+        self._blocks = (per_trial + 1) // 2
+        self._trials = trials
+        self._per_trial = per_trial
+        self._counters = np.empty((0, len(trials) * self._blocks, 2), dtype=">u8")
+        self._keystream = bytearray()
+
+    def words(self, slots: range) -> Words:
+        """Raw 64-bit words, (slots, trials, per_trial), for a range of step 1; overwritten by the next call."""
+        if len(slots) > len(self._counters):
+            self._counters = np.empty((len(slots), *self._counters.shape[1:]), dtype=">u8")
+            first, last = self._trials.start * self._blocks, self._trials.stop * self._blocks
+            self._counters[:, :, 1] = np.arange(first, last, dtype=np.uint64)
+            self._keystream = bytearray(self._counters.nbytes + _AES_BLOCK)
+        counters = self._counters[: len(slots)]
+        counters[:, :, 0] = np.arange(slots.start, slots.stop, dtype=np.uint64)[:, None]
+        length = self._encryptor.update_into(counters.data.cast("B"), self._keystream)
+        drawn = np.frombuffer(self._keystream, dtype="<u8", count=length // 8)
+        return drawn.reshape(len(slots), len(self._trials), 2 * self._blocks)[:, :, : self._per_trial]
 
 
 def uniforms(raw: Words) -> Floats:
     """Uniform numbers in [0, 1), multiples of 2⁻⁵³, one for each word."""
-    return (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    numbers = (raw >> np.uint64(11)).astype(np.float64)
+    numbers *= 2.0**-53
+    return numbers
 
 
 def normals(raw: Words) -> Floats:
     """Standard normal numbers, one for each word, by the inverse distribution function on an odd grid of 2⁻⁵³."""
-    return normal_quantile(((raw >> np.uint64(12)).astype(np.float64) + 0.5) * 2.0**-52)
+    numbers = (raw >> np.uint64(12)).astype(np.float64)
+    numbers += 0.5
+    numbers *= 2.0**-52
+    return normal_quantile(numbers)
 
 
 @dataclass(frozen=True)
@@ -82,9 +102,8 @@ class BlockReader:
     """
 
     def __init__(self, key: bytes, batch: Batch, per_trial: int) -> None:
-        self._key = key
+        self._stream = Stream(key, batch.trial_range, per_trial)
         self._batch = batch
-        self._per_trial = per_trial
         width = max(1, batch.trials * per_trial)
         self._length = max(1, min(256, _BLOCK_WORDS // width, batch.slots))
 
@@ -102,5 +121,4 @@ class BlockReader:
         return normals(self._words(slots))
 
     def _words(self, slots: range) -> Words:
-        raw = words(self._key, slots, self._batch.trial_range, self._per_trial)
-        return np.ascontiguousarray(raw.transpose(0, 2, 1))
+        return np.ascontiguousarray(self._stream.words(slots).transpose(0, 2, 1))

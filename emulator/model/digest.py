@@ -48,7 +48,6 @@ class BeliefLog:
         self._x_hat = np.empty((length, n, trials))
         self._P = np.empty((length, n, n, trials))
         self._action = np.empty((length, trials), np.uint8)
-        self._record = np.dtype([("gamma", "u1"), ("x_hat", "<f8", (n,)), ("P", "<f8", (n, n))])
 
     def add(self, k: int, belief: Belief) -> Digests | None:
         """Take slot k; at the end of a block, its digest for every trial, (R, 32)."""
@@ -65,15 +64,21 @@ class BeliefLog:
         return Rows(self._x_hat[rows], self._P[rows], self._action[rows])
 
     def _digest(self, length: int) -> Digests:
-        trials = self._action.shape[1]
+        _, n, trials = self._x_hat.shape
+        P = self._P.reshape(-1, n * n, trials)
         digests = np.empty((trials, DIGEST_BYTES), np.uint8)
+        numbers = np.empty((_TILE, length, n + n * n), "<f8")
+        records = np.empty((_TILE, length, 1 + numbers.itemsize * (n + n * n)), np.uint8)
         for start in range(0, trials, _TILE):
             tile = slice(start, min(start + _TILE, trials))
-            records = np.empty((tile.stop - start, length), self._record)
-            records["gamma"] = (self._action[:length, tile] != Action.LOST).T
-            records["x_hat"] = self._x_hat[:length, :, tile].transpose(2, 0, 1)
-            records["P"] = self._P[:length, :, :, tile].transpose(3, 0, 1, 2)
-            for row, record in enumerate(records, start):
+            rows = slice(0, tile.stop - start)
+            for i in range(n):
+                numbers[rows, :, i] = self._x_hat[:length, i, tile].T
+            for i in range(n * n):
+                numbers[rows, :, n + i] = P[:length, i, tile].T
+            records[rows, :, 0] = (self._action[:length, tile] != Action.LOST).T
+            records[rows, :, 1:] = numbers[rows].view(np.uint8)
+            for row, record in enumerate(records[rows], start):
                 digests[row] = np.frombuffer(sha256(record.data).digest(), np.uint8)
         return digests
 

@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 
 UNIT_ROUNDOFF = 2.0**-53
 HORIZON_TOLERANCE = 0.01
+_SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding does not explain
 
 
 def product(M: Floats, x: Floats) -> Floats:
@@ -252,10 +253,10 @@ def _covariance_mistakes(M: Floats) -> list[str]:
     if asymmetry.size:
         i, j = asymmetry[0]
         return [f"entry [{i}][{j}] is {M[i, j]} but [{j}][{i}] is {M[j, i]}; expected a symmetric matrix"]
-    try:
-        cholesky(M)
-    except ValueError:
-        lowest = float(np.linalg.eigvalsh(M)[0])
+    scale = np.sqrt(np.abs(np.diag(M)))
+    lowest = float(np.linalg.eigvalsh(M)[0])
+    # Of the correlations, so that states in different units do no harm, and with room for rounding in a singular M.
+    if not np.all(np.diag(M) > 0.0) or np.linalg.eigvalsh(M / np.outer(scale, scale))[0] <= _SINGULAR:
         return [f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix, all eigenvalues above 0"]
     return []
 

@@ -97,7 +97,7 @@ class PacketUser(Receiver):
     Its covariance is what it believes; where it took an innovation for the state, the truth is another
     (docs/mathematics.md, eavesdroppers).
 
-    Source: Lemma 1 of the paper's section on eavesdroppers.
+    Source: Lemma V.1.
     """
 
     @abstractmethod

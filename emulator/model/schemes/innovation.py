@@ -68,7 +68,7 @@ class InnovationEncoder(Encoder):
 class InnovationEstimator(Receiver):
     """The exact MMSE estimator that holds the secret.
 
-    Source: Theorem 1 (covariance) and docs/mathematics.md, legitimate estimator.
+    Source: Theorem IV.1 (covariance) and docs/mathematics.md, legitimate estimator.
     """
 
     def __init__(self, process: Process, trials: int, secret: SharedSecret) -> None:
