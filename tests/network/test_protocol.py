@@ -21,7 +21,7 @@ from emulator.network.access import Keys, grants
 from emulator.streams import normals, root_of_seed, stream_key, uniforms, words
 
 TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
-GOLDEN = {name: block for name, block in re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M)}
+GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))
 MESSAGES = [name for name in GOLDEN if "\nbytes " in GOLDEN[name]]
 KEY = "evedrop/golden"
 
@@ -112,15 +112,15 @@ def decode_packet(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
 Encode = Callable[[dict[str, Any], dict[str, Any]], bytes]
 Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
 CODECS: dict[str, tuple[Encode, Decode]] = {
-    "packet": (lambda shape, value: wire.uplink(value["k"], np.array(value["z"])), decode_packet),
+    "packet": (lambda _shape, value: wire.uplink(value["k"], np.array(value["z"])), decode_packet),
     "delivery": (encode_delivery, decode_delivery),
     "progress": (
-        lambda shape, value: wire.progress(value["k"]),
-        lambda shape, value, raw: {"k": wire.read_progress(KEY, raw)},
+        lambda _shape, value: wire.progress(value["k"]),
+        lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw)},
     ),
     "control": (
-        lambda shape, value: wire.control(value["do"]),
-        lambda shape, value, raw: {"do": wire.read_control(KEY, raw)},
+        lambda _shape, value: wire.control(value["do"]),
+        lambda _shape, _value, raw: {"do": wire.read_control(KEY, raw)},
     ),
     "truth": (encode_truth, decode_truth),
     "report": (encode_report, decode_report),
@@ -139,14 +139,14 @@ def test_the_document_has_every_block() -> None:
 def test_message_encodes_to_these_bytes(name: str) -> None:
     """The values of a golden block give exactly its bytes."""
     shape, value, raw = parts_of(GOLDEN[name])
-    assert CODECS[name.split(",")[0]][0](shape, value).hex(" ") == raw.hex(" ")
+    assert CODECS[name.split(",", maxsplit=1)[0]][0](shape, value).hex(" ") == raw.hex(" ")
 
 
 @pytest.mark.parametrize("name", MESSAGES)
 def test_bytes_decode_to_these_values(name: str) -> None:
     """The bytes of a golden block give exactly its values."""
     shape, value, raw = parts_of(GOLDEN[name])
-    assert CODECS[name.split(",")[0]][1](shape, value, raw) == value
+    assert CODECS[name.split(",", maxsplit=1)[0]][1](shape, value, raw) == value
 
 
 @pytest.mark.parametrize("name", MESSAGES)
@@ -154,7 +154,7 @@ def test_cut_message_is_refused(name: str) -> None:
     """A golden message without its last byte is malformed, and the error shows where it came from and its bytes."""
     shape, value, raw = parts_of(GOLDEN[name])
     with pytest.raises(MalformedMessage, match=f"malformed message on {KEY}.*{raw[:4].hex(' ')}"):
-        CODECS[name.split(",")[0]][1](shape, value, raw[:-1])
+        CODECS[name.split(",", maxsplit=1)[0]][1](shape, value, raw[:-1])
 
 
 def test_brief_is_read_and_written_as_documented(tmp_path: Path) -> None:

@@ -1,0 +1,290 @@
+"""What an eavesdropper can get from the network, and do to it, with its own credentials, wrong ones and none.
+
+Each test shows first that the right credentials do get or do what is denied to the attacker. Nothing waits for silence:
+what one session puts is dealt with in order, so a message that is let through proves that the earlier ones were not.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from bench import Bench, Ear, bench_of, connect, scenario_of, until
+
+from emulator.network import wire
+from emulator.network.access import Grant, access_control, grants
+
+EVE = "eve"
+PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
+SHAPE = (2, 5)
+BATCH = 8
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """One router for all tests of this file: none of them may leave a trace in it."""
+    with bench_of(scenario_of(slots=100_000), tmp_path_factory.mktemp("access")) as one:
+        one.due = 0
+        yield one
+
+
+def flow(stage: Bench) -> None:
+    """Let one slot pass: everybody who should gets exactly what they should, and nothing else was in the way."""
+    k, stage.due = stage.due, stage.due + 1
+    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    for name, ear in stage.downlinks.items():
+        key, payload = ear.hear()
+        gamma, z = wire.read_delivery(key, payload, k, SHAPE)
+        assert np.array_equal(z, np.where(gamma, stage.packet(k), 0.0)), name
+    if stage.due % BATCH == 0:
+        key, payload = stage.journal.hear()
+        journal = wire.read_journal(key, payload, stage.due - BATCH, stage.scenario.receivers, 5)
+        assert journal.count == BATCH
+
+
+def all_keys(stage: Bench) -> dict[str, str]:
+    """Every key of the run, by what it is."""
+    keys = stage.keys
+    found = {"uplink": keys.uplink, "journal": keys.journal}
+    for name in (*PROCESSES, "router", "observer"):
+        for kind in ("telemetry", "progress", "control", "alive"):
+            found[f"{kind}/{name}"] = getattr(keys, kind)(name)
+    found |= {f"downlink/{name}": keys.downlink(name) for name in PROCESSES[1:]}
+    return found
+
+
+def wildcards(stage: Bench) -> list[str]:
+    """What an attacker would ask for who does not know the keys."""
+    under = f"evedrop/{stage.keys.run}"
+    kinds = ("downlink", "telemetry", "progress", "control", "alive")
+    asked = ["**", "evedrop/**", "evedrop/*/uplink", "*/*/*", "*/*/*/*", f"{under}/**", f"{under}/*", f"{under}/*/*"]
+    return [*asked, *(f"{under}/{kind}/*" for kind in kinds), f"{under}/downlink/**", "@/**", "@/*/**"]
+
+
+def talk(stage: Bench) -> None:
+    """Everybody says on every key they may write what the others hear: all that an eavesdropper could overhear."""
+    for _ in range(BATCH):
+        flow(stage)
+    for name in PROCESSES:
+        stage.settle(name)
+        if name != "sensor":
+            stage.put(name, stage.keys.progress(name), wire.progress(1))
+            assert stage.progress[name].hear()[1] == wire.progress(1)
+        stage.put("observer", stage.keys.control(name), wire.control("noted"))
+        assert stage.controls[name].hear()[1] == wire.control("noted")
+    stage.put("observer", stage.keys.progress("observer"), wire.progress(1))
+    assert stage.progress["observer"].hear()[1] == wire.progress(1)
+
+
+MODES = {
+    "client": {},
+    "peer": {"mode": "peer"},
+    "router": {"mode": "router", "listen": {"endpoints": []}},
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_eavesdropper_hears_only_its_own_downlink(mode: str, stage: Bench) -> None:
+    """Asking by subscription for all keys and every wildcard, in any mode of Zenoh, it gets its deliveries and control."""
+    with connect(stage.briefs[EVE], **MODES[mode]) as attacker:
+        ears = {key: Ear() for key in (*all_keys(stage).values(), *wildcards(stage))}
+        for key, ear in ears.items():
+            attacker.declare_subscriber(key, ear)
+        own, ears_of_own = stage.keys.downlink(EVE), ears[stage.keys.downlink(EVE)]
+        until(lambda: flow(stage) or not ears_of_own.messages.empty(), "a delivery to the attacker")
+        first = stage.due
+        talk(stage)
+        slots = range(first, stage.due)
+        while wire.Reader(*ears_of_own.hear()).integer("k") < slots[-1]:
+            pass
+        # What is let through to one subscription of a session reaches its wildcards too: only that may.
+        allowed = {own, stage.keys.control(EVE)}
+        for key, ear in ears.items():
+            assert {found for found, _ in ear.all()} <= allowed, key
+
+
+def connected(stage: Bench, attacker: zenoh.Session) -> None:
+    """Return when what the attacker may put arrives, which takes a moment between routers."""
+    key = stage.keys.telemetry(EVE)
+
+    def knock() -> bool:
+        attacker.put(key, b"knock")
+        return not stage.telemetry[EVE].messages.empty()
+
+    until(knock, "the attacker's own telemetry")
+    assert_heard(stage, attacker)
+
+
+def assert_heard(stage: Bench, attacker: zenoh.Session) -> None:
+    """What the attacker may put arrives, so the router has dealt with all that it put before."""
+    block = zenoh.CongestionControl.BLOCK
+    attacker.put(stage.keys.progress(EVE), b"mine", congestion_control=block)
+    attacker.put(stage.keys.telemetry(EVE), b"mine", congestion_control=block)
+    assert stage.progress[EVE].hear() == (stage.keys.progress(EVE), b"mine")
+    while (found := stage.telemetry[EVE].hear()) != (stage.keys.telemetry(EVE), b"mine"):
+        assert found == (stage.keys.telemetry(EVE), b"knock")
+
+
+@pytest.mark.parametrize("key", ["**", "evedrop/**"])
+def test_wildcard_alone_hears_nothing(key: str, stage: Bench) -> None:
+    """A session that asks for a wildcard and nothing else gets not even its own deliveries."""
+    with connect(stage.briefs[EVE]) as attacker, connect(stage.briefs[EVE]) as control:
+        ear, own = Ear(), Ear()
+        attacker.declare_subscriber(key, ear)
+        control.declare_subscriber(stage.keys.downlink(EVE), own)
+        talk(stage)
+        own.hear()
+        assert ear.all() == []
+
+
+def test_eavesdropper_gets_nothing_by_asking(stage: Bench) -> None:
+    """Queries for all keys and every wildcard, the router's own administration too, come back empty."""
+    # The observer answers on each of its keys: the question must not reach it.
+    asked: list[str] = []
+    for name in PROCESSES:
+        stage.sessions["observer"].declare_queryable(
+            stage.keys.telemetry(name), lambda q: asked.append(str(q.key_expr))
+        )
+    with connect(stage.briefs[EVE]) as attacker:
+        for key in [*all_keys(stage).values(), *wildcards(stage)]:
+            replies = [str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None]
+            # A session may look at itself: its own part of Zenoh's administration is no news from anybody.
+            assert [found for found in replies if not found.startswith(f"@/{attacker.zid()}/")] == [], key
+    talk(stage)
+    assert asked == []
+
+
+def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
+    """It learns of no token, neither by watching, with history, nor by asking; the observer sees them."""
+    with connect(stage.briefs[EVE]) as attacker, ExitStack() as stack:
+        ear, control = Ear(), Ear()
+        alive = {name: stage.keys.alive(name) for name in PROCESSES}
+        for name in PROCESSES:
+            stack.enter_context(stage.sessions[name].liveliness().declare_token(alive[name]))
+        for key in (*alive.values(), stage.keys.alive("router"), *wildcards(stage)):
+            if key.startswith("@"):
+                continue
+            attacker.liveliness().declare_subscriber(key, ear, history=True)
+            assert list(attacker.liveliness().get(key, timeout=5.0)) == []
+        seen = {stage.tokens.hear()[0] for _ in PROCESSES}
+        assert seen == set(alive.values())
+        attacker.declare_subscriber(stage.keys.downlink(EVE), control)
+        flow(stage)
+        control.hear()
+        assert ear.all() == []
+    gone = {stage.tokens.hear()[0] for _ in PROCESSES}
+    assert gone == {f"deleted {key}" for key in alive.values()}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage: Bench) -> None:
+    """What it puts on any other key, and any deletion, reaches nobody; the run goes on as if nothing had been."""
+    keys = all_keys(stage)
+    own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
+    payloads = (wire.uplink(stage.due, np.zeros(SHAPE)), wire.control("end"), wire.progress(10**9), b"\xc1")
+    block = zenoh.CongestionControl.BLOCK
+    with connect(stage.briefs[EVE], **MODES[mode]) as attacker:
+        connected(stage, attacker)
+        for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:
+            for payload in payloads if key not in own else ():
+                attacker.put(key, payload, congestion_control=block)
+            attacker.delete(key, congestion_control=block)
+        assert_heard(stage, attacker)
+    talk(stage)
+    for ears in (stage.downlinks, stage.controls, stage.progress, stage.telemetry):
+        assert {name: ear.all() for name, ear in ears.items()} == {name: [] for name in ears}
+    assert stage.journal.all() == []
+    assert stage.router.poll() is None
+
+
+def test_eavesdropper_cannot_feign_another_process(stage: Bench) -> None:
+    """Nobody sees a token that it declares for another process, and nobody one that it withdraws."""
+    with connect(stage.briefs[EVE]) as attacker:
+        tokens = [
+            attacker.liveliness().declare_token(stage.keys.alive(name)) for name in (*PROCESSES, "router", "observer")
+        ]
+        assert stage.tokens.hear() == (stage.keys.alive(EVE), b"")
+        for token in tokens:
+            token.undeclare()
+        assert stage.tokens.hear() == (f"deleted {stage.keys.alive(EVE)}", b"")
+        flow(stage)
+        assert stage.tokens.all() == []
+
+
+def test_eavesdropper_answers_no_question(stage: Bench) -> None:
+    """A queryable that it offers, for every key, is asked by nobody, the observer included."""
+    asked: list[str] = []
+    with connect(stage.briefs[EVE]) as attacker:
+        for key in [*all_keys(stage).values(), "**", "evedrop/**"]:
+            attacker.declare_queryable(key, lambda query: asked.append(str(query.key_expr)))
+        assert_heard(stage, attacker)
+        for name in ("observer", "sensor", "legitimate"):
+            for key in all_keys(stage).values():
+                assert list(stage.sessions[name].get(key, timeout=5.0)) == []
+    assert asked == []
+
+
+WRONG = {
+    "none": ("", ""),
+    "wrong password": ("eve", "guessed"),
+    "empty password": ("eve", ""),
+    "unknown user": ("trudy", "guessed"),
+    "another's name": ("observer", "guessed"),
+    "the operator": ("operator", ""),
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("who", WRONG)
+def test_no_session_without_credentials(who: str, mode: str, stage: Bench) -> None:
+    """Without a user and its password no session is opened, in any mode: nothing can be asked."""
+    user, password = WRONG[who]
+    brief = replace(stage.briefs[EVE], user=user, password=password)
+    auth = {"auth": {"usrpwd": {"user": user, "password": password}}} if user else {}
+    connect_once = {"endpoints": [brief.router], "timeout_ms": 0, "exit_on_failure": True}
+    with pytest.raises(zenoh.ZError, match=r"Unable to connect|close message"):
+        connect(brief, connect=connect_once, transport=auth, **MODES[mode]).close()
+    connect(stage.briefs[EVE], connect=connect_once, **MODES[mode]).close()
+    flow(stage)
+
+
+def test_the_table_grants_nothing_twice_and_no_wildcard() -> None:
+    """Every key has one writer, no rule covers more than exact keys, and no eavesdropper may read what is not its own."""
+    table = grants("r", ("legitimate", "eve"))
+    written = [key for grant in table for key in (*grant.writes, grant.token)]
+    assert len(written) == len(set(written))
+    for rule in access_control(table)["rules"]:
+        assert rule["permission"] == "allow"
+        assert not [key for key in rule["key_exprs"] if "*" in key or "$" in key]
+    eve = next(grant for grant in table if grant.process == "eve")
+    own = Grant(
+        "eve",
+        writes=("evedrop/r/telemetry/eve", "evedrop/r/progress/eve"),
+        reads=("evedrop/r/downlink/eve", "evedrop/r/control/eve"),
+        token="evedrop/r/alive/eve",  # noqa: S106 - a liveliness token is no secret
+    )
+    assert eve == own
+    assert access_control(table)["default_permission"] == "deny"
+
+
+def test_a_process_with_a_wrong_brief_says_so(stage: Bench, tmp_path: Path) -> None:
+    """An eavesdropper's program whose password is not of this run ends with status 2 and one line."""
+    path = replace(stage.briefs[EVE], password="of another run").write(tmp_path)  # noqa: S106 - that is the point
+    ended = subprocess.run(
+        [sys.executable, "-c", f"""
+from emulator.network import session
+session.CONNECT_SECONDS = 1.0
+from emulator.cli import main
+raise SystemExit(main(["eavesdropper", {str(path)!r}]))"""],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 2
+    assert "no session with the router at tcp/127.0.0.1:" in ended.stderr
+    assert "Traceback" not in ended.stderr
