@@ -7,6 +7,7 @@ and leaves out what does not fit.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -27,7 +28,7 @@ _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds from one batch to the next, so that a batch is worth its overhead
 _MOST_SLOTS = 1024  # in a batch
 _MOST_WAITING = 20_000  # slots the file may be behind, before the run waits for it
-_LONGEST_WAIT = 10.0  # seconds the run waits for the file, before it goes on without one
+_FILE_TIMEOUT = 5.0  # seconds the run waits for the file, before it goes on without one
 _LIVE_BATCHES = 20
 _LIVE_TIMEOUT = 1.0
 
@@ -56,7 +57,7 @@ class Recording:
             self._file.save(path, default_blueprint=layout(scene))
             log_styles(self._file, scene)
         except Exception as error:
-            self.failure = str(error)
+            self._give_up(str(error))
         self._live = _Live(scene, live) if live else None
         self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
         self._writer.start()
@@ -67,7 +68,7 @@ class Recording:
             return
         with self._changed:
             if self._waiting_slots > _MOST_WAITING:
-                in_time = self._changed.wait_for(lambda: self._waiting_slots <= _MOST_WAITING, _LONGEST_WAIT)
+                in_time = self._changed.wait_for(lambda: self._waiting_slots <= _MOST_WAITING, _FILE_TIMEOUT)
                 if not in_time:
                     self._give_up("the disk did not keep up with the run")
             if self.failure is None or self._live is not None:
@@ -83,20 +84,20 @@ class Recording:
     def close(self) -> bool:
         """Finish the file, then the viewer's stream, each within a time limit.
 
-        True if the interpreter can now exit normally. If not, Rerun hangs in a thread, and only os._exit ends it.
+        True if the interpreter can now exit normally. If not, Rerun hangs, and only os._exit ends the process.
         """
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._writer.join(_LONGEST_WAIT)
+        self._writer.join(_FILE_TIMEOUT)
         if self._writer.is_alive():
             self._give_up("the disk did not keep up with the run")
-            return False
-        return self._live.close() if self._live else True
+        live_ended = self._live.close() if self._live else True
+        return live_ended and self.failure is None
 
     def _give_up(self, why: str) -> None:
         if self.failure is None:
-            self.failure = why
+            self.failure = f"the recording is incomplete: {why}; free some space, or choose another --out"
 
     def _write(self) -> None:
         while True:
@@ -109,8 +110,8 @@ class Recording:
             self._put(chunks, notes)
             if closing:
                 break
-        self._file.flush()
-        self._file.disconnect()
+        if self.failure is None:
+            self._file.disconnect()
 
     def _put(self, chunks: list[Slots], notes: list[Event]) -> None:
         columns = [lines(NOTES, notes)] if notes else []
@@ -118,10 +119,19 @@ class Recording:
         batch = Batch([*batch.columns, *columns], batch.opening)
         if not batch.columns:
             return
-        for column in batch.columns:
-            column.send(self._file)
+        if self.failure is None:
+            self._save(batch)
         if self._live is not None and not self._live.offer(batch):
             self.dropped += 1
+
+    def _save(self, batch: Batch) -> None:
+        for column in batch.columns:
+            column.send(self._file)
+        try:
+            # Rerun tells of a file it can no longer write only by never finishing.
+            self._file.flush(timeout_sec=_FILE_TIMEOUT)
+        except RuntimeError:
+            self._give_up("the file could not be written")
 
 
 class _Live:
@@ -132,12 +142,15 @@ class _Live:
         self._url = url
         self._batches: queue.Queue[tuple[Batch, bool] | None] = queue.Queue(_LIVE_BATCHES)
         self._missed = False
-        self._done = threading.Event()
+        self._gone = False
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
         self._thread.start()
 
     def offer(self, batch: Batch) -> bool:
-        """Queue a batch; False if it was left out."""
+        """Queue a batch; False if it was left out, because the viewer is slow. If it is gone, nothing is missed."""
+        if self._gone:
+            return True
         try:
             self._batches.put_nowait((batch, self._missed))
         except queue.Full:
@@ -149,11 +162,10 @@ class _Live:
     def close(self) -> bool:
         """Whether the stream ended in time."""
         deadline = time.monotonic() + _LIVE_TIMEOUT
-        try:
+        with contextlib.suppress(queue.Full):
             self._batches.put(None, timeout=_LIVE_TIMEOUT)
-        except queue.Full:
-            return False
-        self._thread.join(max(0.0, deadline - time.monotonic()))
+        self._closing.set()
+        self._thread.join(max(0.1, deadline - time.monotonic()))
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -164,8 +176,23 @@ class _Live:
             batch, missed = item
             for column in [*(opening(batch) if missed else []), *batch.columns]:
                 column.send(stream)
-        stream.flush(timeout_sec=_LIVE_TIMEOUT)
+            if not self._arrived(stream):
+                self._gone = True
+                break
         stream.disconnect()
+
+    def _arrived(self, stream: rr.RecordingStream) -> bool:
+        """Wait until the viewer has taken everything, so that Rerun never holds more than a batch; False if it is gone."""
+        while True:
+            begun = time.monotonic()
+            try:
+                stream.flush(timeout_sec=_LIVE_TIMEOUT)
+            except RuntimeError:
+                # A viewer that is merely slow uses up the time; one that is gone is known at once.
+                if self._closing.is_set() or time.monotonic() - begun < _LIVE_TIMEOUT / 2:
+                    return False
+            else:
+                return True
 
 
 def _stream(scene: Scene) -> rr.RecordingStream:
