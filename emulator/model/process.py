@@ -228,7 +228,7 @@ def mistakes_of(A: Floats, Q: Floats, initial_covariance: Floats) -> list[tuple[
         return found
     for name, M in (("Q", Q), ("initial_covariance", initial_covariance)):
         found += [(name, sentence) for sentence in _covariance_mistakes(M)]
-    if not any(name == "Q" and "symmetric" in sentence for name, sentence in found):
+    if any(name == "Q" and "positive definite" in sentence for name, sentence in found):
         reached = _reachable(A, Q)
         if reached < A.shape[0]:
             found.append(

@@ -71,17 +71,9 @@ class Receiver(ABC):
         P = np.repeat(self.process.initial_covariance[:, :, None], self.trials, axis=2)
         return Belief(np.zeros((n, self.trials)), P, np.zeros(self.trials, np.uint8))
 
-    def predicted(self, k: int, x_hat: Floats) -> Floats:
-        """A x̂, (n, R); at k = 0 the prior itself, which is already about x_0."""
-        return self.process.predict(x_hat) if k else x_hat
-
-    def carried(self, k: int, P: Floats) -> Floats:
-        """A P Aᵀ, (n, n, R); at k = 0 the prior itself."""
-        return self.process.carry(P) if k else P
-
-    def diffused(self, k: int, carried: Floats) -> Floats:
-        """A P Aᵀ + Q from A P Aᵀ, (n, n, R); at k = 0 the prior itself."""
-        return self.process.diffuse(carried) if k else carried
+    @abstractmethod
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """`Action` of slot k in every trial, (R,), from γ (R,) alone: no scheme of this kind looks at the packet first."""
 
     @abstractmethod
     def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
@@ -89,30 +81,3 @@ class Receiver(ABC):
 
         gamma (R,): received or not; z (n, R): the packets, of any value where gamma is false.
         """
-
-
-class PacketUser(Receiver):
-    """Takes a packet for the state or ignores it: the paper's class of eavesdroppers.
-
-    Its covariance is what it believes; where it took an innovation for the state, the truth is another
-    (docs/mathematics.md, eavesdroppers).
-
-    Source: Lemma V.1.
-    """
-
-    @abstractmethod
-    def uses(self, k: int) -> Flags | None:
-        """b_k (R,): whether a packet received in slot k is used as the state; None means always."""
-
-    def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
-        """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is used."""
-        uses = self.uses(k)
-        used = gamma if uses is None else gamma & uses
-        return Belief(
-            select(used, lambda: z, lambda: self.predicted(k, belief.x_hat)),
-            select(used, lambda: np.zeros_like(belief.P), lambda: self.diffused(k, self.carried(k, belief.P))),
-            _USER_ACTIONS[gamma.view(np.uint8) + used.view(np.uint8)],
-        )
-
-
-_USER_ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)

@@ -38,9 +38,7 @@ class Simulation:
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.receivers}
         """Receiver → block number → digests, (R, 32)."""
 
-    def _receiver(self, name: str) -> Receiver:
-        if name == LEGITIMATE:
-            return self._scheme.estimator(self._secret, self._batch)
+    def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy)
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
@@ -51,8 +49,9 @@ class Simulation:
         n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
         names = self._scenario.receivers
         trajectory = Trajectory(self._process, self._keys.process, self._batch)
-        encoder = self._scheme.encoder(self._secret, self._batch)
-        receivers = {name: self._receiver(name) for name in names}
+        encoder, estimator = self._scheme.pair(self._secret, self._batch)
+        receivers = {LEGITIMATE: estimator}
+        receivers.update({name: self._eavesdropper(name) for name in self._scenario.eavesdroppers})
         links = {name: link_of(self._scenario.link(name).spec, self._keys.link(name), self._batch) for name in names}
         beliefs = {name: receivers[name].prior() for name in names}
         logs = {name: BeliefLog(n, trials, slots) for name in names}

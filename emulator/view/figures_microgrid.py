@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.model.ensemble import initial_covariance, legitimate_step, packet_user_step
 from emulator.model.links.bernoulli import Bernoulli
 from emulator.model.links.link import Link
 from emulator.model.process import Floats, Process
+from emulator.model.receiver import Action
 from emulator.model.schedule import Schedule
 from emulator.model.theory import Outcomes, expected_traces, misled_covariances
+from emulator.model.update import actual_covariance
 from emulator.streams import Batch, root_of_seed, stream_key
 from emulator.view.figures_links import deliveries
 from emulator.view.figures_style import BLUE, GREEN, GREY, RED, panels
@@ -75,21 +76,24 @@ def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
     root = root_of_seed(2025)
     links = [Link(Bernoulli(MU), stream_key(root, f"link/{name}"), batch) for name in ("legitimate", "eavesdropper")]
     schedules = [Schedule(stream_key(root, f"schedule/{mu_d}"), mu_d, batch) for mu_d in STATE_PROBABILITIES]
-    certain, uncertain = process(), uncertain_process()
-    misled = misled_covariances(uncertain, slots)
     width = len(schedules)
+    processes = (process(), process(), uncertain_process())
+    covariances = [np.repeat(one.initial_covariance[:, :, None], width * trials, axis=2) for one in processes]
+    misled = misled_covariances(processes[-1], slots)
     sums = np.zeros((len(RECEIVERS), width * trials))
     for k, received in enumerate(zip(*(deliveries(link, slots) for link in links), strict=True)):
         nu = np.concatenate([schedule.at(k) for schedule in schedules])
         gamma, gamma_e = (np.tile(flags, width) for flags in received)
-        if k == 0:
-            P, P_smart = initial_covariance(certain, gamma), initial_covariance(certain, gamma_e)
-            P_naive = initial_covariance(uncertain, gamma_e)
-        else:
-            P = legitimate_step(certain, P, gamma, nu)
-            P_smart = packet_user_step(certain, P_smart, gamma_e & ~nu, nu, misled[k])
-            P_naive = packet_user_step(uncertain, P_naive, gamma_e, nu, misled[k])
-        for row, covariance in enumerate((P, P_smart, P_naive)):
+        actions = (
+            np.where(gamma, np.where(nu, np.uint8(Action.INNOVATION), np.uint8(Action.STATE)), np.uint8(Action.LOST)),
+            np.where(gamma_e & ~nu, np.uint8(Action.STATE), np.uint8(Action.LOST)),
+            np.where(gamma_e, np.uint8(Action.STATE), np.uint8(Action.LOST)),
+        )
+        covariances = [
+            actual_covariance(one, k, P, action, nu, misled[k])
+            for one, P, action in zip(processes, covariances, actions, strict=True)
+        ]
+        for row, covariance in enumerate(covariances):
             sums[row] += covariance[0, 0] + covariance[1, 1]
         if k % 8192 == 0:
             progress(f"microgrid: slot {k} of {slots}")

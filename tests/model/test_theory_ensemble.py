@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from emulator.model.ensemble import initial_covariance, legitimate_step, packet_user_step
 from emulator.model.process import Floats, Process
+from emulator.model.receiver import Action
 from emulator.model.theory import Outcomes, expected_traces, misled_covariances
+from emulator.model.update import actual_covariance
 from emulator.view import figures_strategies as strategies
 
 TRIALS = 20_000
@@ -21,6 +23,11 @@ def agrees(samples: Floats, expected: Floats) -> bool:
     return bool(np.all(np.abs(samples.mean(axis=-1) - expected) <= 5.0 * error + 1e-15))
 
 
+def actions(gamma: NDArray[np.bool_], nu: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """What the legitimate estimator does: lost, innovation decoded, or state used."""
+    return np.where(gamma, np.where(nu, np.uint8(Action.INNOVATION), np.uint8(Action.STATE)), np.uint8(Action.LOST))
+
+
 @pytest.mark.parametrize("process", [UNSTABLE, MARGINAL], ids=["unstable", "marginal"])
 @pytest.mark.parametrize(("b0", "b1"), [(1.0, 0.0), (1.0, 1.0), (0.8, 0.3)], ids=["smart", "naive", "suspicious"])
 def test_simulated_covariances_average_to_the_expectation(process: Process, b0: float, b1: float) -> None:
@@ -29,15 +36,13 @@ def test_simulated_covariances_average_to_the_expectation(process: Process, b0: 
     random = np.random.default_rng(17)
     misled = misled_covariances(process, SLOTS)
     ours, theirs = np.empty((SLOTS, TRIALS)), np.empty((SLOTS, TRIALS))
+    P = P_e = np.repeat(process.initial_covariance[:, :, None], TRIALS, axis=2)
     for k in range(SLOTS):
         gamma, gamma_e = random.random(TRIALS) < mu, random.random(TRIALS) < mu_e
         nu = (random.random(TRIALS) >= mu_d) & (k > 0)
         used = gamma_e & (random.random(TRIALS) < np.where(nu, b1, b0))
-        if k == 0:
-            P, P_e = initial_covariance(process, gamma), initial_covariance(process, used)
-        else:
-            P = legitimate_step(process, P, gamma, nu)
-            P_e = packet_user_step(process, P_e, used, nu, misled[k])
+        P = actual_covariance(process, k, P, actions(gamma, nu), nu, misled[k])
+        P_e = actual_covariance(process, k, P_e, np.where(used, np.uint8(Action.STATE), np.uint8(0)), nu, misled[k])
         ours[k], theirs[k] = np.trace(P), np.trace(P_e)
     assert agrees(ours, expected_traces(process, Outcomes.legitimate(mu, mu_d), SLOTS))
     assert agrees(theirs, expected_traces(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), SLOTS))
@@ -47,11 +52,13 @@ def test_steps_are_the_three_cases() -> None:
     """Each event alone gives its own covariance: predicted, zero, carried or misled."""
     P = np.repeat(np.array([[2.0, 0.5], [0.5, 1.0]])[:, :, None], 3, axis=2)
     A, start = UNSTABLE.A, P[:, :, 0]
-    after = legitimate_step(UNSTABLE, P, np.array([False, True, True]), np.array([True, False, True]))
+    nu = np.array([True, False, True])
+    f = misled_covariances(UNSTABLE, 2)[1]
+    after = actual_covariance(UNSTABLE, 1, P, actions(np.array([False, True, True]), nu), nu, f)
     for trial, expected in enumerate((A @ start @ A.T + Q, np.zeros((2, 2)), A @ start @ A.T)):
         assert after[:, :, trial] == pytest.approx(expected, rel=1e-14)
-    f = misled_covariances(UNSTABLE, 2)[1]
-    after = packet_user_step(UNSTABLE, P, np.array([False, True, True]), np.array([True, False, True]), f)
+    used = np.array([Action.DISCARDED, Action.STATE, Action.STATE], np.uint8)
+    after = actual_covariance(UNSTABLE, 1, P, used, nu, f)
     for trial, expected in enumerate((A @ start @ A.T + Q, np.zeros((2, 2)), f)):
         assert after[:, :, trial] == pytest.approx(expected, rel=1e-14)
 

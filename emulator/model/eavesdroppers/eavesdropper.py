@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from emulator.model.packet_user import PacketUser
 from emulator.model.process import Process
-from emulator.model.receiver import PacketUser
 from emulator.streams import Batch
 
 

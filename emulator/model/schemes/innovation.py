@@ -3,31 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
+from emulator.model import update
 from emulator.model.process import Floats, Process, StateFactors, product
-from emulator.model.receiver import Action, Belief, Flags, Receiver, select
+from emulator.model.receiver import Action, Belief, Codes, Flags, Receiver, select
 from emulator.model.schedule import Schedule
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.streams import Batch, BlockReader
 
 
-class Shared(NamedTuple):
-    """What sensor and legitimate estimator share about a slot, for R trials."""
-
-    nu: Flags
-    """ν_k, (R,): true for an innovation."""
-    chi: Floats
-    """χ_k ~ N(0, A Σ_{k−1} Aᵀ), (n, R); 0 at k = 0."""
-
-
 class SharedSecret:
-    """(ν_k, χ_k) of every slot, from the streams `schedule` and `noise`.
+    """ν_k and χ_k of every slot, from the streams `schedule` and `noise`.
 
-    Final. χ_k = A L_{k−1} ξ_k with L L ᵀ = Σ_{k−1} factored by QR. Addressed by slot: a lost packet desynchronises
-    nobody.
+    Final. χ_k = A L_{k−1} ξ_k with L Lᵀ = Σ_{k−1} factored by QR. Addressed by slot: a lost packet desynchronises
+    nobody. Noise is drawn only where it is asked for.
 
     Source: docs/mathematics.md, encoding noise.
     """
@@ -40,14 +31,19 @@ class SharedSecret:
         self._slots = range(0)
         self._chi: Floats
 
-    def at(self, k: int) -> Shared:
-        """The secret of slot k."""
+    def nu(self, k: int) -> Flags:
+        """ν_k, (R,): true for an innovation."""
+        return self._schedule.at(k)
+
+    def chi(self, k: int) -> Floats:
+        """χ_k ~ N(0, A Σ_{k−1} Aᵀ), (n, R); 0 at k = 0."""
         if k not in self._slots:
             self._slots = self._reader.block(k)
             zero = [[0.0] * self._n for _ in range(self._n)]
             factors = np.array([self._factors.carried(slot) if slot else zero for slot in self._slots])
             self._chi = product(factors, self._reader.normals(self._slots))
-        return Shared(self._schedule.at(k), self._chi[k - self._slots.start])
+        chi: Floats = self._chi[k - self._slots.start]
+        return chi
 
 
 class InnovationEncoder(Encoder):
@@ -61,8 +57,11 @@ class InnovationEncoder(Encoder):
 
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The packet of slot k."""
-        nu, chi = self._secret.at(k)
-        return Packet(select(nu, lambda: (x - predicted) + chi, lambda: x), nu)
+        nu = self._secret.nu(k)
+        return Packet(select(nu, lambda: (x - predicted) + self._secret.chi(k), lambda: x), nu)
+
+
+_ACTIONS = np.array([Action.LOST, Action.STATE, Action.INNOVATION], np.uint8)
 
 
 class InnovationEstimator(Receiver):
@@ -75,27 +74,18 @@ class InnovationEstimator(Receiver):
         super().__init__(process, trials)
         self._secret = secret
 
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """Lost, used as the state, or decoded, by the schedule."""
+        return _ACTIONS[gamma.view(np.uint8) + (gamma & self._secret.nu(k)).view(np.uint8)]
+
     def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
-        nu, chi = self._secret.at(k)
-        state, innovation = gamma & ~nu, gamma & nu
-
-        def estimate() -> Floats:
-            predicted = self.predicted(k, belief.x_hat)
-            return select(innovation, lambda: predicted + (z - chi), lambda: predicted)
-
-        def covariance() -> Floats:
-            carried = self.carried(k, belief.P)
-            return select(innovation, lambda: carried, lambda: self.diffused(k, carried))
-
+        action = self.act(k, gamma)
         return Belief(
-            select(state, lambda: z, estimate),
-            select(state, lambda: np.zeros_like(belief.P), covariance),
-            _ACTIONS[gamma.view(np.uint8) + innovation.view(np.uint8)],
+            update.estimate(self.process, k, belief.x_hat, action, z, lambda: z - self._secret.chi(k)),
+            update.believed_covariance(self.process, k, belief.P, action),
+            action,
         )
-
-
-_ACTIONS = np.array([Action.LOST, Action.STATE, Action.INNOVATION], np.uint8)
 
 
 class Innovation(Scheme):
@@ -106,9 +96,16 @@ class Innovation(Scheme):
 
     def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
         """The sensor's side."""
-        return InnovationEncoder(SharedSecret(self.process, self.state_probability, keys, batch))
+        return InnovationEncoder(self._secret(keys, batch))
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
         """The legitimate estimator's side."""
-        secret = SharedSecret(self.process, self.state_probability, keys, batch)
-        return InnovationEstimator(self.process, batch.trials, secret)
+        return InnovationEstimator(self.process, batch.trials, self._secret(keys, batch))
+
+    def pair(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[Encoder, Receiver]:
+        """Both sides, with one secret between them."""
+        secret = self._secret(keys, batch)
+        return InnovationEncoder(secret), InnovationEstimator(self.process, batch.trials, secret)
+
+    def _secret(self, keys: Mapping[str, bytes], batch: Batch) -> SharedSecret:
+        return SharedSecret(self.process, self.state_probability, keys, batch)

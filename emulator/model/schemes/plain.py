@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from emulator.model.packet_user import PacketUser
 from emulator.model.process import Floats
-from emulator.model.receiver import Flags, PacketUser, Receiver
+from emulator.model.receiver import Flags, Receiver
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.streams import Batch
 

@@ -43,6 +43,10 @@ class Scheme(ABC):
     def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
         """The sensor's side; keys holds those of `secret_streams`."""
 
+    def pair(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[Encoder, Receiver]:
+        """Both sides in one process; a scheme may let them draw what they share only once."""
+        return self.encoder(keys, batch), self.estimator(keys, batch)
+
     @abstractmethod
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
         """The legitimate estimator's side; keys holds those of `secret_streams`."""
