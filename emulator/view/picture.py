@@ -89,6 +89,6 @@ def _last_slot(viewer: ViewerClient) -> int | None:
 
 
 def _without_driver(log: str) -> str | None:
-    if "adapter" not in log.lower():
+    if "graphics adapter" not in log and "render context" not in log:
         return None
     return "no Vulkan driver to draw with; install one, on Debian: apt-get install mesa-vulkan-drivers"

@@ -1,0 +1,49 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.model.receiver import Codes
+from emulator.view.events import Event, Watcher
+from emulator.view.scene import Scene, Shown
+
+LOST, STATE, MISLED = 0, 1, 4
+
+
+def watch(codes: list[int], cuts: list[int], slots: int = 1000) -> list[Event]:
+    """Events of an eavesdropper's lane that is handed over in pieces."""
+    shown = Shown("eve", "eavesdropper", "naive", 0.9)
+    watcher = Watcher(shown, Scene("", "r", slots, 1, 2, 0.0, (shown,)))
+    found: list[Event] = []
+    bounds = [0, *sorted(cuts), len(codes)]
+    for start, end in zip(bounds, bounds[1:], strict=False):
+        part: Codes = np.array(codes[start:end], np.uint8)
+        found += watcher.watch(start, part)
+    return found
+
+
+def test_stretch_is_told_when_long_and_when_over() -> None:
+    """Three slots without a state are told in the third, with how many misled, and their end in the slot that ends them."""
+    assert watch([STATE, LOST, MISLED, LOST, LOST, STATE], [3]) == [
+        Event(2, "WARN", "eve took an innovation for the state, for the first time"),
+        Event(3, "WARN", "eve lost track: 3 slots without a state, 1 misled"),
+        Event(5, "INFO", "eve caught a state again after 4 slots"),
+    ]
+
+
+def test_short_stretches_are_not_told() -> None:
+    """One or two missed packets are everyday life."""
+    assert watch([LOST, LOST, STATE] * 20, []) == []
+
+
+@given(st.lists(st.sampled_from([LOST, STATE, 3, MISLED]), min_size=1, max_size=80), st.data())
+def test_pieces_do_not_matter(codes: list[int], data: st.DataObject) -> None:
+    """However a lane is cut, the same events are found."""
+    cuts = data.draw(st.lists(st.integers(0, len(codes)), max_size=6))
+    assert watch(codes, cuts) == watch(codes, [])
+
+
+def test_long_run_has_few_lines() -> None:
+    """Long stretches over and over become everyday life too: a long run has some hundreds of lines."""
+    lengths = np.random.default_rng(1).geometric(0.1, 10_000)
+    codes = [code for length in lengths.tolist() for code in (*[LOST] * length, STATE)]
+    assert 50 < len(watch(codes, [], len(codes))) < 1000

@@ -1,0 +1,75 @@
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from simulated_run import Simulated
+
+from emulator.errors import UsageError
+from emulator.view.picture import opened, picture
+from emulator.view.recording import Recording
+
+
+def recorded(run: Simulated, rrd: Path) -> Path:
+    """The run on file."""
+    recording = Recording(rrd, run.scene, None)
+    for slots in run.chunks(100):
+        recording.add(slots)
+    assert recording.close()
+    return rrd
+
+
+def filled(png: bytes) -> float:
+    """Share of the pixels inside a panel that are not its most frequent colour."""
+    pixels = np.asarray(matplotlib.image.imread(io.BytesIO(png)))[:, :, :3]
+    inside = (pixels[40:, :, :] * 255).astype(np.int64) @ np.array([65536, 256, 1])
+    return float(np.mean(inside != np.bincount(inside.ravel()).argmax()))
+
+
+@pytest.mark.parametrize(("n", "growth"), [(2, 1.0), (1, 1.0), (2, 1.12), (4, 1.0)])
+def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """Whatever the process, each panel draws something, in more than one colour, and complains of nothing."""
+    rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
+    try:
+        with opened(rrd, (1600, 950)) as viewer:
+            views = viewer.get_state().views
+            shares = {str(view.name): filled(viewer.take_screenshot(view.view_id)) for view in views}
+            complaints = [view.reports for view in views if view.reports]
+    except UsageError as error:
+        if "no Vulkan driver" not in str(error):
+            raise
+        pytest.skip(str(error))
+    assert len(shares) == 5
+    assert min(shares.values()) > 0.004, shares
+    assert complaints == []
+
+
+def test_picture_is_a_png_of_that_size(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """A picture is written in the size asked for, without complaints."""
+    rrd = recorded(simulated(60), tmp_path / "r.rrd")
+    try:
+        assert picture(rrd, tmp_path / "r.png", (1200, 800)) == []
+    except UsageError as error:
+        if "no Vulkan driver" not in str(error):
+            raise
+        pytest.skip(str(error))
+    assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (800, 1200)
+
+
+def test_missing_driver_is_named(
+    simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a Vulkan driver the error says what to install."""
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent")
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent")
+    rrd = recorded(simulated(20), tmp_path / "r.rrd")
+    with pytest.raises(UsageError, match="mesa-vulkan-drivers"):
+        picture(rrd, tmp_path / "r.png")
+
+
+def test_missing_recording_is_named(tmp_path: Path) -> None:
+    """A recording that is not there is a mistake of the user's, and told so."""
+    with pytest.raises(UsageError, match="does not exist"):
+        picture(tmp_path / "r.rrd", tmp_path / "r.png")

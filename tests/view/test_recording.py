@@ -1,0 +1,193 @@
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from simulated_run import Simulated
+
+from emulator.view import paths, plane
+from emulator.view.recording import Recording, Scene
+
+SLOTS = 400
+
+
+def record(run: Simulated, rrd: Path, chunk: int = 60) -> None:
+    """Put a run on file, some slots at a time."""
+    recording = Recording(rrd, run.scene, None)
+    for slots in run.chunks(chunk):
+        recording.add(slots)
+    recording.note(5, "WARN", "a note")
+    assert recording.close()
+    assert recording.failure is None
+    assert recording.dropped == 0
+
+
+def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
+    """The component's values of one entity, by slot."""
+    found: dict[int, Any] = {}
+    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
+        columns = chunk.to_record_batch().to_pydict()
+        found |= dict(zip(columns[paths.TIMELINE], columns[component], strict=True))
+    return found
+
+
+def lane(rrd: Path, entity: str, slots: int) -> list[str]:
+    """The lane's word in every slot, from its changes."""
+    changes, words = rows(rrd, entity, "StateChange:state"), []
+    for k in range(slots):
+        words.append(changes[k][0] if k in changes else words[-1])
+    return words
+
+
+@pytest.fixture(scope="module")
+def run(simulated: Callable[..., Simulated]) -> Simulated:
+    """A run of every strategy."""
+    return simulated(SLOTS)
+
+
+@pytest.fixture(scope="module")
+def rrd(run: Simulated, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its recording."""
+    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
+    record(run, path)
+    return path
+
+
+def test_curves_are_logarithms_at_full_rate(run: Simulated, rrd: Path) -> None:
+    """Every receiver has its error, believed and expected trace in every slot; what is exact lies on a common floor."""
+    lowest = []
+    for name, peer in run.slots.peers.items():
+        for kind, values in (("error", peer.squared_error), ("trace", peer.trace), ("theory", peer.expected_trace)):
+            shown = rows(rrd, f"{kind}/{name}", "Scalars:scalars")
+            curve = np.array([shown[k][0] for k in range(SLOTS)])
+            above = curve > curve.min()
+            np.testing.assert_allclose(curve[above], np.log10(values[above]), rtol=1e-12)
+            if kind == "error":
+                lowest.append(curve.min())
+                assert (np.log10(np.maximum(values[~above], 1e-300)) <= curve.min()).all()
+    assert max(lowest) == min(lowest)
+
+
+def test_lanes_tell_what_happened(run: Simulated, rrd: Path) -> None:
+    """Each lane says in every slot what became of the packet, and an innovation used as the state misled."""
+    nu = run.slots.nu
+    assert lane(rrd, "packets/0_sent", SLOTS) == ["innovation" if flag else "state" for flag in nu]
+    for i, shown in enumerate(run.scene.receivers):
+        words = {0: "dropped", 1: "state", 2: "innovation", 3: "discarded"}
+        expected = [words[int(action)] for action in run.slots.peers[shown.name].action]
+        if i > 0:
+            expected = ["misled" if nu[k] and word == "state" else word for k, word in enumerate(expected)]
+            assert "misled" in expected or shown.strategy == "smart"
+        assert lane(rrd, f"packets/{i + 1}_{shown.name}", SLOTS) == expected
+
+
+def test_plane_shows_truth_estimates_and_ellipses(run: Simulated, rrd: Path) -> None:
+    """The plane holds each point, mirrored, and ellipses whose points are all 2σ from their centre."""
+    truth = rows(rrd, "plane/truth/at", "Points2D:positions")
+    for k in (0, 1, 200, SLOTS - 1):
+        np.testing.assert_allclose(truth[k][0], run.slots.x[k] * [1, -1], rtol=1e-6)
+    smart = run.slots.peers["smart"]
+    ellipses = rows(rrd, "plane/smart/cov", "LineStrips2D:strips")
+    unsure = [k for k in range(SLOTS) if np.trace(smart.P[k]) > 0]
+    for k in unsure[:20]:
+        offsets = np.array(ellipses[k][0]) * [1, -1] - smart.x_hat[k]
+        distances = np.einsum("ci,ij,cj->c", offsets, np.linalg.inv(smart.P[k]), offsets)
+        np.testing.assert_allclose(np.sqrt(distances), 2.0, rtol=1e-3)
+
+
+def test_trail_passes_through_every_slot(run: Simulated, rrd: Path) -> None:
+    """The trail's pieces join up to the whole way."""
+    pieces = rows(rrd, "plane/truth/trail", "LineStrips2D:strips")
+    for k in range(1, SLOTS):
+        np.testing.assert_allclose(pieces[k][0], run.slots.x[k - 1 : k + 1] * [1, -1], rtol=1e-6)
+
+
+def test_events_name_receivers_and_notes(run: Simulated, rrd: Path) -> None:
+    """There are lines about the run, about a long stretch without packets, and the note."""
+    assert rows(rrd, "events/run", "TextLog:text")[5] == ["a note"]
+    assert any("lost track" in text[0] for text in rows(rrd, "events/smart", "TextLog:text").values())
+    assert any("for the first time" in text[0] for text in rows(rrd, "events/naive", "TextLog:text").values())
+
+
+def test_layout_and_styles_are_in_the_file(rrd: Path) -> None:
+    """The file alone is enough to look at: it holds the layout, and a static style for every curve and lane."""
+    assert RrdReader(rrd).blueprints()
+    styled = {str(chunk.entity_path) for chunk in RrdReader(rrd).stream().filter(is_static=True)}
+    assert {"/error/legitimate", "/trace/naive", "/theory/smart", "/packets/0_sent", "/packets/4_smart"} <= styled
+
+
+def test_chunks_do_not_show(run: Simulated, rrd: Path, tmp_path: Path) -> None:
+    """However the slots are handed over, the same is recorded."""
+    record(run, tmp_path / "other.rrd", chunk=7)
+    for entity, component in (
+        ("error/naive", "Scalars:scalars"),
+        ("packets/3_suspicious", "StateChange:state"),
+        ("plane/smart/trail", "LineStrips2D:strips"),
+        ("plane/frame", "LineStrips2D:strips"),
+        ("events/suspicious", "TextLog:text"),
+    ):
+        assert rows(tmp_path / "other.rrd", entity, component) == rows(rrd, entity, component)
+
+
+def test_one_state_is_drawn_over_time(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """A process of one state has curves in place of the plane."""
+    run = simulated(50, n=1)
+    record(run, tmp_path / "r.rrd")
+    shown = rows(tmp_path / "r.rrd", "plane/smart", "Scalars:scalars")
+    assert [shown[k][0] for k in range(50)] == run.slots.peers["smart"].x_hat[:, 0].tolist()
+
+
+def test_long_runs_have_bounded_frames() -> None:
+    """200 000 slots as fast as they go have some thousand frames, the last slot among them; real time has 30 a second."""
+    fast = Scene("", "r", 200_000, 1, 2, 0.0, ())
+    offsets = np.concatenate([first + plane.frames(fast, first, 1000) for first in range(0, 200_000, 1000)])
+    assert len(offsets) <= 4001
+    assert offsets[-1] == 199_999
+    assert plane.stride(Scene("", "r", 3000, 1, 2, 0.02, ())) == 2
+    assert plane.stride(Scene("", "r", 300, 1, 2, 0.0, ())) == 1
+
+
+def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) -> None:
+    """Without a file the run goes on, and the reason is kept."""
+    recording = Recording(tmp_path / "missing" / "r.rrd", run.scene, None)
+    for slots in run.chunks(100):
+        recording.add(slots)
+    recording.close()
+    assert recording.failure is not None
+    assert "No such file" in recording.failure
+
+
+FULL_DISK = """
+import os, resource, signal, sys
+sys.path.insert(0, sys.argv[1])
+from simulated_run import orbit, simulate
+from pathlib import Path
+from emulator.view.recording import Recording
+run = simulate(orbit(), 3000)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
+recording = Recording(Path(sys.argv[2]), run.scene, None)
+for slots in run.chunks(300):
+    recording.add(slots)
+safe = recording.close()
+print("safe" if safe else "unsafe", recording.failure, flush=True)
+os._exit(0)
+"""
+
+
+def test_full_disk_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
+    """When the file can grow no more, adding and closing still end in time, and the reason is kept."""
+    command = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent), str(tmp_path / "r.rrd")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.startswith("unsafe the recording is incomplete")
+
+
+def test_close_leaves_no_thread(run: Simulated, tmp_path: Path) -> None:
+    """A closed recording has ended its threads."""
+    record(run, tmp_path / "r.rrd")
+    assert not [thread for thread in threading.enumerate() if thread.name in {"recording", "live view"}]
