@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,7 +17,7 @@ def watch(codes: list[int], cuts: list[int], slots: int = 1000) -> list[Event]:
     watcher = Watcher(shown, Scene("", "r", slots, 1, 2, 0.0, (shown,)))
     found: list[Event] = []
     bounds = [0, *sorted(cuts), len(codes)]
-    for start, end in zip(bounds, bounds[1:], strict=False):
+    for start, end in pairwise(bounds):
         part: Codes = np.array(codes[start:end], np.uint8)
         found += watcher.watch(start, part)
     return found
