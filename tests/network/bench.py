@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from emulator.brief import Brief, Flow, read_brief
+from emulator.brief import Brief, Flow
 from emulator.network.access import Keys
 from emulator.network.session import client_config
 from emulator.run.briefs import Observation, briefs_of
@@ -159,17 +159,3 @@ def bench_of(scenario: Scenario, folder: Path) -> Iterator[Bench]:
     """A bench that is gone when the block ends."""
     with ExitStack() as stack:
         yield Bench(scenario, folder, stack)
-
-
-def parts_of(pid: int) -> dict[str, tuple[int, Brief]]:
-    """Process name → (pid, brief) of the children of a launcher."""
-    found = {}
-    for line in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        try:
-            arguments = Path(f"/proc/{line}/cmdline").read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if len(arguments) > 4 and arguments[1:3] == [b"-m", b"emulator"]:
-            brief = read_brief(Path(arguments[4].decode()))
-            found[brief.process] = (int(line), brief)
-    return found

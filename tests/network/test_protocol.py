@@ -18,7 +18,7 @@ from emulator.model.elementary import normal_quantile
 from emulator.model.receiver import Belief
 from emulator.network import wire
 from emulator.network.access import Keys, grants
-from emulator.streams import normals, root_of_seed, stream_key, uniforms, words
+from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
 TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))
@@ -183,7 +183,7 @@ def golden_words() -> dict[str, np.ndarray]:
     """The golden words: "slot trial" → (m,)."""
     golden = json.loads(GOLDEN["words"])
     key = stream_key(root_of_seed(golden["seed"]), golden["stream"])
-    drawn = words(key, range(2), range(2), golden["per_trial"])
+    drawn = Stream(key, range(2), golden["per_trial"]).words(range(2))
     return {f"{k} {r}": drawn[k, r] for k in range(2) for r in range(2)}
 
 
@@ -203,7 +203,7 @@ def test_words_far_away() -> None:
     golden = json.loads(GOLDEN["far words"])
     key = stream_key(root_of_seed(golden["seed"]), golden["stream"])
     k, r = golden["slot"], golden["trial"]
-    drawn = words(key, range(k, k + 1), range(r, r + 1), golden["per_trial"])
+    drawn = Stream(key, range(r, r + 1), golden["per_trial"]).words(range(k, k + 1))
     assert [f"{word:016x}" for word in drawn[0, 0].tolist()] == golden["words"]
 
 
