@@ -518,7 +518,7 @@ def _sentence(detail: ErrorDetails) -> str:
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {_toml(found)}; expected a number {bound}{example}"
     if kind == "too_long":
-        return f"has {context['actual_length']} entries; expected at most {context['max_length']}"
+        return f"has more than {context['max_length']} entries; expected at most so many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {_toml(found)}; expected {expected}{example}"
 

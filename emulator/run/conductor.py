@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from queue import Empty, SimpleQueue
 
 from emulator.errors import Interrupted, RunError
@@ -28,9 +29,12 @@ class Stop:
 class Conductor:
     """Final. Its news are (source, payload): telemetry and journal as they come; everything else it keeps to itself."""
 
-    def __init__(self, session: Session, receivers: tuple[str, ...], stop: Stop) -> None:
+    def __init__(
+        self, session: Session, receivers: tuple[str, ...], stop: Stop, beat: Callable[[], None] = lambda: None
+    ) -> None:
         self._session = session
         self._stop = stop
+        self._beat = beat
         self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
         self._present = dict.fromkeys((ROUTER, SENSOR, *receivers), False)
         keys = session.keys
@@ -43,14 +47,19 @@ class Conductor:
         self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
         self._progress = session.outlet(keys.progress(OBSERVER))
 
+    @property
+    def missing(self) -> list[str]:
+        """The processes that are not on the network."""
+        return [name for name, there in self._present.items() if not there]
+
     def assemble(self) -> None:
         """Wait for every process. Raises RunError naming those that are missing after 30 s."""
         deadline = time.monotonic() + READY_SECONDS
-        while not all(self._present.values()):
+        while self.missing:
             self._stop.check()
-            missing = [name for name, there in self._present.items() if not there]
             if time.monotonic() > deadline:
-                raise RunError(f"{', '.join(missing)} did not appear within {READY_SECONDS:.0f} s; look at the logs")
+                names = ", ".join(self.missing)
+                raise RunError(f"{names} did not appear within {READY_SECONDS:.0f} s; look at the logs")
             self._note(self._next())
         self._session.ready()
 
@@ -67,9 +76,8 @@ class Conductor:
         news = self._next()
         if news is None or not isinstance(news[1], bytes):
             self._note(news)
-            gone = [name for name, there in self._present.items() if not there]
-            if gone:
-                raise RunError(f"{', '.join(gone)} ended before the run did; look at its log")
+            if self.missing:
+                raise RunError(f"{', '.join(self.missing)} left the network before the run ended; look at the logs")
             return None
         return news[0], news[1]
 
@@ -83,6 +91,7 @@ class Conductor:
             command(control("end"))
 
     def _next(self) -> tuple[str, bytes | bool] | None:
+        self._beat()
         try:
             return self._news.get(timeout=_LOOK_SECONDS)
         except Empty:

@@ -1,7 +1,8 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
-Its news go to standard output, a JSON object a line: `{"event": "started"}`, `{"event": "progress", …}` four times a
-second, and at the end `{"event": "ended", "summary": …}`. Whatever ends the run, the results folder is whole.
+Its news go to standard output, a JSON object a line: `{"event": "started"}`, then four times a second `{"event":
+"progress", …}`, every second `{"event": "alive"}`, and then `{"event": "finishing"}` and `{"event": "ended", "status": …}`.
+Whatever ends the run, the results folder is whole.
 """
 
 from __future__ import annotations
@@ -9,9 +10,13 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
+import threading
 import time
+import traceback
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +36,8 @@ if TYPE_CHECKING:
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
+_BEAT_SECONDS = 1.0
+_ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 
 def observe(brief: Brief) -> int:
@@ -38,6 +45,9 @@ def observe(brief: Brief) -> int:
     stop = Stop()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    if brief.ends_with_stdin:
+        threading.Thread(target=_stop_with_stdin, name="launcher-watch", daemon=True).start()
+        brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario)
     status, how = 0, "complete"
@@ -48,9 +58,23 @@ def observe(brief: Brief) -> int:
                 observation.conduct(stop)
             except EvedropError as error:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
+            finally:
+                tell("finishing")
     except OSError as error:
         status, how = RunError.exit_status, f"the results cannot be written ({error}); free some room and run again"
+    except Exception as error:  # a mistake of ours must not cost what was measured
+        traceback.print_exc()
+        status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
     return observation.finish(status, how)
+
+
+def _stop_with_stdin() -> None:
+    """Write what there is, and end, when the launcher is gone."""
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_ORPHAN_SECONDS)
+    os._exit(RunError.exit_status)
 
 
 def tell(event: str, **news: Any) -> None:
@@ -71,7 +95,8 @@ class Observation:
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
         self._writer: ResultsWriter
-        self._started = self._ended = self._told = time.monotonic()
+        self._started = self._ended = self._told = self._beaten = time.monotonic()
+        self._suspects: list[str] = []
         self._recent: tuple[float, int] = (self._started, 0)
 
     def writer(self) -> ResultsWriter:
@@ -82,21 +107,24 @@ class Observation:
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
         with Session(self._brief) as session:
-            conductor = Conductor(session, self._scenario.receivers, stop)
+            conductor = Conductor(session, self._scenario.receivers, stop, self._beat)
             if self._brief.part["recording"]:
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
                 )
-            conductor.assemble()
-            self._started = self._ended = time.monotonic()
-            self._recent = (self._started, 0)
-            conductor.start()
-            tell("started")
             try:
+                conductor.assemble()
+                self._started = self._ended = time.monotonic()
+                self._recent = (self._started, 0)
+                conductor.start()
+                tell("started")
                 while self._joiner.done < self._scenario.slots:
                     news = conductor.news()
                     if news is not None:
                         self._take(conductor, *news)
+            except RunError:
+                self._suspects = conductor.missing
+                raise
             finally:
                 self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
@@ -119,6 +147,13 @@ class Observation:
             self._recording.add(shown(slots, scored))
         conductor.report(self._joiner.done)
         self._progress(scored)
+
+    def _beat(self) -> None:
+        """Show the launcher that we live, when there is nothing else to tell."""
+        now = time.monotonic()
+        if now - self._beaten >= _BEAT_SECONDS:
+            self._beaten = now
+            tell("alive")
 
     def _progress(self, scored: Mapping[str, Scored]) -> None:
         now = time.monotonic()
@@ -145,7 +180,8 @@ class Observation:
         except OSError as error:
             status = RunError.exit_status
             summary["ended"] = f"the results cannot be written ({error}); free some room and run again"
-        tell("ended", status=status, how=summary["ended"], view=self._recording.failure if self._recording else None)
+        view = self._recording.failure if self._recording is not None else None
+        tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
         if not safe:
             os._exit(status)
         return status

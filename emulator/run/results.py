@@ -6,7 +6,9 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -136,8 +138,9 @@ class ResultsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for table in (self._slots, self._trials, self._journal, self._digests):
-            table.close()
+        with ExitStack() as every:  # one that cannot be written keeps no other from being whole
+            for table in (self._slots, self._trials, self._journal, self._digests):
+                every.callback(table.close)
 
     def slot_rows(self, first: int, name: str, sums: SlotSums, expected: Floats) -> None:
         """A row per slot: statistics over trials of one receiver; expected is the trace that theory gives, (c,)."""
@@ -220,7 +223,9 @@ def seen_actions(action: Codes, nu: Flags) -> Codes:
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json; infinite and undefined numbers as strings, which JSON lacks."""
-    (folder / "summary.json").write_text(json.dumps(_plain(summary), indent=1, ensure_ascii=False) + "\n")
+    unfinished = folder / "summary.json.new"
+    unfinished.write_text(json.dumps(_plain(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    os.replace(unfinished, folder / "summary.json")
 
 
 def _plain(value: Any) -> Any:

@@ -34,7 +34,7 @@ class Secrecy:
     relative: Verdict
     perfect: Verdict
     relative_by_theory: bool
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 of the run, and J bounded."""
+    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded."""
     perfect_by_theory: bool
     """J bounded and J_e not."""
     ratio: float
@@ -102,9 +102,9 @@ def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: 
     (user, user_outcomes), (name, other, other_outcomes) = legitimate, eavesdropper
     user_bound, other_bound = limit_trace(process, user_outcomes), limit_trace(process, other_outcomes)
     perfect_by_theory = math.isfinite(user_bound) and math.isinf(other_bound)
-    slots = user.slots
+    complete = user.done == user.slots
+    slots = user.slots if complete else max(user.done, 2)
     gap = expected_traces(process, other_outcomes, slots) - expected_traces(process, user_outcomes, slots)
-    complete = user.done == slots
     user_means, other_means = window_means(user), window_means(other)
     relative = _relative(other_means - user_means) if complete else Verdict.UNDECIDED
     if not perfect_by_theory:
