@@ -137,19 +137,35 @@ class Process:
         return None
 
 
-class Trajectory:
-    """The true states of a batch: x_0 = L0 ξ_0, then x_k = A x_{k−1} + L_Q ξ_k, with ξ from the stream `process`.
+class ProcessNoise:
+    """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`. Final."""
 
-    Final. Must be read slot by slot.
-    """
+    def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
+        self._reader = BlockReader(key, batch, process.n)
+        self._initial_factor = cholesky(process.initial_covariance)
+        self._factor = cholesky(process.Q)
+        self._slots = range(0)
+        self._noise: Floats
+
+    def at(self, k: int) -> Floats:
+        """What slot k adds to A x_{k−1}, (n, R)."""
+        if k not in self._slots:
+            self._slots = self._reader.block(k)
+            factors = np.broadcast_to(self._factor, (len(self._slots), *self._factor.shape))
+            if self._slots.start == 0:
+                factors = factors.copy()
+                factors[0] = self._initial_factor
+            self._noise = product(factors, self._reader.normals(self._slots))
+        noise: Floats = self._noise[k - self._slots.start]
+        return noise
+
+
+class Trajectory:
+    """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Final. Must be read slot by slot."""
 
     def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
         self._process = process
-        self._reader = BlockReader(key, batch, process.n)
-        self._initial_factor = cholesky(process.initial_covariance)
-        self._noise_factor = cholesky(process.Q)
-        self._block = range(0)
-        self._noise: Floats
+        self._noise = ProcessNoise(process, key, batch)
         self._next = 0
         self.x: Floats = np.zeros((process.n, batch.trials))
         self.predicted: Floats = self.x
@@ -157,25 +173,14 @@ class Trajectory:
 
     def advance(self) -> Floats:
         """The next slot's state, (n, R)."""
-        k = self._next
-        if k not in self._block:
-            self._block = self._reader.block(k)
-            self._noise = self._draw(self._block)
-        noise = self._noise[k - self._block.start]
-        if k == 0:
+        noise = self._noise.at(self._next)
+        if self._next == 0:
             self.x = noise
         else:
             self.predicted = self._process.predict(self.x)
             self.x = self.predicted + noise
-        self._next = k + 1
+        self._next += 1
         return self.x
-
-    def _draw(self, slots: range) -> Floats:
-        factors = np.broadcast_to(self._noise_factor, (len(slots), *self._noise_factor.shape))
-        if slots.start == 0:
-            factors = factors.copy()
-            factors[0] = self._initial_factor
-        return product(factors, self._reader.normals(slots))
 
 
 class StateFactors:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -56,6 +56,14 @@ class Slots:
     def trials(self) -> int:
         """Number of trials."""
         return int(self.x.shape[2])
+
+    def copied(self) -> Slots:
+        """The same in arrays of its own."""
+        receivers = {
+            name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
+            for name, one in self.receivers.items()
+        }
+        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers)
 
 
 class Joiner:

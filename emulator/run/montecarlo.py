@@ -1,59 +1,181 @@
 """Monte Carlo: the trials of a live run in memory, the same bits without a network.
 
-Trials run in fixed blocks of 500, whatever their number, and are merged in trial order.
+Trials run in fixed blocks of 500 and are merged in trial order: the results are the same for any number of workers.
 """
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emulator.model.digest import RunDigest
+import numpy as np
+
+from emulator.errors import Interrupted, UsageError
+from emulator.model.digest import BLOCK_SLOTS, RunDigest
+from emulator.run.histogram import SlotHistograms
 from emulator.run.results import ResultsWriter, new_folder, write_summary
 from emulator.run.score import SlotSums, Tally, merged
-from emulator.run.scorekeeper import Ending, Scorekeeper, resolved, summary_of
-from emulator.run.simulation import Simulation
+from emulator.run.scorekeeper import Ending, expected_traces_of, resolved, summary_of
+from emulator.run.signals import stop_on_signals
+from emulator.run.simulation import Mode
+from emulator.run.trials import BatchResult, Task, tasks_of
+from emulator.run.workers import in_processes, in_this_process, on_cluster
 from emulator.scenario import Scenario
 
-BLOCK_TRIALS = 500
+_WORTH_A_PROCESS = 2_000_000  # trial-slots and receivers: below, starting workers costs more than it saves
+_TELL_SECONDS = 0.1
+
+News = Mapping[str, Any]
 
 
-def simulate(scenario: Scenario, folder: Path, tell: Callable[[Mapping[str, Any]], None]) -> int:
-    """Run all trials of a scenario into a results folder; the exit status. `tell` gets progress as it is made."""
+@dataclass(frozen=True)
+class Plan:
+    """How to simulate: what, and where."""
+
+    mode: Mode = Mode.EXACT
+    workers: int | None = None
+    """None: as many as pay on this machine."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, which then does the work."""
+
+    def workers_for(self, scenario: Scenario) -> int:
+        """The number of workers. Raises UsageError if it is not positive."""
+        if self.workers is not None and self.workers < 1:
+            raise UsageError(f"--workers {self.workers}: expected 1 or more")
+        if self.workers is not None:
+            return self.workers
+        work = scenario.trials * scenario.slots * len(scenario.receivers)
+        return (os.cpu_count() or 1) if work > _WORTH_A_PROCESS else 1
+
+
+def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], plan: Plan = Plan()) -> int:
+    """Run all trials of a scenario into a results folder; the exit status. `tell` gets progress as it is made.
+
+    Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C, with what is done in the folder.
+    """
+    check_mode(scenario, plan.mode)
+    workers = plan.workers_for(scenario)
     new_folder(folder)
     started = time.monotonic()
     (folder / "scenario.toml").write_text(resolved(scenario))
-    names, slots = scenario.receivers, scenario.slots
-    sums = {name: SlotSums.zero(slots) for name in names}
-    tallies: dict[str, dict[int, Tally]] = {name: {} for name in names}
-    digests = {name: RunDigest() for name in names}
-    end = scenario.first_trial + scenario.trials
-    with ResultsWriter(folder, names, len(scenario.process.A)) as writer:
-        for start in range(scenario.first_trial, end, BLOCK_TRIALS):
-            trials = range(start, min(start + BLOCK_TRIALS, end))
-            recorded = max(0, min(scenario.first_trial + scenario.record_trials, trials.stop) - start)
-            simulation = Simulation(scenario, trials, recorded)
-            keeper = Scorekeeper(scenario, len(trials))
-            for chunk in simulation.chunks():
-                scored = keeper.add(chunk)
-                for name, one in scored.items():
-                    sums[name].add(chunk.first, one.sums)
-                if recorded:
-                    writer.trial_rows(chunk, {name: one.squared_error for name, one in scored.items()}, start)
-                done = (start - scenario.first_trial) * slots + len(trials) * (chunk.first + chunk.count)
-                rate = done / (time.monotonic() - started)
-                tell({"event": "progress", "done": done, "rate": rate, "rate_unit": "trial-slots/s"})
-            writer.digest_rows(start, simulation.digests)
-            for name in names:
-                tallies[name][start] = keeper.tallies[name]
-                digests[name].add(simulation.digests[name])
-        theory = Scorekeeper(scenario, 1).expected(slots)
-        for name in names:
-            writer.slot_rows(0, name, sums[name], theory[name])
-    totals = {name: merged(tallies[name]) for name in names}
-    ending = Ending(time.monotonic() - started)
-    summary = summary_of(scenario, totals, {name: digests[name].hexadecimal for name in names}, ending)
-    write_summary(folder, summary)
+    with stop_on_signals() as stop:
+        results = _results(tasks_of(scenario, plan.mode, workers), workers, plan.scheduler, _teller(tell), stop.is_set)
+        merger = _Merger(scenario, plan.mode)
+        with ResultsWriter(folder, scenario.receivers, len(scenario.process.A)) as writer:
+            for result in results:
+                merger.add(result, writer)
+            if not merger.trials:
+                raise Interrupted("interrupted before anything was done; nothing was kept")
+            merger.write(writer)
+        complete = merger.complete and not stop.is_set()
+        ending = Ending(time.monotonic() - started, "complete" if complete else "interrupted")
+        summary = merger.summary(ending)
+        write_summary(folder, summary)
+    if not complete:
+        raise Interrupted("interrupted; what was done is in the results folder")
     return 0 if all(expectation["held"] for expectation in summary["expectations"]) else 1
+
+
+def check_mode(scenario: Scenario, mode: Mode) -> None:
+    """Raise UsageError where a mode cannot follow the scenario: numbers that leave double precision altogether."""
+    if mode is Mode.EXACT:
+        return
+    for name, expected in expected_traces_of(scenario).items():
+        beyond = np.flatnonzero(~np.isfinite(expected))
+        if beyond.size:
+            raise UsageError(
+                f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
+                f"give --slots {beyond[0]} or fewer, or take {name} out of the scenario"
+            )
+
+
+def _results(
+    tasks: list[Task], workers: int, scheduler: str | None, tell: Callable[[int], None], stopped: Callable[[], bool]
+) -> Iterator[BatchResult]:
+    if scheduler is not None:
+        return on_cluster(tasks, scheduler, tell, stopped)
+    if workers == 1 or len(tasks) == 1:
+        return in_this_process(tasks, tell, stopped)
+    return in_processes(tasks, min(workers, len(tasks)), tell, stopped)
+
+
+def _teller(tell: Callable[[News], None]) -> Callable[[int], None]:
+    """Progress in trial-slots, with their rate, a few times a second."""
+    started = told = time.monotonic()
+    done = 0
+
+    def take(count: int) -> None:
+        nonlocal told, done
+        done += count
+        now = time.monotonic()
+        if now - told > _TELL_SECONDS:
+            told = now
+            tell({"event": "progress", "done": done, "rate": done / (now - started), "rate_unit": "trial-slots/s"})
+
+    return take
+
+
+class _Merger:
+    """Adds up results in trial order. Final."""
+
+    def __init__(self, scenario: Scenario, mode: Mode) -> None:
+        self._scenario = scenario
+        self._mode = mode
+        names = scenario.receivers
+        self._sums = {name: SlotSums.zero(scenario.slots) for name in names}
+        self._tallies: dict[str, dict[int, Tally]] = {name: {} for name in names}
+        self._digests = {name: RunDigest() for name in names}
+        self._errors: dict[str, SlotHistograms] = {}
+        self._traces: dict[str, SlotHistograms] = {}
+        self._whole = mode is Mode.EXACT
+        self.trials = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether every trial has every slot."""
+        done = (tally.done == tally.slots for tallies in self._tallies.values() for tally in tallies.values())
+        return self.trials == self._scenario.trials and all(done)
+
+    def add(self, result: BatchResult, writer: ResultsWriter) -> None:
+        """Take the next batch."""
+        for block in result.blocks:
+            self.trials += block.trials
+            for name in self._scenario.receivers:
+                self._sums[name].add(0, block.sums[name])
+                self._tallies[name][block.start] = block.tallies[name]
+            if self._mode is Mode.EXACT:
+                self._add_digests(block.start, block.digests, writer)
+        for mine, theirs in ((self._errors, result.errors), (self._traces, result.traces)):
+            for name, histograms in theirs.items():
+                if name in mine:
+                    mine[name].merge(histograms)
+                else:
+                    mine[name] = histograms
+        for slots, errors in result.recorded:
+            writer.trial_rows(slots, errors, result.start)
+
+    def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter) -> None:
+        writer.digest_rows(start, digests)
+        blocks = -(-self._scenario.slots // BLOCK_SLOTS)
+        for name, of_blocks in digests.items():
+            self._whole &= len(of_blocks) == blocks
+            if self._whole:
+                self._digests[name].add(of_blocks)
+
+    def write(self, writer: ResultsWriter) -> None:
+        """Write the rows of all slots."""
+        expected = expected_traces_of(self._scenario)
+        for name in self._scenario.receivers:
+            quantiles = np.hstack([self._errors[name].quantiles(), self._traces[name].quantiles()])
+            writer.slot_rows(0, name, self._sums[name], expected[name], quantiles, self._mode is Mode.COVARIANCE_ONLY)
+
+    def summary(self, ending: Ending) -> dict[str, Any]:
+        """The summary of all that was added."""
+        totals = {name: merged(tallies) for name, tallies in self._tallies.items()}
+        whole = self._whole and self.complete
+        digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
+        return summary_of(self._scenario, totals, digests, ending, self._mode.value)

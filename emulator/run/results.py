@@ -24,6 +24,7 @@ from emulator.model.digest import DIGEST_BYTES, Digests
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
 from emulator.network.wire import packed_flags
+from emulator.run.histogram import LEVELS
 from emulator.run.joined import Slots
 from emulator.run.score import SlotSums
 
@@ -35,11 +36,13 @@ SLOTS = pa.schema(
         ("peer", pa.dictionary(pa.int8(), pa.string())),
         ("trials", pa.int64()),
         ("mean_squared_error", pa.float64()),
+        ("mean_actual_trace_covariance", pa.float64()),
         ("standard_error", pa.float64()),
         ("mean_trace_covariance", pa.float64()),
         ("expected_trace_covariance", pa.float64()),
         ("received_fraction", pa.float64()),
         ("used_fraction", pa.float64()),
+        *((f"{quantity}_quantile_{level:g}", pa.float64()) for quantity in ("error", "trace") for level in LEVELS),
     ]
 )
 JOURNAL = pa.schema(
@@ -142,24 +145,38 @@ class ResultsWriter:
             for table in (self._slots, self._trials, self._journal, self._digests):
                 every.callback(table.close)
 
-    def slot_rows(self, first: int, name: str, sums: SlotSums, expected: Floats) -> None:
-        """A row per slot: statistics over trials of one receiver; expected is the trace that theory gives, (c,)."""
+    def slot_rows(
+        self,
+        first: int,
+        name: str,
+        sums: SlotSums,
+        expected: Floats,
+        quantiles: Floats | None = None,
+        covariance_only: bool = False,
+    ) -> None:
+        """A row per slot: statistics over trials of one receiver.
+
+        expected: the trace that theory gives, (c,); quantiles: of error and of trace, (c, 2 levels), NaN where there are
+        none; covariance_only: the error is the trace of the actual covariance, not a squared error.
+        """
         count, trials = len(expected), sums.trials
-        mean = sums.squared_error / trials
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            variance = np.maximum(0.0, sums.squared_error_squared / trials - mean * mean) * trials / (trials - 1)
-            standard_error = np.sqrt(variance / trials) if trials > 1 else np.full(count, np.nan)
+            mean = sums.error / trials
+            variance = np.maximum(0.0, sums.error_squared / trials - mean * mean) * trials / (trials - 1.0)
+            standard_error = np.where(trials > 1, np.sqrt(variance / trials), np.nan)
+            columns = [sums.trace / trials, expected, sums.received / trials, sums.used / trials]
+        nothing = pa.nulls(count, pa.float64())
+        spread = quantiles if quantiles is not None else np.full((count, 2 * len(LEVELS)), np.nan)
         self._slots.add(
             [
                 np.arange(first, first + count),
                 self._names(name, count),
-                np.full(count, trials),
-                mean,
+                trials.astype(np.int64),
+                nothing if covariance_only else mean,
+                mean if covariance_only else nothing,
                 standard_error,
-                sums.trace / trials,
-                expected,
-                sums.received / trials,
-                sums.used / trials,
+                *columns,
+                *(pa.array(column, from_pandas=True) for column in spread.T),
             ]
         )
 

@@ -8,17 +8,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import tomli_w
 
 from emulator.model.digest import BLOCK_SLOTS, Digests, RunDigest
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.process import Floats
-from emulator.model.theory import ExpectedCovariance, Outcomes
+from emulator.model.theory import ExpectedCovariance, Outcomes, expected_traces, has_infinite_variance
 from emulator.network.access import LEGITIMATE
+from emulator.run.histogram import LEVELS
 from emulator.run.joined import Slots
-from emulator.run.score import SlotSums, Tally, slot_sums, squared_errors
+from emulator.run.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.run.verdict import Secrecy, secrecy
 from emulator.scenario import ExpectTable, Scenario
+
+_ENOUGH_TO_SURPRISE = 10  # trials
 
 
 def outcomes_of(scenario: Scenario) -> dict[str, Outcomes]:
@@ -29,6 +33,12 @@ def outcomes_of(scenario: Scenario) -> dict[str, Outcomes]:
         use_state, use_innovation = STRATEGIES[table.strategy].use_probabilities(table.parameters)
         outcomes[name] = Outcomes.eavesdropper(quality[name], mu_d, use_state, use_innovation)
     return outcomes
+
+
+def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
+    """Receiver → theory: trace of the expected actual error covariance in every slot, (slots,)."""
+    process, slots = scenario.process.process, scenario.slots
+    return {name: expected_traces(process, one, slots) for name, one in outcomes_of(scenario).items()}
 
 
 class Scored(NamedTuple):
@@ -49,17 +59,16 @@ class Scorekeeper:
         self._theory = {name: ExpectedCovariance(process, one) for name, one in outcomes_of(scenario).items()}
         self.tallies = {name: Tally(scenario.slots, trials) for name in scenario.receivers}
 
-    def expected(self, slots: int) -> dict[str, Floats]:
-        """Theory of the next slots alone: receiver → trace of the expected actual error covariance, (slots,)."""
-        return {name: theory.next_traces(slots) for name, theory in self._theory.items()}
-
     def add(self, slots: Slots) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory."""
-        scored, expected = {}, self.expected(slots.count)
+        scored = {}
         for name, receiver in slots.receivers.items():
-            errors = squared_errors(slots, receiver)
-            one = Scored(errors, slot_sums(receiver, errors), expected[name])
-            self.tallies[name].add(slots.first, receiver, *one)
+            errors = squared_errors(slots.x, receiver.x_hat)
+            one = Scored(
+                errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
+            )
+            self.tallies[name].add(slots.first, *one)
+            self.tallies[name].account(receiver.delivered, receiver.action, receiver.lost)
             scored[name] = one
         return scored
 
@@ -82,31 +91,80 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
 
 
 def summary_of(
-    scenario: Scenario, tallies: Mapping[str, Tally], digests: Mapping[str, str | None], ending: Ending
+    scenario: Scenario,
+    tallies: Mapping[str, Tally],
+    digests: Mapping[str, str | None],
+    ending: Ending,
+    mode: str = "live",
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
-    peers = {name: {**tally.figures, "digest": digests[name]} for name, tally in tallies.items()}
-    done = tallies[LEGITIMATE].done
+    process, outcomes = scenario.process.process, outcomes_of(scenario)
+    peers = {
+        name: {
+            **tally.figures,
+            "error_quantiles": _quantiles(tally),
+            "infinite_variance": has_infinite_variance(process, outcomes[name]),
+            "digest": digests[name],
+        }
+        for name, tally in tallies.items()
+    }
+    if mode == "covariance-only":
+        for peer in peers.values():
+            peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
+    user = tallies[LEGITIMATE]
     return {
         "scenario": scenario.title,
+        "mode": mode,
         "seed": scenario.seed,
-        "slots": done,
-        "trials": scenario.trials,
+        "slots": user.done,
+        "trials": user.trials,
         "first_trial": scenario.first_trial,
         "wall_seconds": ending.wall_seconds,
-        "slots_per_second": done / ending.wall_seconds if ending.wall_seconds else 0.0,
+        "slots_per_second": user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
         "ended": ending.how,
         "peers": peers,
         "links": {name: tally.link for name, tally in tallies.items()},
         "secrecy": {one.eavesdropper: one.as_dict() for one in verdicts(scenario, tallies)},
+        "surprising": _surprising(scenario, tallies),
         "expectations": [_expectation(expect, peers) for expect in scenario.expect],
     }
+
+
+def _quantiles(tally: Tally) -> dict[str, float] | None:
+    """Quantiles over trials of a trial's mean error; None of a run cut short."""
+    if tally.done != tally.slots:
+        return None
+    return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
+
+
+def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, Any] | None:
+    """The trial whose mean error lies furthest from the median, in logarithms and median deviations, of any receiver."""
+    found: dict[str, Any] | None = None
+    furthest = 0.0
+    for name, tally in tallies.items():
+        means = trial_means(tally)
+        if tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE or not np.all(means > 0.0):
+            continue
+        logarithms = np.log(means)
+        median = float(np.median(logarithms))
+        deviation = np.abs(logarithms - median)
+        spread = float(np.median(deviation))
+        worst = int(np.argmax(deviation))
+        if spread > 0.0 and deviation[worst] / spread > furthest:
+            furthest = float(deviation[worst] / spread)
+            found = {
+                "trial": scenario.first_trial + worst,
+                "receiver": name,
+                "mean_error": float(means[worst]),
+                "median": float(np.exp(median)),
+            }
+    return found
 
 
 def _expectation(expect: ExpectTable, peers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     receiver, figure = expect.figure.split(".")
     found = peers[receiver][figure]
-    return {"text": expect.text, "held": expect.holds(found), "found": found}
+    return {"text": expect.text, "held": found is not None and expect.holds(found), "found": found}
 
 
 def digest_of(scenario: Scenario, blocks: Mapping[int, Digests]) -> str | None:

@@ -1,42 +1,88 @@
-"""A batch of trials in memory: sensor, links and receivers of a scenario, slot by slot, over the model's own code."""
+"""A batch of trials in memory, slot by slot, over the model's own code, in three modes.
+
+| mode | simulates | error |
+|---|---|---|
+| `exact` | states, packets and estimates: the bits of a live run | |x − x̂|² |
+| `error-coordinates` | the errors themselves, so that nothing cancels where the state has grown beyond precision | |e|² |
+| `covariance-only` | covariances given the events; draws no noise | tr of the actual covariance |
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from emulator.model import update
 from emulator.model.digest import BLOCK_SLOTS, BeliefLog, Digests
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.links import link_of
-from emulator.model.links.link import Fate, losses
-from emulator.model.process import Trajectory
-from emulator.model.receiver import Flags, Receiver, trace_of
+from emulator.model.links.link import Fate
+from emulator.model.process import Floats, ProcessNoise, Trajectory
+from emulator.model.receiver import Codes, Flags, Receiver, trace_of
 from emulator.model.schemes import SCHEMES
+from emulator.model.theory import misled_covariances
 from emulator.network.access import LEGITIMATE
 from emulator.run.briefs import StreamKeys
 from emulator.run.joined import ReceiverSlots, Slots
+from emulator.run.score import squared_errors
 from emulator.scenario import Scenario
 from emulator.streams import Batch
 
 _CHUNK_NUMBERS = 131_072  # states of a chunk of slots: about a megabyte an array
 
 
-class Simulation:
-    """The trials of a range, all slots. Final; `chunks` may be read once."""
+class Mode(StrEnum):
+    """What is simulated."""
 
-    def __init__(self, scenario: Scenario, trials: range, recorded: int) -> None:
+    EXACT = "exact"
+    ERROR_COORDINATES = "error-coordinates"
+    COVARIANCE_ONLY = "covariance-only"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One receiver over c slots of R trials."""
+
+    error: Floats
+    """By the mode, (c, R)."""
+    trace: Floats
+    """Believed tr P, (c, R)."""
+    action: Codes
+    """(c, R)."""
+    fates: Codes
+    """(c, R)."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Some slots, measured; its arrays are overwritten when the next one is made."""
+
+    first: int
+    receivers: Mapping[str, Measured]
+    recorded: Slots | None
+    """The recorded trials in full; exact mode only."""
+
+
+class Simulation:
+    """The trials of a range, all slots, of which the first `recorded` in full. Final; `chunks` may be read once."""
+
+    def __init__(self, scenario: Scenario, trials: range, recorded: int = 0, mode: Mode = Mode.EXACT) -> None:
         self._scenario = scenario
         self._recorded = recorded
+        self._mode = mode
         self._batch = Batch(scenario.slots, len(trials), trials.start)
         self._process = scenario.process.process
         self._keys = StreamKeys.of(scenario)
-        self._scheme = SCHEMES[scenario.encoding.scheme](self._process, scenario.encoding.mu_d)
-        self._secret = self._keys.secret(self._scheme.secret_streams)
+        scheme = SCHEMES[scenario.encoding.scheme](self._process, scenario.encoding.mu_d)
+        self._shared = scheme.shared(self._keys.secret(scheme.secret_streams), self._batch)
+        self._receivers: dict[str, Receiver] = {LEGITIMATE: self._shared.estimator()}
+        self._receivers.update({name: self._eavesdropper(name) for name in scenario.eavesdroppers})
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.receivers}
-        """Receiver → block number → digests, (R, 32)."""
+        """Receiver → block number → digests, (R, 32); filled by the exact mode alone."""
 
     def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
@@ -44,46 +90,142 @@ class Simulation:
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
         return STRATEGIES[table.strategy](knowledge, self._batch)
 
-    def chunks(self) -> Iterator[Slots]:
-        """All slots, some tens or hundreds at a time; a chunk's arrays are overwritten when the next one is made."""
-        n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
+    def chunks(self) -> Iterator[Chunk]:
+        """All slots, some tens or hundreds at a time."""
+        slots, trials = self._batch.slots, self._batch.trials
         names = self._scenario.receivers
-        trajectory = Trajectory(self._process, self._keys.process, self._batch)
-        encoder, estimator = self._scheme.pair(self._secret, self._batch)
-        receivers = {LEGITIMATE: estimator}
-        receivers.update({name: self._eavesdropper(name) for name in self._scenario.eavesdroppers})
         links = {name: link_of(self._scenario.link(name).spec, self._keys.link(name), self._batch) for name in names}
-        beliefs = {name: receivers[name].prior() for name in names}
-        logs = {name: BeliefLog(n, trials, slots) for name in names}
-        length = max(1, min(slots, BLOCK_SLOTS, _CHUNK_NUMBERS // (n * trials)))
+        play = {
+            Mode.EXACT: self._exact,
+            Mode.ERROR_COORDINATES: self._error_coordinates,
+            Mode.COVARIANCE_ONLY: self._covariances,
+        }[self._mode]()
+        length = max(1, min(slots, BLOCK_SLOTS, _CHUNK_NUMBERS // (self._process.n * trials)))
         for block in range(0, slots, BLOCK_SLOTS):
             end = min(block + BLOCK_SLOTS, slots)
             for first in range(block, end, length):
                 chunk = range(first, min(first + length, end))
-                x = np.empty((len(chunk), n, trials))
-                nu = np.empty((len(chunk), trials), np.bool_)
-                fates = {name: links[name].fates(chunk) for name in names}
-                delivered = {name: fates[name] == Fate.DELIVERED for name in names}
-                for row, k in enumerate(chunk):
-                    x[row] = trajectory.advance()
-                    packet = encoder.encode(k, x[row], trajectory.predicted)
-                    nu[row] = packet.nu
-                    for name in names:
-                        beliefs[name] = receivers[name].step(k, beliefs[name], delivered[name][row], packet.z)
-                        digests = logs[name].add(k, beliefs[name])
-                        if digests is not None:
-                            self.digests[name][k // BLOCK_SLOTS] = digests
-                yield Slots(
-                    chunk.start,
-                    x,
-                    nu,
-                    {name: self._slots(logs[name], chunk, delivered[name], losses(fates[name])) for name in names},
-                )
+                yield play(chunk, {name: links[name].fates(chunk) for name in names})
 
-    def _slots(
-        self, log: BeliefLog, slots: range, delivered: Flags, lost: Mapping[str, NDArray[np.uint32]]
-    ) -> ReceiverSlots:
-        rows = log.rows(slots.start, slots.stop)
-        trace = trace_of(rows.P.transpose(1, 2, 0, 3))
-        sums = np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1)
-        return ReceiverSlots(rows.x_hat, rows.action, rows.P[..., : self._recorded], sums, delivered, lost)
+    def _exact(self) -> Callable[[range, Mapping[str, Codes]], Chunk]:
+        n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
+        trajectory = Trajectory(self._process, self._keys.process, self._batch)
+        encoder = self._shared.encoder()
+        beliefs = {name: receiver.prior() for name, receiver in self._receivers.items()}
+        logs = {name: BeliefLog(n, trials, slots) for name in self._receivers}
+
+        def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
+            x = np.empty((len(chunk), n, trials))
+            nu = np.empty((len(chunk), trials), np.bool_)
+            delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
+            for row, k in enumerate(chunk):
+                x[row] = trajectory.advance()
+                packet = encoder.encode(k, x[row], trajectory.predicted)
+                nu[row] = packet.nu
+                for name, receiver in self._receivers.items():
+                    beliefs[name] = receiver.step(k, beliefs[name], delivered[name][row], packet.z)
+                    digests = logs[name].add(k, beliefs[name])
+                    if digests is not None:
+                        self.digests[name][k // BLOCK_SLOTS] = digests
+            rows = {name: log.rows(chunk.start, chunk.stop) for name, log in logs.items()}
+            measured = {
+                name: Measured(
+                    squared_errors(x, one.x_hat), trace_of(one.P.transpose(1, 2, 0, 3)), one.action, fates[name]
+                )
+                for name, one in rows.items()
+            }
+            if not self._recorded:
+                return Chunk(chunk.start, measured, None)
+            some = slice(0, self._recorded)
+            receivers = {
+                name: ReceiverSlots(
+                    one.x_hat[..., some],
+                    one.action[:, some],
+                    one.P[..., some],
+                    np.empty((len(chunk), 2)),
+                    delivered[name][:, some],
+                    {},
+                )
+                for name, one in rows.items()
+            }
+            return Chunk(chunk.start, measured, Slots(chunk.start, x[..., some], nu[:, some], receivers))
+
+        return play
+
+    def _error_coordinates(self) -> Callable[[range, Mapping[str, Codes]], Chunk]:
+        n, trials = self._process.n, self._batch.trials
+        noise = ProcessNoise(self._process, self._keys.process, self._batch)
+        # A state that nobody takes an innovation for is never needed, however large it grows.
+        misleads = bool(self._misled())
+        trajectory = Trajectory(self._process, self._keys.process, self._batch) if misleads else None
+        errors = {name: np.zeros((n, trials)) for name in self._receivers}
+        covariances = {name: receiver.prior().P for name, receiver in self._receivers.items()}
+
+        def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
+            measured = self._blank(chunk, fates)
+            for row, k in enumerate(chunk):
+                nu, w = self._shared.nu(k), noise.at(k)
+                if trajectory is not None:
+                    trajectory.advance()
+                for name, action, one in self._acts(k, row, measured):
+                    errors[name] = update.error(
+                        self._process,
+                        errors[name],
+                        action,
+                        nu,
+                        w,
+                        lambda k=k: trajectory.predicted - self._shared.chi(k),  # type: ignore[misc, union-attr]
+                    )
+                    covariances[name] = update.believed_covariance(self._process, k, covariances[name], action)
+                    one.error[row] = (errors[name] * errors[name]).sum(axis=0)
+                    one.trace[row] = trace_of(covariances[name])
+            return Chunk(chunk.start, measured, None)
+
+        return play
+
+    def _covariances(self) -> Callable[[range, Mapping[str, Codes]], Chunk]:
+        misled = self._misled()
+        f = misled_covariances(self._process, self._batch.slots) if misled else None
+        believed = {name: receiver.prior().P for name, receiver in self._receivers.items()}
+        actual = dict(believed)
+
+        def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
+            measured = self._blank(chunk, fates)
+            for row, k in enumerate(chunk):
+                nu = self._shared.nu(k)
+                for name, action, one in self._acts(k, row, measured):
+                    believed[name] = update.believed_covariance(self._process, k, believed[name], action)
+                    one.trace[row] = trace_of(believed[name])
+                    if f is not None and name in misled:
+                        actual[name] = update.actual_covariance(self._process, k, actual[name], action, nu, f[k])
+                        one.error[row] = trace_of(actual[name])
+                    else:
+                        one.error[row] = one.trace[row]
+            return Chunk(chunk.start, measured, None)
+
+        return play
+
+    def _misled(self) -> set[str]:
+        """Receivers that may take an innovation for the state."""
+        mixes = self._scenario.encoding.mu_d < 1.0
+        tables = self._scenario.eavesdroppers.items()
+        return {
+            name
+            for name, table in tables
+            if mixes and STRATEGIES[table.strategy].use_probabilities(table.parameters)[1] > 0.0
+        }
+
+    def _blank(self, chunk: range, fates: Mapping[str, Codes]) -> dict[str, Measured]:
+        shape = (len(chunk), self._batch.trials)
+        return {
+            name: Measured(np.empty(shape), np.empty(shape), np.empty(shape, np.uint8), codes)
+            for name, codes in fates.items()
+        }
+
+    def _acts(self, k: int, row: int, measured: Mapping[str, Measured]) -> Iterator[tuple[str, Codes, Measured]]:
+        """Every receiver's action in slot k."""
+        for name, one in measured.items():
+            gamma: Flags = one.fates[row] == Fate.DELIVERED
+            action = self._receivers[name].act(k, gamma)
+            one.action[row] = action
+            yield name, action, one

@@ -111,7 +111,7 @@ def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: 
         perfect = Verdict.FAILED
     else:
         perfect = _perfect(other_means, user_means, user_bound) if complete else Verdict.UNDECIDED
-    ratio = other.squared_error / user.squared_error if user.squared_error else math.inf
+    ratio = other.error / user.error if user.error else math.inf
     return Secrecy(
         name,
         relative,

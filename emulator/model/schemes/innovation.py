@@ -10,11 +10,11 @@ from emulator.model import update
 from emulator.model.process import Floats, Process, StateFactors, product
 from emulator.model.receiver import Action, Belief, Codes, Flags, Receiver, select
 from emulator.model.schedule import Schedule
-from emulator.model.schemes.scheme import Encoder, Packet, Scheme
+from emulator.model.schemes.scheme import Encoder, Packet, Scheme, Shared
 from emulator.streams import Batch, BlockReader
 
 
-class SharedSecret:
+class SharedSecret(Shared):
     """ν_k and χ_k of every slot, from the streams `schedule` and `noise`.
 
     Final. χ_k = A L_{k−1} ξ_k with L Lᵀ = Σ_{k−1} factored by QR. Addressed by slot: a lost packet desynchronises
@@ -27,7 +27,8 @@ class SharedSecret:
         self._schedule = Schedule(keys["schedule"], state_probability, batch)
         self._reader = BlockReader(keys["noise"], batch, process.n)
         self._factors = StateFactors(process)
-        self._n = process.n
+        self._process = process
+        self._trials = batch.trials
         self._slots = range(0)
         self._chi: Floats
 
@@ -39,11 +40,19 @@ class SharedSecret:
         """χ_k ~ N(0, A Σ_{k−1} Aᵀ), (n, R); 0 at k = 0."""
         if k not in self._slots:
             self._slots = self._reader.block(k)
-            zero = [[0.0] * self._n for _ in range(self._n)]
+            zero = [[0.0] * self._process.n for _ in range(self._process.n)]
             factors = np.array([self._factors.carried(slot) if slot else zero for slot in self._slots])
             self._chi = product(factors, self._reader.normals(self._slots))
         chi: Floats = self._chi[k - self._slots.start]
         return chi
+
+    def encoder(self) -> Encoder:
+        """The sensor's side."""
+        return InnovationEncoder(self)
+
+    def estimator(self) -> Receiver:
+        """The legitimate estimator's side."""
+        return InnovationEstimator(self._process, self._trials, self)
 
 
 class InnovationEncoder(Encoder):
@@ -94,18 +103,6 @@ class Innovation(Scheme):
     secret_streams = ("schedule", "noise")
     mixes = True
 
-    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
-        """The sensor's side."""
-        return InnovationEncoder(self._secret(keys, batch))
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
-        """The legitimate estimator's side."""
-        return InnovationEstimator(self.process, batch.trials, self._secret(keys, batch))
-
-    def pair(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[Encoder, Receiver]:
-        """Both sides, with one secret between them."""
-        secret = self._secret(keys, batch)
-        return InnovationEncoder(secret), InnovationEstimator(self.process, batch.trials, secret)
-
-    def _secret(self, keys: Mapping[str, bytes], batch: Batch) -> SharedSecret:
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """Schedule and noise."""
         return SharedSecret(self.process, self.state_probability, keys, batch)

@@ -28,6 +28,26 @@ class Encoder(ABC):
         """The packet of slot k, from x_k and A x_{k−1}, both (n, R)."""
 
 
+class Shared(ABC):
+    """What sensor and legitimate estimator share, and the two sides made from it. Read ahead in blocks; slots in order."""
+
+    @abstractmethod
+    def nu(self, k: int) -> Flags:
+        """ν_k, (R,): true for an innovation."""
+
+    @abstractmethod
+    def chi(self, k: int) -> Floats:
+        """χ_k, (n, R): the noise that hides an innovation."""
+
+    @abstractmethod
+    def encoder(self) -> Encoder:
+        """The sensor's side."""
+
+    @abstractmethod
+    def estimator(self) -> Receiver:
+        """The legitimate estimator's side."""
+
+
 class Scheme(ABC):
     """One way to fill packets. `state_probability` is μ_d, public; the keys of `secret_streams` are the secret."""
 
@@ -40,13 +60,13 @@ class Scheme(ABC):
         self.state_probability = state_probability
 
     @abstractmethod
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """What the two sides share; keys holds those of `secret_streams`."""
+
     def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
-        """The sensor's side; keys holds those of `secret_streams`."""
+        """The sensor's side alone."""
+        return self.shared(keys, batch).encoder()
 
-    def pair(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[Encoder, Receiver]:
-        """Both sides in one process; a scheme may let them draw what they share only once."""
-        return self.encoder(keys, batch), self.estimator(keys, batch)
-
-    @abstractmethod
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
-        """The legitimate estimator's side; keys holds those of `secret_streams`."""
+        """The legitimate estimator's side alone."""
+        return self.shared(keys, batch).estimator()

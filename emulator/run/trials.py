@@ -1,0 +1,143 @@
+"""Batches of trials as tasks: what a worker is told, what it does, what it gives back.
+
+Sums are kept for fixed blocks of 500 trials, however many a worker simulates side by side, so results do not depend on
+how the work was spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from emulator.model.digest import Digests
+from emulator.model.links.link import Fate, losses
+from emulator.model.process import Floats
+from emulator.run.histogram import SlotHistograms
+from emulator.run.joined import Slots
+from emulator.run.score import SlotSums, Tally, slot_sums, squared_errors
+from emulator.run.scorekeeper import expected_traces_of
+from emulator.run.simulation import Chunk, Measured, Mode, Simulation
+from emulator.scenario import Scenario
+
+BLOCK_TRIALS = 500
+_SIDE_BY_SIDE = 4  # blocks: what a call of numpy costs is spread over more trials, and the state still fits the cache
+
+
+@dataclass(frozen=True)
+class Task:
+    """Some consecutive blocks of trials of a scenario."""
+
+    scenario: dict[str, Any]
+    """As `Scenario.model_dump` gives it."""
+    mode: Mode
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """What one block of trials came to: everything by receiver."""
+
+    start: int
+    trials: int
+    sums: dict[str, SlotSums]
+    tallies: dict[str, Tally]
+    digests: dict[str, dict[int, Digests]]
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What a task came to."""
+
+    start: int
+    blocks: list[Block]
+    errors: dict[str, SlotHistograms]
+    traces: dict[str, SlotHistograms]
+    recorded: list[tuple[Slots, dict[str, Floats]]] = field(default_factory=list)
+    """The recorded trials of the task, with their squared errors."""
+
+
+def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
+    """The work, in trial order."""
+    blocks = -(-scenario.trials // BLOCK_TRIALS)
+    length = BLOCK_TRIALS * max(1, min(_SIDE_BY_SIDE, -(-blocks // workers)))
+    first, end = scenario.first_trial, scenario.first_trial + scenario.trials
+    tables = scenario.model_dump(mode="json")
+    return [Task(tables, mode, start, min(start + length, end)) for start in range(first, end, length)]
+
+
+def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:
+    """Simulate a task. `tell` gets the trial-slots done since it was last called; it ends early once `stopped`."""
+    scenario = Scenario.model_validate(task.scenario)
+    names, slots = scenario.receivers, scenario.slots
+    trials = range(task.start, task.stop)
+    recorded = max(0, min(scenario.first_trial + scenario.record_trials, task.stop) - task.start)
+    simulation = Simulation(scenario, trials, recorded if task.mode is Mode.EXACT else 0, task.mode)
+    scale = float(np.trace(scenario.process.process.Q))
+    result = BatchResult(
+        task.start,
+        [_empty_block(names, slots, start, task.stop) for start in trials[::BLOCK_TRIALS]],
+        {name: SlotHistograms(slots, scale) for name in names},
+        {name: SlotHistograms(slots, scale) for name in names},
+    )
+    expected = expected_traces_of(scenario)
+    for chunk in simulation.chunks():
+        _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
+        if chunk.recorded is not None:
+            errors = {
+                name: squared_errors(chunk.recorded.x, one.x_hat) for name, one in chunk.recorded.receivers.items()
+            }
+            result.recorded.append((chunk.recorded.copied(), errors))
+        tell(len(trials) * _count(chunk))
+        if stopped():
+            break
+    for block in result.blocks:
+        rows = slice(block.start - task.start, block.start - task.start + block.trials)
+        for name, digests in simulation.digests.items():
+            block.digests[name] = {number: values[rows] for number, values in digests.items()}
+    return result
+
+
+def _empty_block(names: tuple[str, ...], slots: int, start: int, stop: int) -> Block:
+    trials = min(BLOCK_TRIALS, stop - start)
+    return Block(
+        start,
+        trials,
+        {name: SlotSums.zero(slots) for name in names},
+        {name: Tally(slots, trials) for name in names},
+        {},
+    )
+
+
+def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None:
+    for name, measured in chunk.receivers.items():
+        for block, part in _parts(result.blocks, result.start, measured):
+            trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
+            sums = slot_sums(part.error, part.action, trace)
+            block.sums[name].add(chunk.first, sums)
+            block.tallies[name].add(chunk.first, part.error, sums, expected[name])
+            block.tallies[name].account(part.fates == Fate.DELIVERED, part.action, losses(part.fates))
+        result.errors[name].add(chunk.first, measured.error)
+        result.traces[name].add(chunk.first, measured.trace)
+
+
+def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tuple[Block, Measured]]:
+    """What was measured, block by block."""
+    for block in blocks:
+        rows = slice(block.start - start, block.start - start + block.trials)
+        yield (
+            block,
+            Measured(
+                measured.error[:, rows],
+                measured.trace[:, rows],
+                measured.action[:, rows],
+                measured.fates[:, rows],
+            ),
+        )
+
+
+def _count(chunk: Chunk) -> int:
+    return len(next(iter(chunk.receivers.values())).error)
