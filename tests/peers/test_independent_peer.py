@@ -1,0 +1,137 @@
+"""A legitimate estimator written from docs/protocol.md alone agrees with ours to the last bit."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from independent_legitimate import Estimator
+
+from emulator.model.digest import RunDigest
+from emulator.model.process import Trajectory
+from emulator.model.schemes import SCHEMES
+from emulator.network import wire
+from emulator.run.briefs import Observation, StreamKeys, briefs_of
+from emulator.run.launcher import free_port
+from emulator.run.results import load_results
+from emulator.run.simulation import Simulation
+from emulator.scenario import Scenario, load
+from emulator.streams import Batch
+
+PEER = Path(__file__).with_name("independent_legitimate.py")
+THREE_STATES = {
+    "A": [[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]],
+    "Q": [[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]],
+    "initial_covariance": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]],
+}
+UNSTABLE = {
+    "A": [[1.0, 0.3], [0.5, 1.001]],
+    "Q": [[1e-3, 2e-4], [2e-4, 1e-3]],
+    "initial_covariance": [[1.0, 0.5], [0.5, 1.0]],
+}
+
+
+def scenario_of(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> Scenario:
+    """A scenario without eavesdroppers."""
+    return Scenario.model_validate(
+        {
+            "title": "Independent",
+            "slots": slots,
+            "seed": 5,
+            "trials": 9,
+            "first_trial": first_trial,
+            "record_trials": 2,
+            "process": process,
+            "encoding": {"scheme": "innovation", "state_probability": 0.4},
+            "legitimate": {"link": {"quality": 0.7}},
+        }
+    )
+
+
+@pytest.mark.parametrize(("process", "slots", "first_trial"), [(THREE_STATES, 300, 0), (UNSTABLE, 60, 12_345)])
+def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> None:
+    """Fed with the deliveries of a run, it has our digest, and reports what we report."""
+    scenario = scenario_of(process, slots, first_trial)
+    keys, batch = StreamKeys.of(scenario), Batch(slots, 9, first_trial)
+    made = briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
+    model = scenario.process.process
+    trajectory = Trajectory(model, keys.process, batch)
+    secret = keys.secret(("schedule", "noise"))
+    encoder = SCHEMES["innovation"](model, 0.4).encoder(secret, batch)
+    simulation = Simulation(scenario, range(first_trial, first_trial + 9), 2)
+    for chunk in simulation.chunks():
+        ours = chunk.receivers["legitimate"]
+        for row in range(chunk.count):
+            k = chunk.first + row
+            z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
+            gamma = ours.delivered[row]
+            mask = np.packbits(gamma, bitorder="little").tobytes()
+            peer.receive(wire.delivery(k, mask, z[:, gamma].tobytes()))
+        report = wire.read_report("telemetry", peer.report(), chunk.first, (model.n, 9), 2)
+        assert np.array_equal(report.x_hat, ours.x_hat)
+        assert np.array_equal(report.action, ours.action)
+        assert np.array_equal(report.P, ours.P)
+        assert np.allclose(report.trace, ours.trace, rtol=1e-12)
+    digest = RunDigest()
+    digest.add(simulation.digests["legitimate"])
+    assert peer.digest() == digest.hexadecimal
+
+
+def test_it_refuses_a_gap() -> None:
+    """A slot that is not due is an error, as the protocol says."""
+    scenario = scenario_of(UNSTABLE, 10, 0)
+    made = briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
+    with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
+        peer.receive(wire.delivery(1, b"\0\0", b""))
+
+
+def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
+    """In the place of our estimator, among our router, sensor, eavesdroppers and observer, it ends with our digest."""
+    scenario = load("eavesdroppers", {"slots": 300, "trials": 2})
+    out = tmp_path / "out"
+    (out / "logs").mkdir(parents=True)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    briefs = briefs_of(scenario, endpoint, Observation(out, False, None), ends_with_stdin=False)
+    with ExitStack() as stack:
+        running = {}
+        for name, brief in briefs.items():
+            program = [str(PEER)] if name == "legitimate" else ["-m", "emulator", brief.role]
+            running[name] = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, *program, str(brief.write(tmp_path))],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                )
+            )
+            stack.callback(running[name].kill)
+        said = {name: process.communicate(timeout=40)[0] for name, process in running.items()}
+        statuses = {name: process.returncode for name, process in running.items()}
+    assert set(statuses.values()) <= {0, 1}, (statuses, said)
+    simulation = Simulation(scenario, range(2), 1)
+    for _ in simulation.chunks():
+        pass
+    digest = RunDigest()
+    digest.add(simulation.digests["legitimate"])
+    summary = load_results(out).summary
+    assert summary["peers"]["legitimate"]["digest"] == digest.hexadecimal
+    assert said["legitimate"].strip() == digest.hexadecimal
+
+
+def test_it_is_independent() -> None:
+    """It imports neither this project nor numpy."""
+    assert not [
+        line for line in PEER.read_text().splitlines() if line.split()[:2] in (["import", "numpy"], ["from", "numpy"])
+    ]
+    code = f"import sys; sys.path.insert(0, {str(PEER.parent)!r}); import independent_legitimate; print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"emulator", "peers", "numpy"} & set(modules)

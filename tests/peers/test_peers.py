@@ -1,0 +1,341 @@
+"""Each peer's program, driven through a session that the test plays: what it refuses, and how far it goes alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from queue import SimpleQueue
+from types import SimpleNamespace
+from typing import Any, Self
+
+import msgpack
+import numpy as np
+import pytest
+
+import peers.following
+import peers.sensor
+from emulator.brief import Brief, Flow
+from emulator.errors import Gap, MalformedMessage
+from emulator.network import wire
+from emulator.network.access import Keys
+from emulator.network.reporting import is_due
+from emulator.run.briefs import Observation, briefs_of
+from emulator.scenario import Scenario
+from peers.eavesdropper import eavesdrop
+from peers.legitimate import estimate
+from peers.sensor import Window, sense
+
+WINDOW, BATCH, SLOTS = 12, 4, 50
+
+
+def scenario_of(**changes: Any) -> Scenario:
+    """A small scenario with one eavesdropper of each strategy."""
+    table = {
+        "title": "Peers",
+        "slots": SLOTS,
+        "trials": 3,
+        "process": {
+            "A": [[1.0, 0.1], [0.0, 1.0]],
+            "Q": [[1e-3, 0.0], [0.0, 1e-3]],
+            "initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+        },
+        "encoding": {"scheme": "innovation", "state_probability": 0.5},
+        "legitimate": {"link": {"quality": 0.8}},
+        "eavesdroppers": {
+            "naive": {"strategy": "naive", "link": {"quality": 0.8}},
+            "smart": {"strategy": "smart", "link": {"quality": 0.8}},
+            "suspicious": {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, "link": {"quality": 0.8}},
+        },
+    }
+    return Scenario.model_validate({**table, **changes})
+
+
+def briefs(**changes: Any) -> dict[str, Brief]:
+    """Briefs with a small window."""
+    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
+
+
+@dataclass
+class Stage:
+    """What a peer's session would carry: the test fills the inboxes and reads what was put."""
+
+    inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
+    funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
+    put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
+    commands: SimpleQueue[str] = field(default_factory=SimpleQueue)
+
+    def session(self, brief: Brief) -> FakeSession:
+        """In the place of `Session`."""
+        return FakeSession(self, Keys(brief.run))
+
+    def fill(self, key: str, messages: list[bytes]) -> None:
+        """Put messages into an inbox."""
+        queue = self.inboxes.setdefault(key, SimpleQueue())
+        for message in messages:
+            queue.put(message)
+
+    def all(self, key: str) -> list[bytes]:
+        """All messages that were put on a key; the others are dropped."""
+        found = []
+        while not self.put.empty():
+            where, payload = self.put.get()
+            if where == key:
+                found.append(payload)
+        return found
+
+
+class FakeSession:
+    """The part of `Session` that peers use."""
+
+    def __init__(self, stage: Stage, keys: Keys) -> None:
+        self._stage = stage
+        self.keys = keys
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stage.put.put(("closed", b""))
+
+    def inbox(self, key: str) -> Any:
+        """An inbox whose `recv` never waits for longer than a test may."""
+        queue = self._stage.inboxes.setdefault(key, SimpleQueue())
+
+        def recv() -> Any:
+            payload = queue.get(timeout=20)
+            return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+
+        return SimpleNamespace(recv=recv)
+
+    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+        """As the real one, called by the test."""
+        self._stage.funnels[key] = receive
+
+    def outlet(self, key: str) -> Callable[[bytes], None]:
+        """Puts into the stage."""
+        return lambda payload: self._stage.put.put((key, payload))
+
+    def ready(self) -> None:
+        """Nobody to wait for."""
+
+    def wait_for(self, command: str) -> None:
+        """Until the test commands it."""
+        while self._stage.commands.get(timeout=20) != command:
+            pass
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
+    """A stage in the place of the network."""
+    one = Stage()
+    monkeypatch.setattr(peers.following, "Session", one.session)
+    monkeypatch.setattr(peers.sensor, "Session", one.session)
+    yield one
+    one.commands.put("end")
+
+
+def deliveries(count: int = SLOTS) -> list[bytes]:
+    """Deliveries in which trial k mod 3 is lost."""
+    made = []
+    for k in range(count):
+        gamma = np.arange(3) != k % 3
+        made.append(wire.delivery(k, wire.packed_flags(gamma).tobytes(), np.full((2, 2), float(k)).tobytes()))
+    return made
+
+
+RECEIVERS = {"legitimate": estimate, "naive": eavesdrop, "smart": eavesdrop, "suspicious": eavesdrop}
+
+
+@pytest.mark.parametrize("name", RECEIVERS)
+def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
+    """A receiver's reports cover all slots without gap, with progress after each batch, and it leaves on `end`."""
+    brief = briefs()[name]
+    keys = Keys(brief.run)
+    stage.fill(keys.downlink(name), deliveries())
+    stage.commands.put("end")
+    RECEIVERS[name](brief)
+    put = []
+    while not stage.put.empty():
+        put.append(stage.put.get())
+    assert put.pop() == ("closed", b"")
+    end, blocks = 0, {}
+    for key, payload in put:
+        if key == keys.telemetry(name):
+            report = wire.read_report(key, payload, end, (2, 3), 1)
+            end, blocks = end + report.count, {**blocks, **report.digests}
+            lost = (np.arange(end - report.count, end) % 3)[:, None] == np.arange(3)
+            assert np.array_equal(report.action == 0, lost)
+        else:
+            assert key == keys.progress(name)
+            assert wire.read_progress(key, payload) == end
+    assert end == SLOTS
+    assert set(blocks) == {0}
+
+
+@pytest.mark.parametrize("name", RECEIVERS)
+@pytest.mark.parametrize("batch", [1, 100, 256, 300])
+def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage) -> None:
+    """However slots are batched, also across a digest's block, the same estimates and digests are reported."""
+    found = []
+    for flow in (Flow(1024, 7), Flow(1024, batch)):
+        brief = replace(briefs(slots=600)[name], flow=flow, run="r")
+        stage.fill(Keys("r").downlink(name), deliveries(600))
+        stage.commands.put("end")
+        RECEIVERS[name](brief)
+        end, x_hat, P, blocks = 0, [], [], {}
+        for payload in stage.all(Keys("r").telemetry(name)):
+            report = wire.read_report("", payload, end, (2, 3), 1)
+            end += report.count
+            x_hat.append(report.x_hat)
+            P.append(report.P)
+            blocks |= {block: digests.tobytes() for block, digests in report.digests.items()}
+        found.append((end, np.concatenate(x_hat).tobytes(), np.concatenate(P).tobytes(), blocks))
+    assert found[0] == found[1]
+    assert set(found[0][3]) == {0, 1, 2}
+
+
+GOOD = deliveries()
+BAD = {
+    "a slot is missing": ([GOOD[0], GOOD[2]], Gap, r"gap on evedrop/.*/downlink/\w+: slot 2 arrived where slot 1"),
+    "a slot comes twice": ([GOOD[0], GOOD[0]], Gap, "slot 0 arrived where slot 1 was due"),
+    "no msgpack": ([b"\xc1"], MalformedMessage, r"malformed message on evedrop/.*/downlink/\w+: not msgpack"),
+    "z too short": ([GOOD[0][:-8]], MalformedMessage, "not msgpack"),
+    "mask too long": ([wire.delivery(0, b"\1\0", b"")], MalformedMessage, "gamma of 2 bytes; expected 1 bytes"),
+    "z missing": ([wire.delivery(0, b"\1", b"")], MalformedMessage, "z of None; expected 16 bytes"),
+    "z for nobody": ([wire.delivery(0, b"\0", bytes(16))], MalformedMessage, "z although nothing was received"),
+    "not finite": ([wire.delivery(0, b"\1", np.full(2, np.inf).tobytes())], MalformedMessage, "NaN or infinity"),
+    "slot as text": ([msgpack.packb({"k": "0", "gamma": b"\0"})], MalformedMessage, "k = '0'"),
+    "slot as truth": ([msgpack.packb({"k": False, "gamma": b"\0"})], MalformedMessage, "k = False"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+@pytest.mark.parametrize("name", ["legitimate", "suspicious"])
+def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
+    """A gap, a doubled slot or a malformed delivery ends a receiver with an error that names the key and what was due."""
+    messages, error, text = BAD[what]
+    brief = briefs()[name]
+    stage.fill(Keys(brief.run).downlink(name), messages)
+    with pytest.raises(error, match=text) as caught:
+        RECEIVERS[name](brief)
+    assert caught.value.exit_status == 3
+
+
+class Sensing:
+    """A sensor in a thread of its own."""
+
+    def __init__(self, stage: Stage, brief: Brief) -> None:
+        self.stage = stage
+        self.keys = Keys(brief.run)
+        self.thread = threading.Thread(target=sense, args=(brief,), daemon=True)
+        self.thread.start()
+
+    def next(self) -> tuple[str, bytes]:
+        """What it puts next."""
+        return self.stage.put.get(timeout=20)
+
+    def packets(self, first: int, end: int) -> None:
+        """It sends exactly these packets, with its telemetry at the ends of batches, and nothing more."""
+        told = first - first % BATCH
+        for k in range(first, end):
+            key, payload = self.next()
+            assert key == self.keys.uplink
+            wire.read_uplink(key, payload, k, (2, 3))
+            if (k + 1) % BATCH == 0 or k + 1 == SLOTS:
+                key, payload = self.next()
+                assert key == self.keys.telemetry("sensor")
+                told += wire.read_truth(key, payload, told, (2, 3)).count
+                assert told == k + 1
+
+    def progress(self, name: str, k: int) -> None:
+        """Somebody reports progress."""
+        self.stage.funnels[self.keys.progress(name)](wire.progress(k))
+
+
+def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
+    """It waits for `start`, sends a window, then what the slowest of receivers and observer lets it, and ends on `end`."""
+    brief = briefs()["sensor"]
+    sensing = Sensing(stage, brief)
+    assert stage.put.empty()
+    stage.commands.put("start")
+    sensing.packets(0, WINDOW)
+    everybody = [*brief.part["receivers"], "observer"]
+    assert len(everybody) == 5
+    for name in everybody[:-1]:
+        sensing.progress(name, 40)
+    sent = WINDOW
+    for done in (4, 8, 20):  # the observer alone is behind: each of its reports lets exactly as many slots through
+        sensing.progress("observer", done)
+        sensing.packets(sent, sent := done + WINDOW)
+    sensing.progress("observer", SLOTS)
+    sensing.packets(WINDOW + 20, SLOTS)
+    stage.commands.put("end")
+    sensing.thread.join(20)
+    assert stage.put.get(timeout=20) == ("closed", b"")
+    assert stage.put.empty()
+
+
+class WouldWaitError(Exception):
+    """The sensor would have to wait for news."""
+
+
+class News(SimpleQueue[tuple[str, bytes]]):
+    """A queue that says so instead of waiting."""
+
+    def get(self, *_: Any) -> tuple[str, bytes]:
+        """The next news that is there."""
+        if self.empty():
+            raise WouldWaitError
+        return super().get()
+
+
+@pytest.mark.parametrize("slowest", ["a", "b", "observer"])
+def test_sensor_is_never_a_window_ahead_of_the_slowest(
+    slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
+    monkeypatch.setattr(peers.sensor, "SimpleQueue", News)
+    followers = ("a", "b", "observer")
+    session = stage.session(briefs()["sensor"])
+    window = Window(session, followers, 10)  # type: ignore[arg-type]
+
+    def reaches(limit: int) -> None:
+        window.wait(limit - 1)
+        with pytest.raises(WouldWaitError):
+            window.wait(limit)
+
+    def report(name: str, k: int) -> None:
+        stage.funnels[session.keys.progress(name)](wire.progress(k))
+
+    reaches(10)
+    for name in set(followers) - {slowest}:
+        report(name, 1000)
+        reaches(10)
+    report(slowest, 7)
+    reaches(17)
+    report(slowest, 3)  # progress never goes back
+    reaches(17)
+    report(slowest, 2000)
+    reaches(1010)
+
+
+def test_sensor_refuses_malformed_progress(stage: Stage) -> None:
+    """Progress that is not as documented is an error that names its key."""
+    session = stage.session(briefs()["sensor"])
+    window = Window(session, ("a",), 1)  # type: ignore[arg-type]
+    stage.funnels[session.keys.progress("a")](msgpack.packb({"k": 1.5}))
+    with pytest.raises(MalformedMessage, match=r"progress/a: k = 1.5"):
+        window.wait(1)
+
+
+@pytest.mark.parametrize("window", range(2, 40))
+def test_a_full_window_always_holds_the_end_of_a_batch(window: int) -> None:
+    """Whatever has been reported, some report is due within the next window: no two can wait for each other."""
+    for batch in range(1, window + 1):
+        brief = replace(briefs()["sensor"], flow=Flow(window, batch), slots=101)
+        ends = [0, *(k + 1 for k in range(101) if is_due(brief, k))]
+        assert ends[-1] == 101
+        assert max(np.diff(ends)) <= window
