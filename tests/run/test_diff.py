@@ -8,7 +8,7 @@ from typing import Any
 import pyarrow.compute as pc
 import pytest
 
-from emulator import load_results, montecarlo
+from emulator.api import load_results, montecarlo
 from emulator.errors import UsageError
 from emulator.run.diff import difference
 from emulator.run.results import Results

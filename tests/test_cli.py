@@ -1,0 +1,265 @@
+"""The command line: exit statuses, what is printed, and what is refused before anything is started."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from emulator.run.results import load_results
+from emulator.scenario import shipped
+from tests.conftest import Done, Evedrop
+
+QUICK = ("--slots", "40", "--view", "off")
+
+
+@contextlib.contextmanager
+def taken_port() -> Iterator[int]:
+    """A loopback port on which somebody listens."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        yield int(listener.getsockname()[1])
+
+
+def refused(done: Done, said: str) -> None:
+    """Check a command that was refused: exit 2 and one line."""
+    assert done.status == 2
+    assert done.out == ""
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: ")
+    assert said in line
+
+
+def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
+    """A table with every receiver, a sentence on every eavesdropper, and where the results are."""
+    done = evedrop("run", "eavesdroppers", *QUICK, "--out", "here")
+    assert (done.status, done.err) == (0, "")
+    for words in ("legitimate", "smart:", "naive:", "suspicious:", "expected legitimate.mean_squared_error", "here"):
+        assert words in done.out
+    files = {path.name for path in (evedrop.folder / "here").iterdir()}
+    assert files == {
+        "scenario.toml", "summary.json", "slots.parquet", "trials.parquet", "journal.parquet", "digests.parquet", "logs",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["run", "montecarlo"])
+def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str) -> None:
+    """Standard output is the summary of summary.json; standard error is silent."""
+    view = ("--view", "off") if command == "run" else ()
+    done = evedrop(command, "eavesdroppers", "--slots", "40", "--trials", "2", *view, "--json", "--out", "here")
+    assert (done.status, done.err) == (0, "")
+    assert done.out.count("\n") == 1
+    assert done.summary == load_results(evedrop.folder / "here").summary
+    assert done.summary["trials"] == 2
+
+
+@pytest.mark.parametrize("command", ["run", "montecarlo"])
+def test_a_failed_expectation_is_exit_1(evedrop: Evedrop, command: str) -> None:
+    """The run is whole, and what did not hold is printed with what was found."""
+    view = ("--view", "off") if command == "run" else ("--trials", "1")
+    done = evedrop(command, "eavesdroppers", "--slots", "40", *view, "--set", "expect.0.below=1e-9", "--out", "here")
+    assert (done.status, done.err) == (1, "")
+    assert "expected legitimate.mean_squared_error below 1e-09: FAILED, found" in done.out
+    assert load_results(evedrop.folder / "here").summary["expectations"][0]["held"] is False
+
+
+def test_a_scenario_with_mistakes_starts_nothing(evedrop: Evedrop) -> None:
+    """Every mistake, a line each, exit 2, no results folder."""
+    done = evedrop(
+        "run", "eavesdroppers", *QUICK, "--set", "sluts=3", "--set", "legitimate.link.quality=7", "--out", "x"
+    )
+    assert (done.status, done.out) == (2, "")
+    assert done.err.splitlines() == [
+        "evedrop: eavesdroppers: 2 mistakes, nothing was started",
+        "  legitimate.link.quality: is 7; expected a number from 0 to 1, such as 0.9",
+        "  sluts: is no entry of this table; did you mean slots?",
+    ]
+    assert not (evedrop.folder / "x").exists()
+
+
+def test_an_unbounded_estimator_is_warned_of_and_run(evedrop: Evedrop) -> None:
+    """The warning goes to standard error with bound and value; the run is a run."""
+    done = evedrop("montecarlo", "numerical", "--trials", "1", "--set", "legitimate.link.quality=0.2", "--out", "x")
+    assert done.status == 0
+    assert re.search(r"warning: .*without bound: .*0\.56.*0\.2.*must exceed 2\.4", done.err)
+
+
+def test_a_taken_port_is_refused(evedrop: Evedrop) -> None:
+    """--listen with a port that somebody has: one line, no folder."""
+    with taken_port() as port:
+        done = evedrop("run", "eavesdroppers", *QUICK, "--listen", f"tcp/127.0.0.1:{port}", "--out", "x")
+    refused(done, "Address already in use")
+    assert not (evedrop.folder / "x").exists()
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/127.0.0.1:0", "tcp/127.0.0.1:65536", "tcp/0.0.0.0:17447", "udp/127.0.0.1:17447", "17447"]
+)
+def test_an_endpoint_that_is_none_is_refused(evedrop: Evedrop, endpoint: str) -> None:
+    """A port beyond those there are, every interface, another protocol, no address."""
+    refused(evedrop("run", "eavesdroppers", *QUICK, "--listen", endpoint, "--out", "x"), "no loopback endpoint")
+
+
+def test_a_results_folder_must_be_new_or_empty(evedrop: Evedrop) -> None:
+    """A folder with something in it, a file, and a place under a file are refused; an empty folder is taken."""
+    (evedrop.folder / "full").mkdir()
+    (evedrop.folder / "full" / "file").touch()
+    (evedrop.folder / "empty").mkdir()
+    montecarlo = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "1", "--out")
+    refused(evedrop(*montecarlo, "full"), "full is not empty; give another --out, or empty it")
+    refused(evedrop(*montecarlo, "full/file"), "full/file is a file; give another --out")
+    refused(evedrop(*montecarlo, "full/file/x"), "a part of it is a file; give another --out")
+    assert evedrop(*montecarlo, "empty").status == 0
+    assert [path.name for path in (evedrop.folder / "full").iterdir()] == ["file"]
+
+
+def unwritable(folder: Path) -> str:
+    """A folder that nobody may write to: one without permission, or for root one of the kernel's."""
+    if os.geteuid() == 0:
+        return "/proc"
+    (folder / "locked").mkdir(mode=0o500)
+    return str(folder / "locked")
+
+
+def test_without_permission_nothing_is_started(evedrop: Evedrop) -> None:
+    """One line that names the folder."""
+    where = unwritable(evedrop.folder)
+    refused(evedrop("run", "eavesdroppers", *QUICK, "--out", f"{where}/x"), f"{where}/x cannot be written (")
+
+
+def test_a_folder_that_may_only_be_read_can_be_worked_in(evedrop: Evedrop) -> None:
+    """The current folder is written to only where no --out is given, and then the refusal is one line."""
+    where = unwritable(evedrop.folder)
+    done = evedrop("run", "eavesdroppers", *QUICK, "--out", str(evedrop.folder / "x"), cwd=where)
+    assert done.status == 0
+    refused(evedrop("run", "eavesdroppers", *QUICK, cwd=where), "cannot be written (")
+
+
+def test_two_runs_at_once_do_not_meet(evedrop: Evedrop) -> None:
+    """Ports, keys and folders are a run's own."""
+    runs = [evedrop.live("eavesdroppers", "--slots", "600", "--seed", str(seed), out=f"run{seed}") for seed in (1, 2)]
+    assert [live.end().status for live in runs] == [0, 0]
+    for seed, live in zip((1, 2), runs, strict=True):
+        alone = evedrop("montecarlo", "eavesdroppers", "--slots", "600", "--trials", "1", "--seed", str(seed), "--json",
+                        "--out", f"alone{seed}")  # fmt: skip
+        found = {name: peer["digest"] for name, peer in live.results.summary["peers"].items()}
+        assert found == {name: peer["digest"] for name, peer in alone.summary["peers"].items()}
+
+
+def test_a_secret_of_its_own_changes_the_schedule_alone(evedrop: Evedrop) -> None:
+    """The same file gives the same run; another one other packets of the same process; a short one is refused."""
+    for name, secret in (("one", b"1" * 32), ("two", b"2" * 32), ("short", b"3" * 31)):
+        (evedrop.folder / name).write_bytes(secret)
+    base = ("montecarlo", "eavesdroppers", "--slots", "60", "--trials", "1", "--json", "--out")
+    runs = {
+        "none": evedrop(*base, "a").summary,
+        "one": evedrop(*base, "b", "--secret", "one").summary,
+        "one again": evedrop("montecarlo", "b", "--trials", "1", "--json", "--out", "c").summary,
+        "two": evedrop(*base, "d", "--secret", "two").summary,
+    }
+    digests = {name: {peer["digest"] for peer in summary["peers"].values()} for name, summary in runs.items()}
+    assert digests["one"] == digests["one again"]
+    assert digests["one"].isdisjoint(digests["two"] | digests["none"])
+    schedules = {name: load_results(evedrop.folder / name).trials["sent"].to_pylist() for name in "abd"}
+    assert len({tuple(schedule) for schedule in schedules.values()}) == 3
+    truths = [load_results(evedrop.folder / name).trials["x"].to_pylist() for name in "abd"]
+    assert truths[0] == truths[1] == truths[2]
+    done = evedrop(*base, "e", "--secret", "short")
+    assert done.status == 2
+    assert "has 31 bytes; expected 32 or more" in done.err
+
+
+def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:
+    """0 for equal runs, 1 for a difference, 2 for what is no run."""
+    base = ("montecarlo", "eavesdroppers", "--slots", "30", "--trials", "1", "--out")
+    for name, more in (("a", ()), ("b", ()), ("c", ("--seed", "3"))):
+        assert evedrop(*base, name, *more).status == 0
+    assert evedrop("diff", "a", "b").status == 0
+    different = evedrop("diff", "a", "c")
+    assert (different.status, different.err) == (1, "")
+    assert different.out.startswith("first difference: slot 0, trial 0, legitimate: ")
+    refused(evedrop("diff", "a", "nowhere"), "nowhere is no results folder")
+
+
+def test_check_reports_every_scenario(evedrop: Evedrop) -> None:
+    """All shipped ones are right; a wrong one among right ones is exit 2."""
+    done = evedrop("check", *sorted(shipped()))
+    assert (done.status, done.err) == (0, "")
+    assert done.out.count("no mistakes") == len(shipped())
+    done = evedrop("check", "numerical", "nothing", "eavesdroppers")
+    assert done.status == 2
+    assert done.out.count("no mistakes") == 2
+    assert "no scenario nothing" in done.err
+
+
+def test_list_new_check_and_run_lead_from_nothing_to_a_run(evedrop: Evedrop) -> None:
+    """The way of a new user."""
+    listed = evedrop("list")
+    assert [line.split()[0] for line in listed.out.splitlines()] == sorted(shipped())
+    assert evedrop("new", "mine.toml").status == 0
+    assert evedrop("check", "mine.toml").status == 0
+    assert evedrop("run", "mine.toml", *QUICK).status == 0
+    (folder,) = (evedrop.folder / "runs").iterdir()
+    assert folder.name.startswith("mine-")
+    refused(evedrop("new", "mine.toml"), "mine.toml is there already")
+
+
+def test_the_selftest_passes(evedrop: Evedrop) -> None:
+    """The machine computes the golden digests, and says what it is."""
+    done = evedrop("selftest")
+    assert (done.status, done.err) == (0, "")
+    assert done.out.count("golden") == 4
+    assert "numpy" in done.out
+
+
+def test_a_wrong_golden_digest_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit 3, and the receiver whose digest is not the golden one is marked."""
+    from emulator import cli
+    from emulator.run import selftest
+
+    monkeypatch.setattr(selftest, "GOLDEN", {**selftest.GOLDEN, "smart": "0" * 64})
+    assert cli.main(["selftest"]) == 3
+    told = capsys.readouterr()
+    assert [line.split()[0] for line in told.out.splitlines() if "NOT the golden digest" in line] == ["smart"]
+    assert "does not compute the golden digests" in told.err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(), ("nonsense",), ("run",), ("run", "numerical", "--slots", "many"), ("run", "numerical", "--view", "sideways")],
+)
+def test_a_command_line_that_is_none_is_exit_2(evedrop: Evedrop, arguments: tuple[str, ...]) -> None:
+    """Argparse says what it expected."""
+    done = evedrop(*arguments)
+    assert (done.status, done.out) == (2, "")
+    assert "usage: " in done.err
+
+
+def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
+    """Briefs are written for starting by hand; each fits its own role, and is private."""
+    assert evedrop("brief", "numerical", "--out", "briefs").status == 0
+    briefs = sorted((evedrop.folder / "briefs").iterdir())
+    assert [path.name for path in briefs] == [
+        f"{name}.json" for name in ("legitimate", "naive", "observer", "router", "sensor", "smart")
+    ]
+    assert {path.stat().st_mode & 0o777 for path in briefs} == {0o600}
+    refused(evedrop("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")
+    refused(evedrop("sensor", "briefs/nobody.json"), "No such file")
+    (evedrop.folder / "briefs" / "smart.json").chmod(0o644)
+    refused(evedrop("eavesdropper", "briefs/smart.json"), "readable by others")
+
+
+def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:
+    """`evedrop list | head -1`: no traceback."""
+    with subprocess.Popen(["head", "-c", "1"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as reader:
+        done = evedrop("list", stdout=reader.stdin)
+        assert reader.stdin is not None
+        reader.stdin.close()
+    assert (done.status, done.err) == (0, "")
