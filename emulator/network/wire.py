@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 
 from emulator.errors import Gap, MalformedMessage
 from emulator.model.digest import DIGEST_BYTES, Digests
+from emulator.model.links.link import Fate
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
+
+_REASONS = frozenset(fate.name.lower() for fate in Fate if fate is not Fate.DELIVERED)
 
 
 def pack(fields: Mapping[str, Any]) -> bytes:
@@ -289,5 +292,7 @@ def read_journal(key: str, payload: bytes, first: int, receivers: tuple[str, ...
         link = message.nested("links").nested(name)
         delivered[name] = flags_of(link.array("delivered", "u1", (c, (trials + 7) // 8)), trials)
         reasons = link.nested("lost")
-        lost[name] = {reason: reasons.array(reason, "<u4", (c,)) for reason in link.map("lost")}
+        if set(link.map("lost")) != _REASONS:
+            raise message.malformed(f"{name} lost for {list(link.map('lost'))}", f"the reasons {sorted(_REASONS)}")
+        lost[name] = {reason: reasons.array(reason, "<u4", (c,)) for reason in sorted(_REASONS)}
     return Journal(k, c, delivered, lost)

@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from emulator.errors import EvedropError, Gap, MalformedMessage, RunError
 from emulator.network import wire
+from emulator.run.joined import Joiner
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)
@@ -140,3 +141,39 @@ def test_a_journal_without_a_receiver_is_refused() -> None:
     raw = wire.Journal(0, 1, {"a": np.ones((1, 3), bool)}, {"a": {"lost": np.zeros(1, np.uint32)}}).pack()
     with pytest.raises(MalformedMessage, match="b = None; expected a map b"):
         READERS["journal"](raw)
+
+
+@pytest.mark.parametrize("reasons", [[], ["eaten"], ["lost", "eaten"]])
+def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
+    """A journal gives every reason of the links and no other: columns of messages must fit together."""
+    counts = {reason: np.zeros(1, np.uint32) for reason in reasons}
+    raw = wire.Journal(0, 1, dict.fromkeys("ab", np.ones((1, 3), bool)), dict.fromkeys("ab", counts)).pack()
+    with pytest.raises(MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['lost'\]"):
+        READERS["journal"](raw)
+
+
+TELEMETRY = {
+    "truth": lambda k: wire.Truth(k, np.zeros((2, 1, 3)), np.zeros((2, 3), bool)).pack(),
+    "report": lambda k: wire.Report(
+        k, np.zeros((2, 1, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 1, 1, 1)), np.zeros((2, 2)), {}
+    ).pack(),
+    "journal": lambda k: wire.Journal(
+        k, 2, {"a": np.ones((2, 3), bool)}, {"a": {"lost": np.zeros(2, np.uint32)}}
+    ).pack(),
+}
+
+
+@pytest.mark.parametrize("second", [0, 1, 3, 4])
+@pytest.mark.parametrize("what", TELEMETRY)
+def test_observer_notices_gaps_and_doubles(what: str, second: int) -> None:
+    """Truth, report or journal that does not begin where the last one ended is a gap."""
+    joiner = Joiner(("a",), (1, 3), 1)
+    take = {
+        "truth": lambda raw: joiner.truth("key", raw),
+        "report": lambda raw: joiner.report("a", "key", raw),
+        "journal": lambda raw: joiner.journal("key", raw),
+    }[what]
+    take(TELEMETRY[what](0))
+    with pytest.raises(Gap, match=f"gap on key: slot {second} arrived where slot 2 was due"):
+        take(TELEMETRY[what](second))
+    take(TELEMETRY[what](2))
