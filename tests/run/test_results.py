@@ -1,0 +1,75 @@
+"""The references of scenario and results: complete, and with examples that are right."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from emulator import scenario
+from emulator.api import montecarlo
+from emulator.run.results import ACTIONS, DIGESTS, JOURNAL, Results, load_results
+from emulator.scenario import parse
+
+DOCS = Path(__file__).parents[2] / "docs"
+TABLES = [
+    kind for kind in vars(scenario).values() if isinstance(kind, type) and issubclass(kind, BaseModel) and kind.model_fields
+]  # fmt: skip
+
+
+def words(page: str) -> set[str]:
+    """What a page has between backquotes."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return {word for quoted in re.findall(r"`([^`\n]+)`", text) for word in re.split(r"[^\w.]+", quoted)}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """A small run."""
+    return montecarlo("eavesdroppers", slots=30, trials=12, out=tmp_path_factory.mktemp("run") / "run")
+
+
+def test_every_example_of_the_scenario_reference_is_right() -> None:
+    """Each TOML block is a whole scenario without a mistake."""
+    blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "scenario.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) >= 2
+    for block in blocks:
+        parse(block, "docs/scenario.md")
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.__name__)
+def test_the_scenario_reference_has_every_entry(table: type[BaseModel]) -> None:
+    """No field of a table is left out."""
+    tables = {"process", "encoding", "legitimate", "eavesdroppers", "expect"}  # they are headings
+    assert {name for name in table.model_fields if name not in tables} - words("scenario.md") - {"quality"} == set()
+    assert "link.quality" in words("scenario.md")
+
+
+def test_the_results_reference_has_every_column(results: Results) -> None:
+    """Every column of every table, every action, every entry of the summary."""
+    known = words("results.md")
+    for names in (results.slots.column_names, results.trials.column_names, JOURNAL.names, DIGESTS.names, ACTIONS):
+        assert set(names) - known == set()
+    summary = results.summary
+    for part in (summary, summary["peers"]["smart"], summary["links"]["smart"], summary["secrecy"]["smart"]):
+        assert set(part) - known == set()
+    assert set(summary["expectations"][0]) <= known
+
+
+def test_tables_have_a_row_for_everything(results: Results) -> None:
+    """Slots times receivers, and times recorded trials; what is in both tables agrees."""
+    assert results.slots.num_rows == results.trials.num_rows == 30 * 4
+    assert set(results.trials["action"].to_pylist()) <= set(ACTIONS)
+    for row in results.trials.to_pylist():
+        error = sum((x - x_hat) ** 2 for x, x_hat in zip(row["x"], row["x_hat"], strict=True))
+        assert row["squared_error"] == pytest.approx(error, rel=1e-12)
+        assert row["trace_covariance"] == pytest.approx(row["P"][0] + row["P"][3], rel=1e-12)
+        assert (row["action"] == "misled") <= (row["sent"] == "innovation" and row["peer"] != "legitimate")
+
+
+def test_a_summary_is_replaced_as_a_whole(results: Results) -> None:
+    """No half-written summary can be read, and none is left beside it."""
+    assert [path.name for path in results.folder.glob("summary*")] == ["summary.json"]
+    assert load_results(str(results.folder)).summary == results.summary
