@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from independent_legitimate import Estimator
 
-from emulator.model.digest import RunDigest
+from emulator import montecarlo
+from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.process import Trajectory
 from emulator.model.schemes import SCHEMES
 from emulator.network import wire
 from emulator.run.briefs import Observation, StreamKeys, briefs_of
 from emulator.run.launcher import free_port
 from emulator.run.results import load_results
-from emulator.run.simulation import Simulation
 from emulator.scenario import Scenario, load
 from emulator.streams import Batch
 
@@ -65,22 +65,24 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     trajectory = Trajectory(model, keys.process, batch)
     secret = keys.secret(("schedule", "noise"))
     encoder = SCHEMES["innovation"](model, 0.4).encoder(secret, batch)
-    simulation = Simulation(scenario, range(first_trial, first_trial + 9), 2)
-    for chunk in simulation.chunks():
-        ours = chunk.receivers["legitimate"]
-        for row in range(chunk.count):
-            k = chunk.first + row
-            z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
-            gamma = ours.delivered[row]
-            mask = np.packbits(gamma, bitorder="little").tobytes()
-            peer.receive(wire.delivery(k, mask, z[:, gamma].tobytes()))
-        report = wire.read_report("telemetry", peer.report(), chunk.first, (model.n, 9), 2)
-        assert np.array_equal(report.x_hat, ours.x_hat)
-        assert np.array_equal(report.action, ours.action)
-        assert np.array_equal(report.P, ours.P)
-        assert np.allclose(report.trace, ours.trace, rtol=1e-12)
-    digest = RunDigest()
-    digest.add(simulation.digests["legitimate"])
+    estimator = SCHEMES["innovation"](model, 0.4).estimator(secret, batch)
+    belief, log, digest = estimator.prior(), BeliefLog(model.n, 9, slots), RunDigest()
+    gammas = np.random.default_rng(1).random((slots, 9)) < 0.7
+    beliefs, blocks = [], {}
+    for k, gamma in enumerate(gammas):
+        z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
+        belief = estimator.step(k, belief, gamma, z)
+        beliefs.append(belief)
+        digests = log.add(k, belief)
+        if digests is not None:
+            blocks[k // 256] = digests.copy()
+        peer.receive(wire.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
+    report = wire.read_report("telemetry", peer.report(), 0, (model.n, 9), 2)
+    assert np.array_equal(report.x_hat, [one.x_hat for one in beliefs])
+    assert np.array_equal(report.action, [one.action for one in beliefs])
+    assert np.array_equal(report.P, [one.P[:, :, :2] for one in beliefs])
+    assert np.allclose(report.trace[:, 0], [np.trace(one.P).sum() for one in beliefs], rtol=1e-12)
+    digest.add(blocks)
     assert peer.digest() == digest.hexadecimal
 
 
@@ -117,14 +119,10 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
         said = {name: process.communicate(timeout=40)[0] for name, process in running.items()}
         statuses = {name: process.returncode for name, process in running.items()}
     assert set(statuses.values()) <= {0, 1}, (statuses, said)
-    simulation = Simulation(scenario, range(2), 1)
-    for _ in simulation.chunks():
-        pass
-    digest = RunDigest()
-    digest.add(simulation.digests["legitimate"])
+    digest = montecarlo(scenario, trials=2, out=tmp_path / "memory").summary["peers"]["legitimate"]["digest"]
     summary = load_results(out).summary
-    assert summary["peers"]["legitimate"]["digest"] == digest.hexadecimal
-    assert said["legitimate"].strip() == digest.hexadecimal
+    assert summary["peers"]["legitimate"]["digest"] == digest
+    assert said["legitimate"].strip() == digest
 
 
 def test_it_is_independent() -> None:

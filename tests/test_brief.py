@@ -1,0 +1,210 @@
+"""Briefs: written for one process alone, refused when they are anything else."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.brief import Brief, Flow, Model, read_brief
+from emulator.errors import BriefError
+from emulator.run.briefs import Observation, StreamKeys, briefs_of
+from emulator.scenario import Scenario
+
+BRIEF = Brief(
+    run="r01",
+    process="eve",
+    role="eavesdropper",
+    router="tcp/127.0.0.1:17460",
+    user="eve",
+    password="p",  # noqa: S106 - an example
+    slots=10,
+    trials=3,
+    first_trial=5,
+    recorded=1,
+    flow=Flow(8, 2),
+    model=Model([[1.0, 0.1], [0.0, 1.0]], [[1e-3, 0.0], [0.0, 1e-3]], [[1.0, 0.0], [0.0, 1.0]], 0.5),
+    keys={"schedule": "ab" * 32},
+    part={"strategy": "smart", "parameters": {}},
+)
+
+
+def test_reads_back_what_was_written(tmp_path: Path) -> None:
+    """A brief survives its file, which nobody else may read, whatever the umask."""
+    before = os.umask(0)
+    try:
+        path = BRIEF.write(tmp_path)
+    finally:
+        os.umask(before)
+    assert path.name == "eve.json"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert read_brief(path, "eavesdropper") == BRIEF
+    assert BRIEF.stream_keys == {"schedule": bytes.fromhex("ab" * 32)}
+    assert list(BRIEF.batch.trial_range) == [5, 6, 7]
+    assert np.array_equal(BRIEF.model.process.A, [[1.0, 0.1], [0.0, 1.0]])
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644, 0o610])
+def test_refuses_what_others_can_read(mode: int, tmp_path: Path) -> None:
+    """A brief that group or others can read holds no secret any more."""
+    path = BRIEF.write(tmp_path)
+    path.chmod(mode)
+    with pytest.raises(BriefError, match="readable by others; a brief holds keys: chmod 600"):
+        read_brief(path)
+
+
+def test_refuses_another_role(tmp_path: Path) -> None:
+    """A program takes no brief of another role, and says which command does."""
+    with pytest.raises(
+        BriefError, match="brief of a eavesdropper; expected one of a sensor: start `evedrop eavesdropper`"
+    ):
+        read_brief(BRIEF.write(tmp_path), "sensor")
+
+
+def without(name: str) -> dict[str, Any]:
+    """The brief without an entry."""
+    found = asdict(BRIEF)
+    del found[name]
+    return found
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        [],
+        "text",
+        {},
+        {**asdict(BRIEF), "secret": "00"},
+        {**asdict(BRIEF), "role": "spy"},
+        {**asdict(BRIEF), "flow": {"window": 8}},
+        {**asdict(BRIEF), "flow": {"window": 8, "batch": 2, "more": 1}},
+        {**asdict(BRIEF), "model": []},
+        without("slots"),
+        without("model"),
+        without("role"),
+    ],
+)
+def test_refuses_what_is_no_brief(found: object, tmp_path: Path) -> None:
+    """Missing and unknown entries, unknown roles and other JSON are one line with the remedy, status 2."""
+    path = tmp_path / "brief.json"
+    path.write_text(json.dumps(found))
+    path.chmod(0o600)
+    with pytest.raises(
+        BriefError, match=r"is not a brief of this version .*; write it again with `evedrop brief`"
+    ) as caught:
+        read_brief(path)
+    assert caught.value.exit_status == 2
+
+
+def test_refuses_what_is_not_there(tmp_path: Path) -> None:
+    """A missing file and one that is not JSON are told apart."""
+    with pytest.raises(BriefError, match="No such file or directory"):
+        read_brief(tmp_path / "none.json")
+    path = tmp_path / "broken.json"
+    path.write_text("{")
+    path.chmod(0o600)
+    with pytest.raises(BriefError, match="is not a brief of this version"):
+        read_brief(path)
+
+
+def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
+    """A scenario with one eavesdropper of each strategy."""
+    link = {"link": {"quality": 0.8}}
+    suspicious = {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, **link}
+    table = {
+        "title": "Briefs",
+        "slots": 50,
+        "seed": seed,
+        "process": asdict(BRIEF.model),
+        "encoding": {"scheme": "innovation", "state_probability": 0.5},
+        "legitimate": link,
+        "eavesdroppers": {
+            "naive": {"strategy": "naive", **link},
+            "smart": {"strategy": "smart", **link},
+            "doubtful": suspicious,
+        },
+    }
+    del table["process"]["state_probability"]
+    return Scenario.model_validate({**table, **changes})
+
+
+def made(scenario: Scenario) -> dict[str, Brief]:
+    """The briefs of a scenario."""
+    return briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+
+
+def test_who_is_given_which_keys() -> None:
+    """Each process has the keys of the streams it owns by definition, and no others."""
+    found = {name: set(brief.keys) for name, brief in made(scenario_of()).items()}
+    assert found == {
+        "router": {"link/legitimate", "link/naive", "link/smart", "link/doubtful"},
+        "sensor": {"process", "schedule", "noise"},
+        "legitimate": {"schedule", "noise"},
+        "naive": set(),
+        "smart": {"schedule"},
+        "doubtful": {"schedule", "coin"},
+        "observer": set(),
+    }
+
+
+def test_without_secret_nobody_has_its_keys() -> None:
+    """The plain scheme has no secret: sensor and estimator are given none."""
+    briefs = made(scenario_of(encoding={"scheme": "plain"}, eavesdroppers={}))
+    assert set(briefs["sensor"].keys) == {"process"}
+    assert set(briefs["legitimate"].keys) == set()
+
+
+def test_keys_agree_between_those_who_share_them() -> None:
+    """Whoever holds a stream holds the same key; different streams have different keys."""
+    briefs = made(scenario_of())
+    for stream in ("schedule", "noise"):
+        assert len({brief.keys[stream] for brief in briefs.values() if stream in brief.keys}) == 1
+    everything = {(name, key) for brief in briefs.values() for name, key in brief.keys.items()}
+    assert len({key for _, key in everything}) == len(everything)
+
+
+def test_a_secret_file_replaces_the_seed_where_it_must(tmp_path: Path) -> None:
+    """With a secret of its own a scenario has other schedule and noise keys, and everything else as before."""
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(range(40)))
+    plain, own = made(scenario_of()), made(scenario_of(secret_file=str(secret)))
+    for name, brief in plain.items():
+        for stream, key in brief.keys.items():
+            assert (own[name].keys[stream] == key) == (stream not in {"schedule", "noise"})
+    assert StreamKeys.of(scenario_of(secret_file=str(secret))).seed_root == StreamKeys.of(scenario_of()).seed_root
+
+
+def test_passwords_and_run_are_made_afresh() -> None:
+    """Two runs of one scenario share no password, each process has its own, and the router alone knows all."""
+    first, second = made(scenario_of()), made(scenario_of())
+    passwords = [brief.password for briefs in (first, second) for name, brief in briefs.items() if name != "router"]
+    assert len(set(passwords)) == len(passwords) == 12
+    assert min(map(len, passwords)) >= 32
+    assert first["router"].run != second["router"].run
+    assert first["router"].part["users"] == {n: b.password for n, b in first.items() if n != "router"}
+
+
+def test_an_added_eavesdropper_changes_nobody_elses_keys() -> None:
+    """Keys of streams depend on their own names only."""
+    fewer = scenario_of()
+    more = scenario_of(
+        eavesdroppers={**fewer.model_dump()["eavesdroppers"], "extra": fewer.model_dump()["eavesdroppers"]["smart"]}
+    )
+    before, after = made(fewer), made(more)
+    for name, brief in before.items():
+        assert brief.keys.items() <= after[name].keys.items()
+
+
+def test_model_is_the_only_thing_all_share() -> None:
+    """Every brief holds the public model; no eavesdropper's brief holds anything of the scenario beyond its own part."""
+    briefs = made(scenario_of())
+    assert len({json.dumps(asdict(brief.model)) for brief in briefs.values()}) == 1
+    assert briefs["doubtful"].part == {
+        "strategy": "suspicious",
+        "parameters": {"use_state": 0.9, "use_innovation": 0.1},
+    }

@@ -1,0 +1,122 @@
+"""Random numbers: against AES in counter mode as the library has it, in any order, alone and among others."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from emulator.streams import Batch, BlockReader, Stream, normals, root_of_seed, stream_key, uniforms
+
+KEY = bytes(range(32))
+SLOTS = st.integers(0, 2**45)
+
+
+def counter_mode(key: bytes, k: int, r: int, per_trial: int) -> list[int]:
+    """The words of one slot and trial by AES-CTR itself, started at their counter."""
+    blocks = -(-per_trial // 2)
+    start = (k * 2**64 + r * blocks).to_bytes(16, "big")
+    keystream = Cipher(algorithms.AES(key), modes.CTR(start)).encryptor().update(bytes(16 * blocks))
+    return np.frombuffer(keystream, "<u8")[:per_trial].tolist()
+
+
+@given(
+    st.binary(min_size=32, max_size=32),
+    SLOTS,
+    st.integers(0, 2**48),
+    st.integers(1, 5),
+    st.integers(1, 3),
+    st.integers(1, 4),
+)
+def test_words_are_aes_in_counter_mode(key: bytes, k: int, r: int, per_trial: int, slots: int, trials: int) -> None:
+    """Every word of a block of slots and trials is the library's AES-256-CTR at the documented counter."""
+    drawn = Stream(key, range(r, r + trials), per_trial).words(range(k, k + slots))
+    assert drawn.shape == (slots, trials, per_trial)
+    expected = [[counter_mode(key, k + i, r + j, per_trial) for j in range(trials)] for i in range(slots)]
+    assert drawn.tolist() == expected
+
+
+def test_the_cipher_is_aes_256() -> None:
+    """The key and block of NIST's FIPS 197, appendix C.3, come out of a stream at the counter that is this block."""
+    k, r = 0x0011223344556677, 0x8899AABBCCDDEEFF
+    drawn = Stream(KEY, range(r, r + 1), 2).words(range(k, k + 1))
+    assert drawn.astype("<u8").tobytes().hex() == "8ea2b7ca516745bfeafc49904b496089"
+
+
+def test_keys_are_keyed_blake2b() -> None:
+    """The key of a stream is keyed BLAKE2b of its name; names and roots tell streams apart."""
+    root = root_of_seed(258)
+    assert root == b"\x02\x01" + bytes(30)
+    inner = hashlib.blake2b(root, digest_size=32).digest()
+    assert stream_key(root, "link/eve") == hashlib.blake2b(b"link/eve", key=inner, digest_size=32).digest()
+    roots = [root_of_seed(seed) for seed in (0, 1, 256)]
+    found = {stream_key(one, name) for one in roots for name in ("process", "schedule", "noise", "link/a", "link/ab")}
+    assert len(found) == 15
+
+
+@given(st.data(), st.integers(1, 40), st.integers(1, 6), st.integers(1, 3), st.integers(0, 1000))
+def test_reader_gives_the_same_numbers_in_any_order(
+    data: st.DataObject, slots: int, trials: int, per_trial: int, first: int
+) -> None:
+    """Blocks asked for in any order, of any length, hold the numbers of their slots and trials, nothing else."""
+    batch = Batch(slots, trials, first)
+    reader = BlockReader(KEY, batch, per_trial)
+    whole = reader.normals(range(slots)), reader.uniforms(range(slots))
+    assert whole[0].shape == (slots, per_trial, trials)
+    for _ in range(4):
+        start = data.draw(st.integers(0, slots - 1))
+        stop = data.draw(st.integers(start + 1, slots))
+        assert np.array_equal(reader.normals(range(start, stop)), whole[0][start:stop])
+        assert np.array_equal(reader.uniforms(range(start, stop)), whole[1][start:stop])
+        assert start in reader.block(start)
+    alone = data.draw(st.integers(0, trials - 1))
+    other = BlockReader(KEY, Batch(slots, 1, first + alone), per_trial)
+    assert np.array_equal(other.normals(range(slots))[:, :, 0], whole[0][:, :, alone])
+
+
+def test_what_was_drawn_stays() -> None:
+    """A later draw does not overwrite numbers that were handed out, whatever the shape."""
+    for trials, per_trial in ((1, 1), (1, 2), (1, 4), (3, 1), (3, 2)):
+        reader = BlockReader(KEY, Batch(8, trials), per_trial)
+        first = reader.uniforms(range(4)), reader.normals(range(4))
+        before = [one.copy() for one in first]
+        reader.uniforms(range(4, 8))
+        reader.normals(range(4, 8))
+        assert all(np.array_equal(one, was) for one, was in zip(first, before, strict=True))
+
+
+def test_blocks_cover_all_slots_once() -> None:
+    """The reader's blocks are aligned, and each slot of the run is in exactly one."""
+    for slots, trials in ((1, 1), (255, 1), (600, 1), (600, 1000), (5, 100_000)):
+        reader = BlockReader(KEY, Batch(slots, trials), 2)
+        seen: list[int] = []
+        while len(seen) < slots:
+            seen += reader.block(len(seen))
+        assert seen == list(range(slots))
+
+
+def test_extreme_words() -> None:
+    """Uniforms stay in [0, 1); normals stay finite and symmetric at both ends."""
+    ends = np.array([0, 2**64 - 1], np.uint64)
+    assert uniforms(ends).tolist() == [0.0, 1 - 2.0**-53]
+    low, high = normals(ends).tolist()
+    assert low == -high
+    assert 8.1 < high < 8.3
+
+
+@pytest.mark.parametrize("per_trial", [1, 2, 3])
+def test_numbers_have_their_distributions(per_trial: int) -> None:
+    """Kolmogorov-Smirnov over 200 000 numbers, and correlations between slots, trials and words, at 1e-6 confidence."""
+    reader = BlockReader(KEY, Batch(200, 1000), per_trial)
+    x, u = reader.normals(range(200)), reader.uniforms(range(200))
+    assert stats.kstest(x.ravel(), "norm").pvalue > 1e-6
+    assert stats.kstest(u.ravel(), "uniform").pvalue > 1e-6
+    pairs = [(x[1:], x[:-1]), (x[:, :, 1:], x[:, :, :-1])] + ([(x[:, 1:], x[:, :-1])] if per_trial > 1 else [])
+    for left, right in pairs:
+        correlation = np.mean(left * right)
+        assert abs(correlation) < 4.9 / np.sqrt(left.size)
