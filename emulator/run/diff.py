@@ -24,26 +24,31 @@ class Difference:
 def difference(a: Results, b: Results) -> Difference:
     """Compare what every receiver received and believed, trial by trial, over the trials and receivers both have."""
     blocks_a, blocks_b = _blocks(a), _blocks(b)
-    common = blocks_a.keys() & blocks_b.keys()
-    if not common:
+    common = [key for key in blocks_a.keys() & blocks_b.keys() if _length(a, key[2]) == _length(b, key[2])]
+    first = _first_row(a.trials, b.trials)
+    if not common and first is None:
         return Difference(
-            False, "the runs have no slot of a trial and receiver in common; compare runs of one scenario"
+            False, "the runs have no whole block of a trial and receiver in common; compare runs of one scenario"
         )
     unequal = sorted(
         (block, trial, peer) for peer, trial, block in common if _differ(blocks_a, blocks_b, peer, trial, block)
     )
     only = len(blocks_a) + len(blocks_b) - 2 * len(common)
-    rest = f" ({only} blocks of 256 slots are in one run only)" if only else ""
+    rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
+    if first is not None and (not unequal or first.slot // BLOCK_SLOTS <= unequal[0][0]):
+        return Difference(False, first.text + rest)
     if not unequal:
         peers = ", ".join(sorted({peer for peer, _, _ in common}))
         return Difference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
     block, trial, peer = unequal[0]
-    first = _first_row(a.trials, b.trials)
-    if first is not None and first.slot // BLOCK_SLOTS <= block:
-        return Difference(False, first.text + rest)
-    slots = f"slots {block * BLOCK_SLOTS} to {(block + 1) * BLOCK_SLOTS - 1}"
+    slots = f"slots {block * BLOCK_SLOTS} to {block * BLOCK_SLOTS + _length(a, block) - 1}"
     remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
     return Difference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
+
+
+def _length(results: Results, block: int) -> int:
+    """How many slots of a block a run has."""
+    return min(BLOCK_SLOTS, int(results.summary["slots"]) - block * BLOCK_SLOTS)
 
 
 def _blocks(results: Results) -> dict[tuple[str, int, int], bytes]:
@@ -100,6 +105,8 @@ def _plain(table: pa.Table) -> pa.Table:
 
 def _as_bytes(column: pa.ChunkedArray) -> pa.Array:
     width = 8 * column.type.list_size
+    if not column.num_chunks:
+        return pa.array([], pa.binary())
     values = pa.concat_arrays([chunk.flatten() for chunk in column.chunks]).to_numpy()
     return pa.FixedSizeBinaryArray.from_buffers(pa.binary(width), len(column), [None, pa.py_buffer(values)]).cast(
         pa.binary()

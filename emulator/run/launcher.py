@@ -271,6 +271,9 @@ class _Children:
         Raises RunError if the system does not let us.
         """
         conducts = brief.role == "observer"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        if brief.role == "router":
+            environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
         try:
             path = brief.write(self._private)
             with (self._logs / f"{brief.process}.log").open("wb") as log:
@@ -280,7 +283,7 @@ class _Children:
                     stdout=subprocess.PIPE if conducts else log,
                     stderr=log,
                     start_new_session=True,
-                    env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+                    env=environment,
                 )
         except OSError as error:
             raise RunError(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -141,9 +140,17 @@ class ResultsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with ExitStack() as every:  # one that cannot be written keeps no other from being whole
-            for table in (self._slots, self._trials, self._journal, self._digests):
-                every.callback(table.close)
+        failures: list[Exception] = []
+        for table in (self._slots, self._trials, self._journal, self._digests):
+            try:
+                table.close()
+            except (
+                OSError,
+                pa.ArrowException,
+            ) as failure:  # one that cannot be written keeps no other from being whole
+                failures.append(failure)
+        if failures and error is None:
+            raise failures[0]
 
     def slot_rows(
         self,

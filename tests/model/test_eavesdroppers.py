@@ -1,0 +1,160 @@
+"""Eavesdroppers, against the paper's table one trial at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.process import Process
+from emulator.model.receiver import Action, Belief, Receiver
+from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+
+ROOT = root_of_seed(12)
+KEYS = {name: stream_key(ROOT, name) for name in ("schedule", "coin")}
+PROCESS = Process(
+    np.array([[1.0, 0.3], [0.5, 1.001]]), np.array([[1e-3, 2e-4], [2e-4, 1e-3]]), np.array([[1.0, 0.1], [0.1, 0.5]])
+)
+MU_D, USE_STATE, USE_INNOVATION = 0.4, 0.8, 0.3
+PARAMETERS = {"naive": {}, "smart": {}, "suspicious": {"use_state": USE_STATE, "use_innovation": USE_INNOVATION}}
+
+
+def receiver(name: str, batch: Batch, **parameters: float) -> Receiver:
+    """An eavesdropper that is given what its strategy names, and no more."""
+    strategy = STRATEGIES[name]
+    keys = {stream: KEYS[stream] for stream in strategy.streams}
+    return strategy(Knowledge(PROCESS, MU_D, {**PARAMETERS[name], **parameters}, keys), batch)
+
+
+def events(slots: int, trials: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """γ (slots, R) and any packets z (slots, n, R)."""
+    rng = np.random.default_rng(seed)
+    return rng.random((slots, trials)) < 0.7, rng.standard_normal((slots, 2, trials))
+
+
+def beliefs(name: str, batch: Batch, gamma: np.ndarray, z: np.ndarray) -> list[Belief]:
+    """After every slot."""
+    one = receiver(name, batch)
+    belief, found = one.prior(), []
+    for k in range(batch.slots):
+        belief = one.step(k, belief, gamma[k], z[k])
+        found.append(Belief(*(part.copy() for part in belief)))
+    return found
+
+
+def uniform(stream: str, k: int, r: int) -> float:
+    """One uniform of a stream."""
+    return float(uniforms(Stream(KEYS[stream], range(r, r + 1), 1).words(range(k, k + 1)))[0, 0, 0])
+
+
+def uses(name: str, k: int, r: int) -> bool:
+    """b_k of the paper's table, from the schedule's and the coin's own numbers."""
+    nu = k > 0 and uniform("schedule", k, r) >= MU_D
+    if name == "naive":
+        return True
+    if name == "smart":
+        return not nu
+    return uniform("coin", k, r) < (USE_INNOVATION if nu else USE_STATE)
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+@given(seed=st.integers(0, 2**31), first=st.integers(0, 10_000))
+def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, first: int) -> None:
+    """Used: (z, 0); lost or discarded: (A x̂, A P Aᵀ + Q); before slot 0: (0, Σ0), not predicted."""
+    slots, A, Q = 12, PROCESS.A, PROCESS.Q
+    gamma, z = events(slots, 2, seed)
+    found = beliefs(name, Batch(slots, 2, first), gamma, z)
+    for r in range(2):
+        x_hat, P = np.zeros(2), PROCESS.initial_covariance
+        for k in range(slots):
+            if k:
+                x_hat, P = A @ x_hat, A @ P @ A.T + Q
+            action = Action.LOST
+            if gamma[k, r]:
+                action = Action.STATE if uses(name, k, first + r) else Action.DISCARDED
+            if action == Action.STATE:
+                x_hat, P = z[k, :, r], np.zeros((2, 2))
+            assert found[k].action[r] == action
+            assert np.allclose(found[k].x_hat[:, r], x_hat, rtol=1e-12, atol=1e-13)
+            assert np.allclose(found[k].P[:, :, r], P, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_a_trial_alone_is_the_same_trial(name: str) -> None:
+    """Beliefs of a trial are the same bits alone, among 6 and among 400."""
+    gamma, z = events(300, 400)
+    among = beliefs(name, Batch(300, 400, 50), gamma, z)
+    for first, count in ((77, 1), (400, 6)):
+        part = slice(first - 50, first - 50 + count)
+        alone = beliefs(name, Batch(300, count, first), gamma[:, part].copy(), z[:, :, part].copy())
+        for one, other in zip(alone, among, strict=True):
+            assert one.x_hat.tobytes() == other.x_hat[:, part].tobytes()
+            assert one.P.tobytes() == other.P[:, :, part].tobytes()
+            assert np.array_equal(one.action, other.action[part])
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_what_is_lost_does_not_matter(name: str) -> None:
+    """Of a packet that was lost not a bit enters the belief, not even NaN."""
+    gamma, z = events(40, 30)
+    poisoned = np.where(gamma[:, None, :], z, np.nan)
+    for one, other in zip(
+        beliefs(name, Batch(40, 30), gamma, z), beliefs(name, Batch(40, 30), gamma, poisoned), strict=True
+    ):
+        assert all(left.tobytes() == right.tobytes() for left, right in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_it_needs_what_it_names_and_no_more(name: str) -> None:
+    """Without one of its keys or parameters an eavesdropper cannot be built; the naive one is given nothing."""
+    strategy = STRATEGIES[name]
+    assert {"naive": (), "smart": ("schedule",), "suspicious": ("schedule", "coin")}[name] == strategy.streams
+    assert set(strategy.parameters) == set(PARAMETERS[name])
+    for stream in strategy.streams:
+        keys = {other: KEYS[other] for other in strategy.streams if other != stream}
+        with pytest.raises(KeyError, match=stream):
+            strategy(Knowledge(PROCESS, MU_D, PARAMETERS[name], keys), Batch(2, 1))
+    for parameter in strategy.parameters:
+        with pytest.raises(KeyError, match=parameter):
+            strategy(
+                Knowledge(PROCESS, MU_D, {k: 0.5 for k in strategy.parameters if k != parameter}, KEYS), Batch(2, 1)
+            )
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_use_probabilities_are_what_it_does(name: str) -> None:
+    """P(b = 1 given ν) of theory is how often it uses states and innovations: binomial, at 1e-6 confidence."""
+    slots, trials = 60, 2000
+    batch = Batch(slots, trials)
+    one = receiver(name, batch)
+    belief = one.prior()
+    nu = uniforms(Stream(KEYS["schedule"], range(trials), 1).words(range(slots)))[:, :, 0] >= MU_D
+    used = np.empty((slots, trials), bool)
+    for k in range(slots):
+        belief = one.step(k, belief, np.ones(trials, bool), np.zeros((2, trials)))
+        used[k] = belief.action == Action.STATE
+    for kind, probability in enumerate(STRATEGIES[name].use_probabilities(PARAMETERS[name])):
+        chosen = used[1:][nu[1:] == bool(kind)]
+        if probability in {0.0, 1.0}:
+            assert np.all(chosen == bool(probability))
+        else:
+            assert stats.binomtest(int(chosen.sum()), chosen.size, probability).pvalue > 1e-6
+    if name == "suspicious":  # in slot 0 every packet is the state
+        assert stats.binomtest(int(used[0].sum()), trials, USE_STATE).pvalue > 1e-6
+    else:
+        assert used[0].all()
+
+
+def test_certain_suspicion_is_smart_or_naive() -> None:
+    """With μ_b = 1 the suspicious one is smart at μ̄_b = 0 and naive at μ̄_b = 1, to the bit."""
+    gamma, z = events(50, 20)
+    for use_innovation, twin in ((0.0, "smart"), (1.0, "naive")):
+        one = receiver("suspicious", Batch(50, 20), use_state=1.0, use_innovation=use_innovation)
+        belief = one.prior()
+        for k, expected in enumerate(beliefs(twin, Batch(50, 20), gamma, z)):
+            belief = one.step(k, belief, gamma[k], z[k])
+            assert all(np.array_equal(left, right) for left, right in zip(belief, expected, strict=True))

@@ -1,0 +1,177 @@
+"""The process: its products, its checks, its simulation, its covariances and how far float64 carries it."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from emulator.model.process import Process, StateFactors, Trajectory, mistakes_of, product
+from emulator.streams import Batch, root_of_seed, stream_key
+
+A = np.array([[1.0, 0.3], [0.5, 1.001]])
+Q = 1e-3 * np.eye(2)
+EXAMPLE = Process(A, Q, np.eye(2))
+KEY = stream_key(root_of_seed(1), "process")
+THREE = Process(
+    np.array([[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]]),
+    np.array([[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]]),
+    np.array([[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]]),
+)
+
+
+@pytest.mark.parametrize(("initial", "last"), [(1.0, 87), (1e-3, 96), (1e-12, 97)])
+def test_horizon_of_the_papers_example(initial: float, last: int) -> None:
+    """The last slot within float64's reach: 87 for Σ0 = I, 96 for Σ0 = Q, 97 for 1e-12 I."""
+    process = Process(A, Q, initial * np.eye(2))
+    assert process.horizon(200) == last
+    assert process.horizon(100_000) == last
+    assert process.horizon(last + 2) == last
+    assert process.horizon(last + 1) is None
+
+
+def test_horizon_of_a_marginally_stable_process() -> None:
+    """The microgrid's day is within reach."""
+    assert Process(np.eye(2), 1e-5 * np.eye(2), 1e-5 * np.eye(2)).horizon(86_400) is None
+
+
+def test_horizon_beyond_all_numbers() -> None:
+    """A process that overflows within the run has its horizon all the same, without a warning."""
+    assert 0 < (Process(10.0 * np.eye(1), np.eye(1), np.eye(1)).horizon(5000) or 0) < 20
+
+
+@given(st.integers(1, 4), st.integers(1, 5), st.integers(0, 2**31))
+def test_products_are_numpys(n: int, trials: int, seed: int) -> None:
+    """A x, A P Aᵀ and M x are numpy's to rounding, for every trial and in stacks."""
+    rng = np.random.default_rng(seed)
+    M, x, P = rng.standard_normal((n, n)), rng.standard_normal((n, trials)), rng.standard_normal((n, n, trials))
+    process = Process(M, np.eye(n), np.eye(n))
+    assert np.allclose(process.predict(x), M @ x, rtol=1e-12, atol=1e-12)
+    assert np.allclose(process.carry(P), np.einsum("ij,jkr,lk->ilr", M, P, M), rtol=1e-12, atol=1e-12)
+    assert np.array_equal(process.diffuse(P), P + np.eye(n)[:, :, None])
+    stack = rng.standard_normal((3, n, trials))
+    assert np.allclose(
+        product(np.stack([M, 2 * M, -M]), stack), np.stack([M, 2 * M, -M]) @ stack, rtol=1e-12, atol=1e-12
+    )
+
+
+@given(st.integers(1, 4), st.integers(2, 40), st.integers(0, 2**31), st.data())
+def test_products_do_not_depend_on_the_batch(n: int, trials: int, seed: int, data: st.DataObject) -> None:
+    """A trial's bits are the same alone and among others."""
+    rng = np.random.default_rng(seed)
+    process = Process(rng.standard_normal((n, n)), np.eye(n), np.eye(n))
+    x, P = rng.standard_normal((n, trials)), rng.standard_normal((n, n, trials))
+    r = data.draw(st.integers(0, trials - 1))
+    one = slice(r, r + 1)
+    assert process.predict(x[:, one].copy()).tobytes() == process.predict(x)[:, one].tobytes()
+    assert process.carry(P[:, :, one].copy()).tobytes() == process.carry(P)[:, :, one].tobytes()
+
+
+def states(process: Process, batch: Batch) -> np.ndarray:
+    """All states, (slots, n, R)."""
+    trajectory = Trajectory(process, KEY, batch)
+    return np.stack([trajectory.advance().copy() for _ in range(batch.slots)])
+
+
+@pytest.mark.parametrize("process", [EXAMPLE, THREE])
+def test_a_trial_alone_is_the_same_trial(process: Process) -> None:
+    """Trial 1003 alone, among 7 and among 500 is the same to the bit, and so are fewer slots."""
+    among = states(process, Batch(60, 500, 900))
+    assert states(process, Batch(60, 1, 1003)).tobytes() == np.ascontiguousarray(among[:, :, 103:104]).tobytes()
+    assert states(process, Batch(60, 7, 1000)).tobytes() == np.ascontiguousarray(among[:, :, 100:107]).tobytes()
+    assert np.array_equal(states(process, Batch(10, 500, 900)), among[:10])
+
+
+def test_states_follow_the_process() -> None:
+    """What is not A x is white noise of covariance Q, and x_0 has Σ0: chi-squared over 20 000 trials at 1e-6 confidence."""
+    trajectory = Trajectory(THREE, KEY, Batch(4, 20_000))
+    before = np.zeros((3, 20_000))
+    for k in range(4):
+        x = trajectory.advance().copy()
+        if k:
+            assert np.allclose(trajectory.predicted, THREE.A @ before, rtol=1e-12, atol=1e-13)
+        w = x - (THREE.A @ before if k else 0.0)
+        white = np.linalg.solve(np.linalg.cholesky(THREE.Q if k else THREE.initial_covariance), w)
+        distance = np.sum(white * white)
+        assert 1e-6 < stats.chi2.cdf(distance, white.size) < 1 - 1e-6
+        assert stats.kstest(white.ravel(), "norm").pvalue > 1e-6
+        before = x
+
+
+def test_covariances_are_the_recursion() -> None:
+    """Σ_k = A Σ_{k−1} Aᵀ + Q from Σ0, in closed form."""
+    found = THREE.state_covariances(20)
+    for k in (0, 1, 7, 19):
+        power = np.linalg.matrix_power
+        expected = power(THREE.A, k) @ THREE.initial_covariance @ power(THREE.A, k).T
+        expected += sum((power(THREE.A, j) @ THREE.Q @ power(THREE.A, j).T for j in range(k)), np.zeros((3, 3)))
+        assert np.allclose(found[k], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("process", [EXAMPLE, THREE])
+def test_factors_are_of_the_covariances(process: Process) -> None:
+    """A L_{k−1} times its transpose is A Σ_{k−1} Aᵀ, to 1e-12, whatever the order in which slots are asked for."""
+    factors = StateFactors(process)
+    covariances = process.state_covariances(30)
+    for k in (1, 2, 3, 29, 5, 1, 12):
+        F = np.array(factors.carried(k))
+        expected = process.A @ covariances[k - 1] @ process.A.T
+        assert np.allclose(F @ F.T, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+        assert F.tolist() == StateFactors(process).carried(k)
+
+
+def test_factors_hold_where_cholesky_fails() -> None:
+    """In the unstable example they hold at k = 60 against exact fractions, where Σ has no Cholesky factor any more."""
+    exact = [[Fraction(float(v)) for v in row] for row in EXAMPLE.initial_covariance]
+    A_, Q_ = ([[Fraction(float(v)) for v in row] for row in M] for M in (A, Q))
+
+    def times(M: list[list[Fraction]], N: list[list[Fraction]]) -> list[list[Fraction]]:
+        return [[sum((M[i][j] * N[j][c] for j in range(2)), Fraction(0)) for c in range(2)] for i in range(2)]
+
+    transposed = [list(row) for row in zip(*A_, strict=True)]
+    for k in range(1, 61):
+        exact = times(times(A_, exact), transposed)
+        if k < 60:
+            exact = [[exact[i][j] + Q_[i][j] for j in range(2)] for i in range(2)]
+    F = [[Fraction(v) for v in row] for row in StateFactors(EXAMPLE).carried(60)]
+    found = times(F, [list(row) for row in zip(*F, strict=True)])
+    for i in range(2):
+        for j in range(2):
+            assert abs(found[i][j] / exact[i][j] - 1) < Fraction(1, 10**13)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(EXAMPLE.state_covariances(60)[-1] - Q)
+
+
+def test_spectral_radius_of_the_example() -> None:
+    """ρ(A) = 1.387799, the paper's."""
+    assert abs(EXAMPLE.spectral_radius - 1.387799) < 5e-7
+
+
+MISTAKES = {
+    "rectangular A": ([[1.0, 0.0]], [[1.0]], [[1.0]], "A", "square"),
+    "Q of another size": (np.eye(2), [[1.0]], np.eye(2), "Q", "2 × 2"),
+    "infinite A": ([[np.inf]], [[1.0]], [[1.0]], "A", r"\[0\]\[0\] is inf"),
+    "asymmetric Q": (np.eye(2), [[1.0, 0.1], [0.0, 1.0]], np.eye(2), "Q", "symmetric"),
+    "indefinite Σ0": (np.eye(2), np.eye(2), [[1.0, 2.0], [2.0, 1.0]], "initial_covariance", "positive definite"),
+    "singular Q": (np.eye(2), [[1.0, 1.0], [1.0, 1.0]], np.eye(2), "Q", "positive definite"),
+    "uncontrollable": (np.eye(2), [[1.0, 0.0], [0.0, 0.0]], np.eye(2), "Q", "controllable"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named(name: str) -> None:
+    """What keeps matrices from being a process is said of the right entry."""
+    *matrices, entry, sentence = MISTAKES[name]
+    found = mistakes_of(*(np.array(M, float) for M in matrices))
+    assert any(where == entry and re.search(sentence, what) for where, what in found), found
+
+
+@pytest.mark.parametrize("process", [EXAMPLE, THREE])
+def test_a_process_has_no_mistakes(process: Process) -> None:
+    """The examples pass."""
+    assert mistakes_of(process.A, process.Q, process.initial_covariance) == []

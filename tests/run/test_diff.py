@@ -1,0 +1,124 @@
+"""Where two runs part: the first slot, trial and receiver, with both values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+import pytest
+
+from emulator import load_results, montecarlo
+from emulator.errors import UsageError
+from emulator.run.diff import difference
+from emulator.run.results import Results
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Results]:
+    """A run and others that differ from it in one respect."""
+    folder = tmp_path_factory.mktemp("runs")
+    one: dict[str, dict[str, Any]] = {
+        "whole": {},
+        "again": {},
+        "shorter": {"slots": 300},
+        "weaker": {"eavesdroppers__smart__link__quality": 0.89},
+        "other seed": {"seed": 12, "slots": 600},
+        "later trials": {"first_trial": 2, "trials": 4},
+        "far trials": {"first_trial": 100, "trials": 2},
+        "recorded": {"record_trials": 6},
+        "recorded and weaker": {"record_trials": 6, "eavesdroppers__smart__link__quality": 0.89},
+    }
+    return {
+        name: montecarlo("eavesdroppers", out=folder / name, **{"slots": 600, "trials": 6, **changes})
+        for name, changes in one.items()
+    }
+
+
+def test_equal_runs_have_no_difference(runs: dict[str, Results]) -> None:
+    """The same scenario twice; 6 trials of 4 receivers in 3 blocks."""
+    found = difference(runs["whole"], runs["again"])
+    assert found.same
+    assert found.text == "no difference in 72 blocks of 256 slots: legitimate, naive, smart, suspicious"
+
+
+def test_a_shorter_run_is_the_beginning_of_a_longer_one(runs: dict[str, Results]) -> None:
+    """Blocks cut short are not compared by digest, and the text says that there is more in one run."""
+    for pair in (("whole", "shorter"), ("shorter", "whole")):
+        found = difference(*(runs[name] for name in pair))
+        assert found.same, found.text
+        assert "are in one run only" in found.text
+
+
+def test_later_trials_are_compared_by_number(runs: dict[str, Results]) -> None:
+    """Trials 2 to 5 alone are those of the whole run."""
+    found = difference(runs["whole"], runs["later trials"])
+    assert found.same
+    assert found.text.startswith("no difference in 48 blocks")
+
+
+def test_the_first_difference_is_named_with_both_values(runs: dict[str, Results]) -> None:
+    """Slot, trial and receiver are those that a plain search through the tables finds."""
+    a, b = runs["recorded"].trials.to_pylist(), runs["recorded and weaker"].trials.to_pylist()
+    order = ("slot", "trial", "peer")
+    pairs = zip(*(sorted(rows, key=lambda row: tuple(row[key] for key in order)) for rows in (a, b)), strict=True)
+    first, other = next((x, y) for x, y in pairs if x["x_hat"] != y["x_hat"] or x["action"] != y["action"])
+    found = difference(runs["recorded"], runs["recorded and weaker"])
+    assert not found.same
+    assert first["peer"] == "smart"
+    assert found.text.startswith(f"first difference: slot {first['slot']}, trial {first['trial']}, smart: ")
+    for name in ("action", "x_hat", "P"):
+        assert (f"{name} {first[name]} against {other[name]}" in found.text) == (first[name] != other[name])
+
+
+def test_a_difference_in_a_trial_that_is_not_recorded_is_placed(runs: dict[str, Results]) -> None:
+    """Without rows, the digests still say which trial and which 256 slots, and what to do."""
+    recorded = difference(runs["recorded"], runs["recorded and weaker"]).text
+    trial = int(recorded.split("trial ")[1].split(",")[0])
+    found = difference(runs["whole"], runs["weaker"])
+    assert not found.same
+    if trial:
+        assert f"smart differs in trial {trial} within slots 0 to 255, not recorded" in found.text
+        assert f"--first-trial {trial}" in found.text
+    else:
+        assert found.text.startswith("first difference: slot ")
+
+
+def test_another_seed_differs_at_once(runs: dict[str, Results]) -> None:
+    """Slot 0 of the first trial, and the values of both runs are told."""
+    found = difference(runs["whole"], runs["other seed"])
+    assert found.text.startswith("first difference: slot 0, trial 0, legitimate: ")
+    assert " against " in found.text
+
+
+def test_runs_without_a_trial_in_common_are_not_equal(runs: dict[str, Results]) -> None:
+    """Nothing to compare is not the same as no difference."""
+    found = difference(runs["whole"], runs["far trials"])
+    assert not found.same
+    assert "in common" in found.text
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path, runs: dict[str, Results]) -> None:
+    """No folder, an empty one, a broken summary and a broken table each say what is wrong."""
+    with pytest.raises(UsageError, match="no results folder"):
+        load_results(tmp_path / "nowhere")
+    (tmp_path / "summary.json").write_text("{")
+    with pytest.raises(UsageError, match="is not JSON"):
+        load_results(tmp_path)
+    (tmp_path / "summary.json").write_text("{}")
+    (tmp_path / "slots.parquet").write_text("PAR1")
+    with pytest.raises(UsageError, match=r"slots\.parquet cannot be read"):
+        _ = load_results(tmp_path).slots
+
+
+def test_only_the_changed_eavesdropper_has_another_digest(runs: dict[str, Results]) -> None:
+    """Changing one eavesdropper's link changes no number of anybody else."""
+    peers, others = (runs[name].summary["peers"] for name in ("whole", "weaker"))
+    assert {name for name in peers if peers[name]["digest"] != others[name]["digest"]} == {"smart"}
+
+
+def test_recorded_trials_are_those_asked_for(runs: dict[str, Results]) -> None:
+    """`record_trials` trials from `first_trial` on, each with every slot of every receiver."""
+    assert sorted(pc.unique(runs["recorded"].trials["trial"]).to_pylist()) == list(range(6))
+    assert sorted(pc.unique(runs["later trials"].trials["trial"]).to_pylist()) == [2]
+    assert runs["recorded"].trials.num_rows == 6 * 600 * 4

@@ -1,0 +1,249 @@
+"""Whatever ends a run: the process at fault is named, what was measured is on disk, and no process is left."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Evedrop, Live, wait_until
+
+ENDLESS = ("--slots", "200000")
+SECONDS = 5.0
+"""A run ends within so long of a fault."""
+
+
+def ended_by_fault(live: Live) -> str:
+    """Check a run that a fault ended, just now; what was said of it."""
+    begun = time.monotonic()
+    done = live.end()
+    assert time.monotonic() - begun < SECONDS
+    assert done.status == 3, done.err
+    live.nothing_left()
+    assert live.results.summary["ended"] in done.err
+    return done.err
+
+
+def tables_whole(live: Live) -> int:
+    """Check that the tables are readable and agree with the summary; the slots on disk."""
+    results = live.results
+    slots: int = results.summary["slots"]
+    receivers = len(results.summary["peers"])
+    assert results.slots.num_rows == results.journal.num_rows == slots * receivers
+    assert results.trials.num_rows == slots * receivers
+    return slots
+
+
+@pytest.mark.parametrize("name", ["smart", "router"])
+def test_a_killed_process_is_named_and_the_results_are_kept(evedrop: Evedrop, name: str) -> None:
+    """Kill -9 of any process but the observer costs no slot that was scored."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.kill(name)
+    said = ended_by_fault(live)
+    assert f"{name} was ended by signal 9" in said
+    assert f"logs/{name}.log" in said
+    tables_whole(live)
+
+
+def test_a_killed_observer_is_named(evedrop: Evedrop) -> None:
+    """The observer holds the tables, so they are lost with it; the summary says why."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.kill("observer")
+    assert "observer was ended by signal 9" in ended_by_fault(live)
+
+
+ROGUES = {
+    "no msgpack": ("smart", "Report.pack = lambda self: b'\\xc1 nonsense'", "not msgpack"),
+    "NaN estimate": ("smart", "change(lambda self: dict(x_hat=self.x_hat * float('nan')))", "NaN"),
+    "skipped slots": ("smart", "change(lambda self: dict(first=self.first + 1))", "gap on"),
+    "NaN packet": ("sensor", "packets(lambda k, z: uplink(k, z * float('nan')))", "NaN"),
+    "skipped slot": ("sensor", "packets(lambda k, z: uplink(k + 2, z))", "gap on"),
+    "journal without a link": ("router", "Journal.pack = lambda self: pack({'k': 0, 'c': 1, 'links': {}})", "a map"),
+    "wrong progress": ("suspicious", "reporting.progress = lambda k: b''", "not msgpack"),
+}
+"""What is wrong → the process that does it, how, and what is said of it."""
+
+ROGUE = """
+import dataclasses
+import peers.sensor
+from emulator.network import reporting
+from emulator.network.wire import Journal, Report, pack, uplink
+
+def change(how, honest=Report.pack):
+    Report.pack = lambda self: honest(dataclasses.replace(self, **how(self)))
+
+def packets(how):
+    peers.sensor.uplink = lambda k, z: how(k, z) if k else uplink(k, z)
+
+"""
+
+
+def with_rogue(evedrop: Evedrop, name: str, does: str) -> dict[str, str]:
+    """The environment in which the process of that name does something else than it should."""
+    begin = f"import sys\nif sys.orig_argv[-1].endswith('/{name}.json'):\n    import rogue\n"
+    (evedrop.folder / "sitecustomize.py").write_text(begin)
+    (evedrop.folder / "rogue.py").write_text(ROGUE + does + "\n")
+    return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+
+
+@pytest.mark.parametrize("what", ROGUES)
+def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, what: str) -> None:
+    """Whoever notices, the sender is named, with what was wrong and the last lines of its log."""
+    name, does, said = ROGUES[what]
+    live = evedrop.live("eavesdroppers", *ENDLESS, env=with_rogue(evedrop, name, does))
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith(f"evedrop: {name} broke the protocol: ")
+    assert said in done.err.splitlines()[0]
+    assert f"logs/{name}.log" in done.err
+    live.nothing_left()
+    tables_whole(live)
+
+
+@pytest.mark.parametrize(
+    ("does", "said"),
+    [
+        ("def fail(self):\n    raise RuntimeError('no such luck')\nReport.pack = fail", "no such luck"),
+        ("import os\nReport.pack = lambda self: os._exit(0)", "smart left before the run ended"),
+        ("import os\nos._exit(7)", "smart ended with status 7"),
+    ],
+    ids=["exception", "leaves early", "does not start"],
+)
+def test_a_process_that_fails_is_named(evedrop: Evedrop, does: str, said: str) -> None:
+    """An exception, an early leave and a failed start all end the run, with the log."""
+    live = evedrop.live("eavesdroppers", *ENDLESS, env=with_rogue(evedrop, "smart", does))
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith("evedrop: smart ")
+    assert said in done.err
+    live.nothing_left()
+
+
+def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
+    """Packets that the journal calls delivered and that nobody received are unexplained: exit 3 after a whole run."""
+    lie = (
+        "import emulator.network.router as router\nhonest = router.delivery\n"
+        "router.delivery = lambda k, mask, z: honest(k, bytes(len(mask)), b'') if k == 7 else honest(k, mask, z)"
+    )
+    live = evedrop.live("eavesdroppers", "--slots", "40", env=with_rogue(evedrop, "router", lie))
+    assert live.end().status == 3
+    links = live.results.summary["links"]
+    assert {name for name, link in links.items() if link["unexplained"]}
+    assert "unaccounted" in live.results.summary["ended"]
+
+
+@pytest.mark.parametrize(
+    ("when", "number"),
+    [
+        ("folder", signal.SIGTERM),
+        ("first child", signal.SIGINT),
+        ("running", signal.SIGINT),
+        ("running", signal.SIGTERM),
+        ("running", signal.SIGHUP),
+    ],
+)
+def test_an_interrupted_run_leaves_results_and_no_process(evedrop: Evedrop, when: str, number: signal.Signals) -> None:
+    """Ctrl-C, SIGTERM and SIGHUP at any moment: exit 130, what was measured is readable, nothing is left."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    moments: dict[str, Callable[[], object]] = {
+        "folder": lambda: wait_until(live.folder.exists, "a results folder"),
+        "first child": lambda: wait_until(live.children, "a child"),
+        "running": live.running,
+    }
+    moments[when]()
+    live.process.send_signal(number)
+    begun = time.monotonic()
+    done = live.end()
+    assert time.monotonic() - begun < SECONDS
+    assert done.status == 130
+    assert done.err.splitlines() == ["evedrop: interrupted; what was measured is in the results folder"]
+    live.nothing_left()
+    assert live.results.summary["ended"] == "interrupted"
+    assert (tables_whole(live) > 0) == (when == "running")
+
+
+def test_an_interrupted_run_has_no_digest(evedrop: Evedrop) -> None:
+    """A digest is of a whole run or null, and --json prints the summary of an interrupted run too."""
+    live = evedrop.live("eavesdroppers", *ENDLESS, "--json")
+    live.running()
+    live.process.terminate()
+    summary = live.end().summary
+    assert {peer["digest"] for peer in summary["peers"].values()} == {None}
+    assert {link["unexplained"] for link in summary["links"].values()} == {0}
+    assert all("too few" in verdict["relative"] for verdict in summary["secrecy"].values())
+
+
+def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
+    """Children notice that their launcher is gone; the observer still writes what there is."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.process.kill()
+    live.end()
+    wait_until(lambda: not live.left(), "no process left", SECONDS)
+    assert live.results.summary["ended"] == "interrupted"
+    assert tables_whole(live) > 0
+
+
+def test_a_stopped_process_only_slows_the_run(evedrop: Evedrop) -> None:
+    """A receiver that stands still for a second loses nothing: everybody waits."""
+    live = evedrop.live("eavesdroppers", "--slots", "20000", "--json")
+    live.running()
+    live.kill("smart", signal.SIGSTOP)
+    sensor = live.child("sensor")
+    wait_until(lambda: Path(f"/proc/{sensor}/stat").read_text().rpartition(")")[2].split()[0] == "S", "a sensor asleep")
+    live.kill("smart", signal.SIGCONT)
+    done = live.end(60)
+    assert done.status == 0
+    assert {link["unexplained"] for link in done.summary["links"].values()} == {0}
+    assert all(peer["digest"] for peer in done.summary["peers"].values())
+
+
+@pytest.mark.long
+def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop) -> None:
+    """After the lease of its connection it counts as gone, and is named."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.kill("naive", signal.SIGSTOP)
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith("evedrop: naive gave no sign of life any more: hung, stopped or cut off")
+    live.nothing_left()
+    tables_whole(live)
+
+
+def test_results_that_cannot_be_written_end_the_run(evedrop: Evedrop) -> None:
+    """A full disk, played by a limit on the size of files: one clear line, exit 3, nothing left."""
+
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+
+    live = evedrop.live("eavesdroppers", "--slots", "3000", preexec_fn=small_files)
+    done = live.end()
+    assert done.status == 3
+    assert "the results cannot be written" in done.err.splitlines()[0]
+    live.nothing_left()
+    assert "cannot be written" in live.results.summary["ended"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small disk")
+def test_a_full_disk_ends_the_run(evedrop: Evedrop) -> None:
+    """The same on a disk that is really full, where not even the summary fits."""
+    disk = evedrop.folder / "disk"
+    disk.mkdir()
+    if os.system(f"mount -t tmpfs -o size=128k none {disk} 2>/dev/null"):  # noqa: S605 - our own folder
+        pytest.skip("this machine lets nobody mount")
+    try:
+        live = evedrop.live("eavesdroppers", *ENDLESS, out="disk/run")
+        done = live.end()
+        assert done.status == 3
+        assert "the results cannot be written" in done.err.splitlines()[0]
+        live.nothing_left()
+    finally:
+        os.system(f"umount {disk}")  # noqa: S605 - our own folder

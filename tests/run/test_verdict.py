@@ -1,0 +1,131 @@
+"""Verdicts on secrecy, from errors made up for the purpose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from emulator.model.process import Floats, Process
+from emulator.model.theory import Outcomes
+from emulator.run.score import WINDOWS, Tally, window_means, window_of
+from emulator.run.verdict import Secrecy, Verdict, secrecy
+
+STABLE = Process(np.diag([1.0, 0.9]), np.eye(2) * 1e-3, np.eye(2))
+SLOTS, TRIALS = 81, 60
+
+
+def tally(levels: Floats, done: int = SLOTS, slots: int = SLOTS) -> Tally:
+    """A receiver whose mean squared error is levels (WINDOWS, R) in each window of each trial."""
+    made = Tally(slots, levels.shape[1])
+    lengths = np.bincount(window_of(np.arange(1, slots), slots), minlength=WINDOWS)
+    made.window_errors = levels * lengths[:, None]
+    made.done, made.offered = done, done * made.trials
+    made.error = float(made.window_errors.sum())
+    return made
+
+
+def around(level: float | Floats, spread: float = 0.1, trials: int = TRIALS) -> Floats:
+    """Errors around a level, of each window alike or one for each."""
+    noise = np.random.default_rng(4).uniform(1 - spread, 1 + spread, (WINDOWS, trials))
+    return np.broadcast_to(np.asarray(level, float).reshape(-1, 1), (WINDOWS, trials)) * noise
+
+
+def judged(user: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> Secrecy:
+    """The verdict when theory knows a good legitimate link and an eavesdropper with these probabilities."""
+    outcomes = Outcomes.legitimate(0.9, 0.5), Outcomes.eavesdropper(mu_e, 0.5, 1.0, use_innovation)
+    return secrecy(STABLE, (user, outcomes[0]), ("eve", other, outcomes[1]))
+
+
+def test_relative_secrecy_held_where_every_window_is_above() -> None:
+    """A larger error in every window, beyond doubt."""
+    verdict = judged(tally(around(0.001)), tally(around(0.002)))
+    assert verdict.relative is Verdict.HELD
+    assert verdict.ratio == pytest.approx(2.0, rel=0.05)
+    assert "held in every window" in verdict.sentence
+
+
+def test_relative_secrecy_failed_where_one_window_is_below() -> None:
+    """One window in which the eavesdropper is better, beyond doubt, is enough."""
+    levels = np.full(WINDOWS, 0.002)
+    levels[3] = 0.0005
+    verdict = judged(tally(around(0.001)), tally(around(levels)))
+    assert verdict.relative is Verdict.FAILED
+    assert "failed" in verdict.sentence
+
+
+def test_an_unclear_window_leaves_the_verdict_open() -> None:
+    """A window whose difference may be either way is neither held nor failed."""
+    levels = np.full(WINDOWS, 0.002)
+    levels[3] = 0.001
+    other = around(levels, spread=0.9)
+    assert judged(tally(around(0.001, 0.9)[::-1]), tally(other)).relative is Verdict.UNDECIDED
+
+
+def test_one_trial_decides_nothing() -> None:
+    """However far apart the errors are."""
+    verdict = judged(tally(around(0.001, trials=1)), tally(around(9.0, trials=1)))
+    assert verdict.relative is Verdict.UNDECIDED
+    assert "--trials" in verdict.sentence
+
+
+def test_a_run_cut_short_decides_nothing() -> None:
+    """Windows of a run that was interrupted are not whole."""
+    verdict = judged(tally(around(0.001), done=40), tally(around(0.002), done=40))
+    assert (verdict.relative, verdict.relative_by_theory) == (Verdict.UNDECIDED, True)
+
+
+@pytest.mark.parametrize("slots", [1, 2, 5, 8])
+def test_fewer_slots_than_windows_are_judged_by_those_there_are(slots: int) -> None:
+    """Windows without slots are left out; without any window there is no verdict."""
+    user, other = (tally(around(level), slots, slots) for level in (0.001, 0.002))
+    means = window_means(user)
+    assert np.isnan(means).any(axis=1).sum() == WINDOWS - min(WINDOWS, slots - 1)
+    expected = Verdict.HELD if slots > 1 else Verdict.UNDECIDED
+    assert judged(user, other).relative is expected
+
+
+@pytest.mark.parametrize("slots", [1, 2, 5, 8, 9, 10, 100, 1001])
+def test_windows_cover_the_slots_from_one_on_evenly(slots: int) -> None:
+    """Every slot k ≥ 1 is in one window, in order, and lengths differ by one slot at most."""
+    windows = window_of(np.arange(slots), slots)
+    assert windows[0] == -1
+    assert list(windows[1:]) == sorted(windows[1:])
+    lengths = np.bincount(windows[1:], minlength=WINDOWS)
+    assert lengths.sum() == slots - 1
+    assert len(lengths) == WINDOWS
+    assert lengths.max() - lengths.min() <= 1
+
+
+@pytest.mark.parametrize(
+    ("levels", "verdict"),
+    [
+        (np.linspace(1.0, 9.0, WINDOWS), Verdict.HELD),
+        (np.linspace(9.0, 1.0, WINDOWS), Verdict.FAILED),
+    ],
+    ids=["grows", "falls"],
+)
+def test_perfect_secrecy_asks_for_growth(levels: Floats, verdict: Verdict) -> None:
+    """Where theory says that the eavesdropper's error has no bound, the run must show it growing."""
+    found = judged(tally(around(1e-5)), tally(around(levels)), use_innovation=1.0)
+    assert found.perfect_by_theory
+    assert found.perfect is verdict
+
+
+def test_perfect_secrecy_asks_for_a_bounded_legitimate_error() -> None:
+    """Growth is worth nothing when the legitimate error is beyond its own bound."""
+    levels = np.linspace(1.0, 9.0, WINDOWS)
+    assert judged(tally(around(5.0)), tally(around(levels)), use_innovation=1.0).perfect is Verdict.FAILED
+
+
+def test_perfect_secrecy_is_not_claimed_where_theory_denies_it() -> None:
+    """A smart eavesdropper of a marginally stable process is bounded, whatever a run shows."""
+    found = judged(tally(around(0.001)), tally(around(np.linspace(1.0, 9.0, WINDOWS))))
+    assert (found.perfect_by_theory, found.perfect) == (False, Verdict.FAILED)
+
+
+def test_theory_of_relative_secrecy_needs_a_worse_eavesdropper() -> None:
+    """An eavesdropper with a perfect link beside a poor one is better off, and theory says so."""
+    user, other = tally(around(0.001)), tally(around(0.002))
+    outcomes = Outcomes.legitimate(0.3, 0.9), Outcomes.eavesdropper(1.0, 0.9, 1.0, 0.0)
+    assert not secrecy(STABLE, (user, outcomes[0]), ("eve", other, outcomes[1])).relative_by_theory
+    assert judged(user, other).relative_by_theory

@@ -1,0 +1,270 @@
+"""The scenario file: what is refused, how it is said, and what is taken."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.errors import ScenarioError, UsageError
+from emulator.run.estimates import warnings_of
+from emulator.run.scorekeeper import resolved
+from emulator.scenario import Scenario, load, parse, shipped, value_of, write_new
+
+GOOD: dict[str, Any] = {
+    "title": "A vehicle",
+    "slots": 50,
+    "process": {
+        "A": [[1.0, 0.1], [0.0, 1.0]],
+        "Q": [[1e-3, 0.0], [0.0, 1e-3]],
+        "initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+    },
+    "encoding": {"scheme": "innovation", "state_probability": 0.5},
+    "legitimate": {"link": {"quality": 0.9}},
+    "eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.8}}},
+}
+
+
+def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
+    """What is said of the good scenario with these changes, and without one entry."""
+    tables = copy.deepcopy(GOOD)
+    *above, last = without.split(".")
+    inner = tables
+    for name in above:
+        inner = inner[name]
+    if without:
+        del inner[last]
+    with pytest.raises(ScenarioError) as caught:
+        parse(tomli_w.dumps(tables), "scenario", changes)
+    assert caught.value.exit_status == 2
+    return caught.value.mistakes
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("titel", "x", "titel: is no entry of this table; did you mean title?"),
+        ("title", "", 'title: is ""; expected a string of at least one character, such as "Two'),
+        ("slots", "many", 'slots: is "many"; expected a whole number, such as 2000'),
+        ("slots", 2.5, "slots: is 2.5; expected a whole number"),
+        ("slots", True, "slots: is true; expected a whole number"),
+        ("slots", 0, "slots: is 0; expected a number at least 1"),
+        ("slots", 2**40, "slots: is 1099511627776; expected a number at most 4294967296"),
+        ("seed", -1, "seed: is -1; expected a number at least 0"),
+        ("trials", 0, "trials: is 0; expected a number at least 1"),
+        ("record_trials", 2, "record_trials: is 2; expected at most trials, which is 1"),
+        ("pace", -0.1, "pace: is -0.1; expected a number at least 0"),
+        ("pace", float("nan"), "pace: is nan; expected"),
+        ("process.A", 3, "process.A: is 3; expected a list, such as [[1.0, 0.3], [0.5, 1.001]]"),
+        ("process.A", [[1.0, 2.0]], "process.A: has 1 row of 2 numbers; expected a square matrix, such as"),
+        ("process.A", [[1.0], [1.0, 2.0]], "process.A: has 2 rows of 1 or 2 numbers; expected a square matrix"),
+        ("process.A", [], "process.A: has no rows; expected a square matrix"),
+        ("process.A.0.1", float("inf"), "process.A: entry [0][1] is inf; expected finite numbers"),
+        ("process.A.0.1", 10**400, "process.A.0.1: is 1000"),
+        ("process.A.0.1", "x", 'process.A.0.1: is "x"; expected a number'),
+        ("process.Q", [[1e-3]], "process.Q: is 1 × 1; expected 2 × 2, as A is"),
+        ("process.Q.0.1", 1e-4, "process.Q: entry [0][1] is 0.0001 but [1][0] is 0.0; expected a symmetric matrix"),
+        ("process.Q.1.1", -1.0, "process.Q: has the eigenvalue -1; expected a positive definite matrix"),
+        ("process.initial_covariance.1.1", 0.0, "process.initial_covariance: has the eigenvalue 0; expected a positive"),
+        ("encoding.scheme", "inovation", 'encoding.scheme: is "inovation"; expected innovation or plain'),
+        ("encoding.scheme", "plain", "encoding.state_probability: is set, but the scheme plain"),
+        ("encoding.state_probability", 1.5, "encoding.state_probability: is 1.5; expected a number from 0 to 1"),
+        ("legitimate.link.quality", -0.5, "legitimate.link.quality: is -0.5; expected a number from 0 to 1, such as 0.9"),
+        ("legitimate.link.quality", "0.5", 'legitimate.link.quality: is "0.5"; expected a number, such as 0.9'),
+        ("legitimate.link", 0.5, "legitimate.link: is 0.5; expected a table, such as { quality = 0.9 }"),
+        ("eavesdroppers.smart.strategy", "clever", "expected naive, smart or suspicious"),
+        ("eavesdroppers.smart.use_state", 0.5, "is set, but the strategy smart has no such parameter"),
+        ("eavesdroppers.smart.strategy", "suspicious", "eavesdroppers.smart.use_innovation: is missing; the strategy"),
+        ("eavesdroppers.Eve", GOOD["eavesdroppers"]["smart"], 'eavesdroppers.Eve: is "Eve"; expected a name of a lower'),
+        ("eavesdroppers.router", GOOD["eavesdroppers"]["smart"], "router: is \"router\"; expected any name but sensor"),
+        (
+            "eavesdroppers",
+            {f"e{i}": GOOD["eavesdroppers"]["smart"] for i in range(65)},
+            "eavesdroppers: has more than 64 entries",
+        ),
+        ("expect", [{"figure": "smart.mean_eror", "below": 1.0}], "expect.0.figure: is \"smart.mean_eror\"; expected REC"),
+        ("expect", [{"figure": "smart.used_fraction"}], "expect.0.below: and above are both missing"),
+        ("expect", [{"figure": "smart.used_fraction", "below": float("nan")}], "expect.0.below: is nan; expected a fin"),
+        ("secret_file", "no-such-file", "secret_file: no-such-file cannot be read (No such file or directory)"),
+        ("secret_file", "/dev/null", "secret_file: /dev/null has 0 bytes; expected 32 or more"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_named_with_path_found_and_expected(key: str, value: Any, said: str) -> None:
+    """One wrong entry gives one line: its path, what was found, what was expected, an example or a hint."""
+    found = mistakes({key: value})
+    assert [line for line in found if said in line], found
+    assert "\n" not in "".join(found)
+
+
+@pytest.mark.parametrize("entry", ["title", "slots", "process", "process.Q", "encoding.scheme", "legitimate.link"])
+def test_a_missing_entry_is_named(entry: str) -> None:
+    """What must be there and is not is named by its path."""
+    assert any(line.startswith(f"{entry}: is missing; expected ") for line in mistakes({}, entry))
+
+
+def test_an_uncontrollable_pair_is_named() -> None:
+    """Noise that never reaches a direction of the state is no process of this project."""
+    found = mistakes({"process.A": [[1.0, 0.0], [0.0, 1.0]], "process.Q": [[1.0, 0.0], [0.0, 0.0]]})
+    assert any("not controllable: the noise reaches 1 of 2 directions" in line for line in found)
+
+
+def test_all_mistakes_are_named_at_once() -> None:
+    """No mistake hides another: neither a missing entry those between entries, nor a bad table its neighbours."""
+    changes = {
+        "slots": "many",
+        "titel": "x",
+        "process.Q.0.1": 1e-4,
+        "encoding.scheme": "plain",
+        "encoding.extra": 1,
+        "legitimate.link.quality": 2.0,
+        "eavesdroppers.smart.use_state": 0.5,
+        "eavesdroppers.smart.link": 3,
+        "expect": [{"figure": "nobody.used_fraction"}, {"below": 1.0}],
+        "record_trials": 9,
+    }
+    found = mistakes(changes, "process.initial_covariance")
+    for path in (
+        "slots: ",
+        "titel: ",
+        "process.Q: ",
+        "process.initial_covariance: ",
+        "encoding.extra: ",
+        "encoding.state_probability: ",
+        "legitimate.link.quality: ",
+        "eavesdroppers.smart.link: ",
+        "eavesdroppers.smart.use_state: ",
+        "expect.0.below: ",
+        "expect.0.figure: ",
+        "expect.1.figure: ",
+        "record_trials: ",
+    ):
+        assert len([line for line in found if line.startswith(path)]) == 1, path
+    assert len(found) == 13
+
+
+def test_more_slots_than_the_horizon_are_refused() -> None:
+    """The bound and three ways out are named, and the bound is exact."""
+    (said,) = mistakes({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})
+    assert "slots: is 4000; this process (spectral radius" in said
+    assert said.count(";") >= 3
+    bound = int(said.split("slots = ")[1].split()[0])
+    inside = {"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": bound}
+    assert parse(tomli_w.dumps(GOOD), "scenario", inside).slots == bound
+    assert mistakes({**inside, "slots": bound + 1})
+
+
+@pytest.mark.parametrize(("key", "value"), [("legitimate.link.quality", 0.2), ("encoding.state_probability", 0.1)])
+def test_an_unbounded_estimator_is_a_warning(key: str, value: float) -> None:
+    """A link or μ_d below the stability bound is said with bound and value, and taken."""
+    (warning,) = warnings_of(load("numerical", {key: value}))
+    assert "grows without bound" in warning
+    assert f"{value:g}" in warning
+    assert warnings_of(load("numerical")) == []
+
+
+def test_large_results_are_a_warning() -> None:
+    """A run that will write more than a gigabyte says so first."""
+    scenario = load("eavesdroppers", {"trials": 100_000, "record_trials": 100_000})
+    assert any("GB" in warning for warning in warnings_of(scenario))
+
+
+@pytest.mark.parametrize(
+    ("dotted", "said"),
+    [
+        ("a..b", "empty part"),
+        ("", "empty part"),
+        ("title.x", "x is not in a table or list"),
+        ("process.A.7.0", "7 is no entry of a list of 2; give 0 to 2"),
+        ("process.A.x", "x is no entry of a list of 2"),
+    ],
+)
+def test_a_dotted_key_that_leads_nowhere_is_refused(dotted: str, said: str) -> None:
+    """--set says which part of a key is wrong."""
+    with pytest.raises(UsageError, match=said):
+        parse(tomli_w.dumps(GOOD), "scenario", {dotted: 1})
+
+
+def test_any_entry_can_be_set() -> None:
+    """Entries of tables, of new eavesdroppers, of matrices and of lists, the next entry of a list included."""
+    changes = {
+        "slots": 7,
+        "process.A.0.1": 0.25,
+        "eavesdroppers.extra.strategy": "suspicious",
+        "eavesdroppers.extra.use_state": 0.5,
+        "eavesdroppers.extra.use_innovation": 0.25,
+        "eavesdroppers.extra.link.quality": 0.5,
+        "expect.0.figure": "extra.used_fraction",
+        "expect.0.below": 0.5,
+        "expect.1.figure": "legitimate.received_fraction",
+        "expect.1.above": 0.25,
+    }
+    scenario = parse(tomli_w.dumps(GOOD), "scenario", changes)
+    assert scenario.process.A[0] == [1.0, 0.25]
+    assert scenario.receivers == ("legitimate", "smart", "extra")
+    assert scenario.eavesdroppers["extra"].parameters == {"use_state": 0.5, "use_innovation": 0.25}
+    assert [expect.text for expect in scenario.expect] == [
+        "extra.used_fraction below 0.5",
+        "legitimate.received_fraction above 0.25",
+    ]
+
+
+@given(st.one_of(st.integers(), st.booleans(), st.floats(allow_nan=False), st.lists(st.integers()), st.text("abc d")))
+def test_values_on_the_command_line_are_toml_or_text(value: Any) -> None:
+    """What is TOML is read as such, everything else is the string it is."""
+    text = value if isinstance(value, str) else tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
+    assert value_of(text) == value
+
+
+@pytest.mark.parametrize("name", sorted(shipped()))
+def test_the_resolved_scenario_is_the_same_scenario(name: str) -> None:
+    """What a results folder keeps reads back as what was run, with the versions beside it."""
+    scenario = load(name)
+    text = resolved(scenario)
+    again = parse(text, "resolved")
+    assert again.model_dump() == scenario.model_dump()
+    assert set(tomllib.loads(text)["made_with"]) >= {"python", "evedrop", "numpy"}
+
+
+def test_a_new_scenario_is_commented_and_has_no_mistake(tmp_path: Path) -> None:
+    """`evedrop new` writes a scenario with every entry explained, and never over a file."""
+    file = tmp_path / "mine.toml"
+    write_new(file)
+    load(file)
+    text = file.read_text()
+    for entry in set(Scenario.model_fields) - {"made_with"}:
+        assert entry in text, entry
+    with pytest.raises(UsageError, match="is there already"):
+        write_new(file)
+    with pytest.raises(UsageError, match="cannot be written"):
+        write_new(tmp_path / "no" / "folder.toml")
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("eavesdroper", "did you mean eavesdroppers"),
+        ("nothing.toml", "`evedrop list`"),
+        (".", "without a scenario.toml"),
+    ],
+)
+def test_a_scenario_that_is_not_there_is_named(tmp_path: Path, source: str, said: str) -> None:
+    """A wrong name, a wrong file and a wrong folder each say what to give."""
+    with pytest.raises(UsageError, match=said):
+        load(tmp_path if source == "." else source)
+
+
+def test_what_is_no_toml_is_said_with_its_place(tmp_path: Path) -> None:
+    """A slip of the pen is told with line and column, and bytes that are no text are told as such."""
+    file = tmp_path / "slip.toml"
+    file.write_text("title = 'x'\nslots = = 3\n")
+    with pytest.raises(ScenarioError, match="line 2"):
+        load(file)
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UsageError, match="UTF-8"):
+        load(file)
