@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from emulator import run, montecarlo, load_results
+    from emulator import run, montecarlo, design, load_results
 
 Names are loaded when they are used: a peer imports this package too, and needs none of them.
 """
@@ -11,12 +11,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from emulator.api import montecarlo, run
+    from emulator.api import design, montecarlo, run
     from emulator.run.results import load_results
 
-__all__ = ["load_results", "montecarlo", "run"]
+__all__ = ["design", "load_results", "montecarlo", "run"]
 
-_HOMES = {"load_results": "emulator.run.results", "montecarlo": "emulator.api", "run": "emulator.api"}
+_HOMES = {
+    "design": "emulator.api",
+    "load_results": "emulator.run.results",
+    "montecarlo": "emulator.api",
+    "run": "emulator.api",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,14 +1,20 @@
-"""The Python calls: `run`, `montecarlo`, `load_results`. They do what the commands of the same name do."""
+"""The Python calls: `run`, `montecarlo`, `design`, `load_results`. They do what the commands of the same name do."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.network.access import LEGITIMATE
 from emulator.run.results import Results, load_results
 from emulator.scenario import Scenario, load
+
+if TYPE_CHECKING:
+    from emulator.model.design import Design
+    from emulator.run.montecarlo import Plan
 
 Tell = Callable[[Mapping[str, Any]], None]
 
@@ -59,18 +65,40 @@ def montecarlo(
     *,
     trials: int = 1000,
     out: str | Path | None = None,
+    plan: Plan | None = None,
     tell: Tell = _silent,
     **changes: Any,
 ) -> Results:
     """Run the trials of a scenario in memory, to the same bits as a live run.
 
-    Arguments and errors as for `run`; trials: how many, from `first_trial` on.
+    Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: mode and workers.
     """
-    from emulator.run.montecarlo import simulate  # noqa: PLC0415 - a live run does not need it
+    from emulator.run.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
 
     checked, folder = _prepared(scenario, out, {**changes, "trials": trials})
-    simulate(checked, folder, tell)
+    simulate(checked, folder, tell, plan or Plan())
     return load_results(folder)
+
+
+def design(
+    scenario: str | Path | Scenario, *, max_trace: float | None = None, changes: Mapping[str, Any] | None = None
+) -> Design:
+    """What μ_d may be chosen for a scenario's process and links, and what each choice costs and gives.
+
+    max_trace: Ω, for which the least μ_d is sought; changes: entries by dotted key.
+
+    Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω.
+    """
+    from emulator.model.design import Adversary  # noqa: PLC0415 - a run does not need it
+    from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
+
+    checked = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
+    adversaries = [
+        Adversary(name, table.link.quality, *STRATEGIES[table.strategy].use_probabilities(table.parameters))
+        for name, table in checked.eavesdroppers.items()
+    ]
+    process, mu, mu_d = checked.process.process, checked.quality[LEGITIMATE], checked.encoding.mu_d
+    return design_of(process, mu, mu_d, adversaries, checked.slots, max_trace)
 
 
 def _prepared(

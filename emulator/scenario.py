@@ -326,12 +326,14 @@ def write_new(path: Path) -> None:
         raise UsageError(f"{path} cannot be written ({error.strerror}); give another place") from error
 
 
-def load(source: str | Path, changes: Mapping[str, Any] | None = None) -> Scenario:
+def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False) -> Scenario:
     """The scenario of a shipped name or a file, with changes by dotted key.
+
+    beyond_horizon: allow more slots than float64 can follow exactly, for what does not follow states.
 
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
-    return parse(read(source), str(source), changes)
+    return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon)
 
 
 def read(source: str | Path) -> str:
@@ -354,7 +356,9 @@ def read(source: str | Path) -> str:
         raise UsageError(f"{source} is not text in UTF-8 ({error.reason}); a scenario is a TOML file") from error
 
 
-def parse(text: str, source: str, changes: Mapping[str, Any] | None = None) -> Scenario:
+def parse(
+    text: str, source: str, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False
+) -> Scenario:
     """The scenario in a TOML text. Raises ScenarioError with every mistake."""
     try:
         tables = tomllib.loads(text)
@@ -365,14 +369,14 @@ def parse(text: str, source: str, changes: Mapping[str, Any] | None = None) -> S
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:
-        raise ScenarioError(source, [*_sentences(error), *_across_tables(tables)]) from error
-    mistakes = _across_tables(tables)
+        raise ScenarioError(source, [*_sentences(error), *_across_tables(tables, beyond_horizon)]) from error
+    mistakes = _across_tables(tables, beyond_horizon)
     if mistakes:
         raise ScenarioError(source, mistakes)
     return scenario
 
 
-def _across_tables(tables: Mapping[str, Any]) -> list[str]:
+def _across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
     """What only shows across tables, asked as far as a faulty file allows it: horizon, trials, figures."""
     found: list[str] = []
     slots, trials, recorded = (tables.get(name, 1) for name in ("slots", "trials", "record_trials"))
@@ -380,7 +384,7 @@ def _across_tables(tables: Mapping[str, Any]) -> list[str]:
         process = ProcessTable.model_validate(tables.get("process")).process
     except ValidationError:
         process = None
-    if process is not None and type(slots) is int and 1 <= slots <= 2**32:
+    if process is not None and not beyond_horizon and type(slots) is int and 1 <= slots <= 2**32:
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -64,6 +64,22 @@ class Slots:
             for name, one in self.receivers.items()
         }
         return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers)
+
+
+def concatenated(parts: Sequence[Slots]) -> Slots:
+    """Consecutive slots as one; the fates' reasons, which nobody asks for any more, are left out."""
+
+    def column(name: str, one: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part.receivers[name], one) for part in parts])
+
+    receivers = {
+        name: ReceiverSlots(**{one: column(name, one) for one in _ARRAYS}, lost={}) for name in parts[0].receivers
+    }
+    x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
+    return Slots(parts[0].first, x, nu, receivers)
+
+
+_ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
 
 
 class Joiner:

@@ -17,8 +17,9 @@ import numpy as np
 from emulator.errors import Interrupted, UsageError
 from emulator.model.digest import BLOCK_SLOTS, RunDigest
 from emulator.run.histogram import SlotHistograms
+from emulator.run.joined import concatenated
 from emulator.run.results import ResultsWriter, new_folder, write_summary
-from emulator.run.score import SlotSums, Tally, merged
+from emulator.run.score import SlotSums, Tally, merged, squared_errors
 from emulator.run.scorekeeper import Ending, expected_traces_of, resolved, summary_of
 from emulator.run.signals import stop_on_signals
 from emulator.run.simulation import Mode
@@ -59,12 +60,13 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
     """
     check_mode(scenario, plan.mode)
     workers = plan.workers_for(scenario)
-    new_folder(folder)
-    started = time.monotonic()
-    (folder / "scenario.toml").write_text(resolved(scenario))
     with stop_on_signals() as stop:
-        results = _results(tasks_of(scenario, plan.mode, workers), workers, plan.scheduler, _teller(tell), stop.is_set)
-        merger = _Merger(scenario, plan.mode)
+        started = time.monotonic()
+        tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
+        results = results_of(tasks, workers, plan.scheduler, told, stop.is_set)
+        new_folder(folder)
+        (folder / "scenario.toml").write_text(resolved(scenario))
+        merger = Merger(scenario, plan.mode)
         with ResultsWriter(folder, scenario.receivers, len(scenario.process.A)) as writer:
             for result in results:
                 merger.add(result, writer)
@@ -77,7 +79,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
         write_summary(folder, summary)
     if not complete:
         raise Interrupted("interrupted; what was done is in the results folder")
-    return 0 if all(expectation["held"] for expectation in summary["expectations"]) else 1
+    return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
@@ -93,9 +95,10 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
             )
 
 
-def _results(
+def results_of(
     tasks: list[Task], workers: int, scheduler: str | None, tell: Callable[[int], None], stopped: Callable[[], bool]
 ) -> Iterator[BatchResult]:
+    """What the tasks came to, in their order, done where the plan says."""
     if scheduler is not None:
         return on_cluster(tasks, scheduler, tell, stopped)
     if workers == 1 or len(tasks) == 1:
@@ -103,7 +106,7 @@ def _results(
     return in_processes(tasks, min(workers, len(tasks)), tell, stopped)
 
 
-def _teller(tell: Callable[[News], None]) -> Callable[[int], None]:
+def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
     """Progress in trial-slots, with their rate, a few times a second."""
     started = told = time.monotonic()
     done = 0
@@ -114,12 +117,20 @@ def _teller(tell: Callable[[News], None]) -> Callable[[int], None]:
         now = time.monotonic()
         if now - told > _TELL_SECONDS:
             told = now
-            tell({"event": "progress", "done": done, "rate": done / (now - started), "rate_unit": "trial-slots/s"})
+            tell(
+                {
+                    "event": "progress",
+                    "total": total,
+                    "done": done,
+                    "rate": done / (now - started),
+                    "rate_unit": "trial-slots/s",
+                }
+            )
 
     return take
 
 
-class _Merger:
+class Merger:
     """Adds up results in trial order. Final."""
 
     def __init__(self, scenario: Scenario, mode: Mode) -> None:
@@ -140,8 +151,9 @@ class _Merger:
         done = (tally.done == tally.slots for tallies in self._tallies.values() for tally in tallies.values())
         return self.trials == self._scenario.trials and all(done)
 
-    def add(self, result: BatchResult, writer: ResultsWriter) -> None:
-        """Take the next batch."""
+    @np.errstate(over="ignore")
+    def add(self, result: BatchResult, writer: ResultsWriter | None = None) -> None:
+        """Take the next batch; its digests and recorded trials are written if there is somewhere to."""
         for block in result.blocks:
             self.trials += block.trials
             for name in self._scenario.receivers:
@@ -155,17 +167,21 @@ class _Merger:
                     mine[name].merge(histograms)
                 else:
                     mine[name] = histograms
-        for slots, errors in result.recorded:
+        if writer is not None and result.recorded:
+            slots = concatenated(result.recorded)
+            errors = {name: squared_errors(slots.x, one.x_hat) for name, one in slots.receivers.items()}
             writer.trial_rows(slots, errors, result.start)
 
-    def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter) -> None:
-        writer.digest_rows(start, digests)
+    def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter | None) -> None:
+        if writer is not None:
+            writer.digest_rows(start, digests)
         blocks = -(-self._scenario.slots // BLOCK_SLOTS)
         for name, of_blocks in digests.items():
             self._whole &= len(of_blocks) == blocks
             if self._whole:
                 self._digests[name].add(of_blocks)
 
+    @np.errstate(over="ignore")
     def write(self, writer: ResultsWriter) -> None:
         """Write the rows of all slots."""
         expected = expected_traces_of(self._scenario)
@@ -173,6 +189,7 @@ class _Merger:
             quantiles = np.hstack([self._errors[name].quantiles(), self._traces[name].quantiles()])
             writer.slot_rows(0, name, self._sums[name], expected[name], quantiles, self._mode is Mode.COVARIANCE_ONLY)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> dict[str, Any]:
         """The summary of all that was added."""
         totals = {name: merged(tallies) for name, tallies in self._tallies.items()}

@@ -173,7 +173,7 @@ class Observation:
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
             summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
-        if status == 0 and not all(expectation["held"] for expectation in summary["expectations"]):
+        if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
             status = 1
         try:
             write_summary(self.folder, summary)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -20,6 +21,11 @@ from rich.progress import (
 )
 from rich.table import Table
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from emulator.model.design import Design
+
 News = Mapping[str, Any]
 
 
@@ -29,6 +35,7 @@ class ProgressLine:
     def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
         self.console = Console(stderr=True, highlight=False)
         self._quiet = quiet
+        self._total = total
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -63,6 +70,7 @@ class ProgressLine:
             self._progress.update(
                 self._task,
                 description="running",
+                total=news.get("total", self._total),
                 completed=news["done"],
                 rate=f"{news['rate']:,.0f} {news['rate_unit']}",
                 errors="  ".join(f"{name} {error:.2g}" for name, error in news.get("squared_errors", {}).items()),
@@ -73,20 +81,25 @@ class ProgressLine:
 
 def closing_table(summary: News) -> Table:
     """Per receiver: what it received, its error, and what it believed of it."""
-    trials = f"{summary['trials']} trials" if summary["trials"] > 1 else "1 trial"
+    trials = f"{summary['trials']:,} trials" if summary["trials"] > 1 else "1 trial"
     rate = f"{summary['slots_per_second']:,.0f} slots/s"
-    title = f"{summary['scenario']} · {summary['slots']} slots · {trials} · {rate}"
+    if summary["mode"] != "live":
+        rate = f"{summary['slots_per_second'] * summary['trials']:,.0f} trial-slots/s in memory"
+    title = f"{summary['scenario']} · {summary['slots']:,} slots · {trials} · {rate}"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("receiver", no_wrap=True)
-    for head in ("received", "used", "mean |x−x̂|²", "believed tr P", "expected tr P"):
+    covariances = summary["mode"] == "covariance-only"
+    error = "actual tr P" if covariances else "mean |x−x̂|²"
+    for head in ("received", "used", error, "believed tr P", "expected tr P"):
         table.add_column(head, justify="right", no_wrap=True)
     table.add_column("digest", no_wrap=True)
     for name, peer in summary["peers"].items():
+        found = peer["mean_actual_trace_covariance" if covariances else "mean_squared_error"]
         table.add_row(
             name,
             f"{float(peer['received_fraction']):.4f}",
             f"{float(peer['used_fraction']):.4f}",
-            f"{float(peer['mean_squared_error']):.4g}",
+            f"{float(found):.4g}",
             f"{float(peer['mean_trace_covariance']):.4g}",
             f"{float(peer['expected_trace_covariance']):.4g}",
             (peer["digest"] or "–")[:12],
@@ -94,15 +107,102 @@ def closing_table(summary: News) -> Table:
     return table
 
 
-def print_summary(summary: News, folder: str) -> None:
-    """The closing report on standard output."""
-    console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 100)
+def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
+    """The closing report on standard output; replay: the command that shows one trial live, to complete."""
+    console = _console()
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
     console.print(closing_table(summary))
     for verdict in summary["secrecy"].values():
         console.print(verdict["sentence"])
+    for name, peer in summary["peers"].items():
+        if peer["infinite_variance"] and peer["error_quantiles"] and summary["trials"] > 1:
+            low, middle, high = (f"{float(value):.3g}" for value in peer["error_quantiles"].values())
+            console.print(
+                f"{name}: its error has infinite variance, so the mean over trials is no measure; "
+                f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
+            )
     for expectation in summary["expectations"]:
-        word = "held" if expectation["held"] else "FAILED"
-        console.print(f"expected {expectation['text']}: {word}, found {float(expectation['found']):.4g}")
+        word = {True: "held", False: "FAILED", None: "not measured in this mode"}[expectation["held"]]
+        found = "" if expectation["found"] is None else f", found {float(expectation['found']):.4g}"
+        console.print(f"expected {expectation['text']}: {word}{found}")
+    surprising = summary["surprising"]
+    if surprising is not None:
+        console.print(
+            f"most surprising: trial {surprising['trial']}, {surprising['receiver']}, mean error "
+            f"{surprising['mean_error']:.3g} against {surprising['median']:.3g} in the median trial"
+        )
+        if replay is not None:
+            console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
     console.print(f"results: {folder}")
+
+
+def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
+    """A row a point and peer."""
+    shown = Table(box=SIMPLE_HEAD)
+    columns = [*keys, "peer", "mean error", "expected tr P", "believed tr P", "relative secrecy"]
+    for column in columns:
+        shown.add_column(column, justify="left" if column in {"peer", "relative secrecy"} else "right", no_wrap=True)
+    for row in table.to_pylist():
+        error = row["mean_squared_error"]
+        error = row["mean_actual_trace_covariance"] if error is None else error
+        shown.add_row(
+            *(f"{row[key]}" for key in keys),
+            row["peer"],
+            f"{error:.4g}",
+            f"{row['expected_trace_covariance']:.4g}",
+            f"{row['mean_trace_covariance']:.4g}",
+            row["relative_secrecy"] or "–",
+        )
+    console = _console()
+    console.print(shown)
+    console.print(f"results: {folder}/sweep.parquet, sweep.png")
+
+
+def print_design(design: Design) -> None:
+    """Bounds, intervals, optima and the price of secrecy, for people."""
+    console = _console()
+    console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
+    if design.remark is not None:
+        console.print(design.remark)
+    else:
+        console.print(
+            f"admissible: {design.bound:.6g} < μ_d ≤ 1; at this scenario's μ_d = {design.mu_d:g} the legitimate trace is "
+            f"{design.trace:.4g}, {design.cost:.3g} times that of sending every state ({design.plain_trace:.4g})"
+        )
+    if design.minimum is not None:
+        console.print(f"least μ_d for the wanted trace: {design.minimum:.6g}")
+    table = Table(box=SIMPLE_HEAD)
+    table.add_column("against", no_wrap=True)
+    for head in (
+        "bounded from",
+        "perfect secrecy",
+        "relative secrecy",
+        "best J_r",
+        "best J_r/J",
+        "its trace",
+        "holds from slot",
+    ):
+        table.add_column(head, justify="right", no_wrap=True)
+    for name, against in design.eavesdroppers.items():
+        table.add_row(
+            name,
+            _number(against.bound),
+            "none" if against.perfect is None else f"({against.perfect[0]:.5f}, {against.perfect[1]:.5f}]",
+            "none"
+            if not against.relative
+            else " ∪ ".join(f"({low:.5f}, {high:.5f})" for low, high in against.relative),
+            "–" if against.best_difference is None else f"{against.best_difference:.5f}",
+            "–" if against.best_ratio is None else f"{against.best_ratio:.5f}",
+            _number(against.trace),
+            "–" if against.relative_from is None else str(against.relative_from),
+        )
+    console.print(table)
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else "∞"
+
+
+def _console() -> Console:
+    return Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)

@@ -164,7 +164,7 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, A
 def _expectation(expect: ExpectTable, peers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     receiver, figure = expect.figure.split(".")
     found = peers[receiver][figure]
-    return {"text": expect.text, "held": found is not None and expect.holds(found), "found": found}
+    return {"text": expect.text, "held": None if found is None else expect.holds(found), "found": found}
 
 
 def digest_of(scenario: Scenario, blocks: Mapping[int, Digests]) -> str | None:

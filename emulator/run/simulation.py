@@ -32,7 +32,7 @@ from emulator.run.score import squared_errors
 from emulator.scenario import Scenario
 from emulator.streams import Batch
 
-_CHUNK_NUMBERS = 131_072  # states of a chunk of slots: about a megabyte an array
+_CHUNK_NUMBERS = 64  # slots of a chunk times states: with 2000 trials side by side, a megabyte an array
 
 
 class Mode(StrEnum):
@@ -92,7 +92,7 @@ class Simulation:
 
     def chunks(self) -> Iterator[Chunk]:
         """All slots, some tens or hundreds at a time."""
-        slots, trials = self._batch.slots, self._batch.trials
+        slots = self._batch.slots
         names = self._scenario.receivers
         links = {name: link_of(self._scenario.link(name).spec, self._keys.link(name), self._batch) for name in names}
         play = {
@@ -100,7 +100,8 @@ class Simulation:
             Mode.ERROR_COORDINATES: self._error_coordinates,
             Mode.COVARIANCE_ONLY: self._covariances,
         }[self._mode]()
-        length = max(1, min(slots, BLOCK_SLOTS, _CHUNK_NUMBERS // (self._process.n * trials)))
+        # The same for any number of trials, so that sums over slots are formed in the same order.
+        length = max(1, min(slots, _CHUNK_NUMBERS // self._process.n))
         for block in range(0, slots, BLOCK_SLOTS):
             end = min(block + BLOCK_SLOTS, slots)
             for first in range(block, end, length):

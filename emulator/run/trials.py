@@ -17,7 +17,7 @@ from emulator.model.links.link import Fate, losses
 from emulator.model.process import Floats
 from emulator.run.histogram import SlotHistograms
 from emulator.run.joined import Slots
-from emulator.run.score import SlotSums, Tally, slot_sums, squared_errors
+from emulator.run.score import SlotSums, Tally, slot_sums
 from emulator.run.scorekeeper import expected_traces_of
 from emulator.run.simulation import Chunk, Measured, Mode, Simulation
 from emulator.scenario import Scenario
@@ -56,8 +56,8 @@ class BatchResult:
     blocks: list[Block]
     errors: dict[str, SlotHistograms]
     traces: dict[str, SlotHistograms]
-    recorded: list[tuple[Slots, dict[str, Floats]]] = field(default_factory=list)
-    """The recorded trials of the task, with their squared errors."""
+    recorded: list[Slots] = field(default_factory=list)
+    """The recorded trials of the task, in parts."""
 
 
 def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
@@ -87,10 +87,7 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     for chunk in simulation.chunks():
         _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
         if chunk.recorded is not None:
-            errors = {
-                name: squared_errors(chunk.recorded.x, one.x_hat) for name, one in chunk.recorded.receivers.items()
-            }
-            result.recorded.append((chunk.recorded.copied(), errors))
+            result.recorded.append(chunk.recorded.copied())
         tell(len(trials) * _count(chunk))
         if stopped():
             break
@@ -112,7 +109,9 @@ def _empty_block(names: tuple[str, ...], slots: int, start: int, stop: int) -> B
     )
 
 
+@np.errstate(over="ignore")
 def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None:
+    """Take a chunk. The square of a naive receiver's error may leave double precision; then it is inf, as it should."""
     for name, measured in chunk.receivers.items():
         for block, part in _parts(result.blocks, result.start, measured):
             trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)

@@ -6,13 +6,14 @@ Source: docs/mathematics.md, secrecy and design; docs/results.md, verdict.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
 from emulator.model.process import Floats, Process
-from emulator.model.theory import Outcomes, expected_traces, limit_trace
+from emulator.model.theory import Outcomes, expected_traces, has_infinite_variance, limit_trace
 from emulator.run.score import WINDOWS, Tally, window_means
 
 CONFIDENCE = 0.99
@@ -38,7 +39,10 @@ class Secrecy:
     perfect_by_theory: bool
     """J bounded and J_e not."""
     ratio: float
-    """Mean squared error, eavesdropper's over legitimate."""
+    """Mean error, eavesdropper's over legitimate."""
+    trials: int
+    judged_by: str
+    """`mean` over trials, or `median` where an error has infinite variance and a mean is no measure."""
 
     def as_dict(self) -> dict[str, str | bool]:
         """As in the summary."""
@@ -47,6 +51,7 @@ class Secrecy:
             "perfect": self.perfect.value,
             "relative_by_theory": self.relative_by_theory,
             "perfect_by_theory": self.perfect_by_theory,
+            "judged_by": self.judged_by,
             "sentence": self.sentence,
         }
 
@@ -58,14 +63,21 @@ class Secrecy:
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",
             Verdict.FAILED: "relative secrecy failed in this run",
-            Verdict.UNDECIDED: "too few trials to decide from this run (try --trials 200)",
+            Verdict.UNDECIDED: f"{self.trials} trials are too few to decide"
+            if self.trials > 1
+            else "one trial decides nothing (try --trials 200)",
         }[self.relative]
         if self.perfect is Verdict.HELD:
             run = "perfect secrecy held in this run: its error grew while the legitimate one stayed bounded"
-        return f"{self.eavesdropper}: {times} × the legitimate squared error; {run}; theory promises {theory} secrecy"
+        if self.judged_by == "median" and self.trials > 1:
+            run += " (judged by medians, for the variance is infinite)"
+        return f"{self.eavesdropper}: {times} × the legitimate error; {run}; theory promises {theory} secrecy"
 
 
-def _bounds(samples: Floats) -> tuple[float, float]:
+Bounds = Callable[[Floats], tuple[float, float]]
+
+
+def mean_bounds(samples: Floats) -> tuple[float, float]:
     """One-sided 99 % bounds below and above the mean of samples (R,), by Student's t."""
     from scipy.special import stdtrit  # noqa: PLC0415 - 0.2 s that only a verdict needs
 
@@ -77,21 +89,34 @@ def _bounds(samples: Floats) -> tuple[float, float]:
     return mean - reach, mean + reach
 
 
-def _relative(difference: Floats) -> Verdict:
+def median_bounds(samples: Floats) -> tuple[float, float]:
+    """One-sided 99 % bounds below and above the median of samples (R,), by order statistics, whatever their tails."""
+    from scipy.special import bdtr, bdtrik  # noqa: PLC0415 - as above
+
+    count = len(samples)
+    ordered = np.sort(samples)
+    # The largest rank that, by the binomial law of how many samples lie below the median, is too high only once in 100.
+    rank = int(bdtrik(1.0 - CONFIDENCE, count, 0.5)) if bdtr(0, count, 0.5) <= 1.0 - CONFIDENCE else -1
+    if rank < 0:
+        return -math.inf, math.inf
+    return float(ordered[rank]), float(ordered[count - 1 - rank])
+
+
+def _relative(difference: Floats, bounds_of: Bounds) -> Verdict:
     """From the mean error differences of each window and trial, (WINDOWS, R)."""
-    bounds = [_bounds(row) for row in difference if not np.isnan(row).any()]
+    bounds = [bounds_of(row) for row in difference if not np.isnan(row).any()]
     if any(high < 0.0 for _, high in bounds):
         return Verdict.FAILED
     return Verdict.HELD if bounds and all(low > 0.0 for low, _ in bounds) else Verdict.UNDECIDED
 
 
-def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float) -> Verdict:
+def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: Bounds) -> Verdict:
     """Grows from the first to the last quarter, while the legitimate error stays within its bound."""
     quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
         return Verdict.UNDECIDED
-    growth = _bounds(eavesdropper[-quarter:].mean(axis=0) - eavesdropper[:quarter].mean(axis=0))
-    error = _bounds(legitimate[-quarter:].mean(axis=0))
+    growth = bounds_of(eavesdropper[-quarter:].mean(axis=0) - eavesdropper[:quarter].mean(axis=0))
+    error = bounds_of(legitimate[-quarter:].mean(axis=0))
     if growth[1] < 0.0 or error[0] > bound:
         return Verdict.FAILED
     return Verdict.HELD if growth[0] > 0.0 else Verdict.UNDECIDED
@@ -106,11 +131,13 @@ def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: 
     slots = user.slots if complete else max(user.done, 2)
     gap = expected_traces(process, other_outcomes, slots) - expected_traces(process, user_outcomes, slots)
     user_means, other_means = window_means(user), window_means(other)
-    relative = _relative(other_means - user_means) if complete else Verdict.UNDECIDED
+    heavy = any(has_infinite_variance(process, one) for one in (user_outcomes, other_outcomes))
+    bounds_of = median_bounds if heavy else mean_bounds
+    relative = _relative(other_means - user_means, bounds_of) if complete else Verdict.UNDECIDED
     if not perfect_by_theory:
         perfect = Verdict.FAILED
     else:
-        perfect = _perfect(other_means, user_means, user_bound) if complete else Verdict.UNDECIDED
+        perfect = _perfect(other_means, user_means, user_bound, bounds_of) if complete else Verdict.UNDECIDED
     ratio = other.error / user.error if user.error else math.inf
     return Secrecy(
         name,
@@ -119,4 +146,6 @@ def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: 
         bool(math.isfinite(user_bound) and np.all(gap[1:] > 0.0)),
         perfect_by_theory,
         ratio,
+        user.trials,
+        "median" if heavy else "mean",
     )

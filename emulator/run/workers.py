@@ -142,12 +142,16 @@ def on_cluster(tasks: list[Task], scheduler: str, tell: Tell, stopped: Stopped) 
     except ImportError as error:
         raise UsageError("--scheduler needs Dask: pip install 'evedrop[cluster]'") from error
     try:
-        client = Client(scheduler, timeout=5, set_as_default=False)
+        client = Client(scheduler, timeout=5, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
             f"--scheduler {scheduler}: no Dask scheduler answers there within 5 s; start one with `dask scheduler`, "
             "and give its address, such as tcp://127.0.0.1:8786"
         ) from error
+    return _from_cluster(client, tasks, tell, stopped)
+
+
+def _from_cluster(client: Any, tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
     with contextlib.closing(client):
         futures = [client.submit(_on_worker, task, pure=False) for task in tasks]
         try:

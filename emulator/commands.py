@@ -1,0 +1,281 @@
+"""What each command does: reads its options, calls the module that does the work, prints what came out.
+
+Every import of weight waits for the command that needs it, so that `evedrop --help` and a peer start quickly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from emulator.errors import BriefError, Interrupted, RunError, UsageError
+
+if TYPE_CHECKING:
+    from emulator.run.montecarlo import Plan
+    from emulator.run.viewer import Viewer
+    from emulator.scenario import Scenario
+
+
+def _changes(options: argparse.Namespace) -> dict[str, Any]:
+    from emulator.scenario import value_of
+
+    changes: dict[str, Any] = {}
+    for change in options.changes:
+        key, equals, value = change.partition("=")
+        if not equals or not key:
+            raise UsageError(f"--set {change}: expected KEY=VALUE, such as --set legitimate.link.quality=0.8")
+        changes[key] = value_of(value)
+    for name in ("seed", "slots", "trials", "first_trial", "record_trials", "pace"):
+        value = getattr(options, name, None)
+        if value is not None:
+            changes[name] = value
+    if getattr(options, "secret", None) is not None:
+        changes["secret_file"] = str(options.secret.absolute())
+    return changes
+
+
+def list_scenarios(_: argparse.Namespace) -> int:
+    """A line for each shipped scenario."""
+    from emulator.scenario import load, shipped
+
+    for name in shipped():
+        print(f"{name:<16}{load(name).title}")
+    return 0
+
+
+def new(options: argparse.Namespace) -> int:
+    """Write the commented scenario."""
+    from emulator.scenario import write_new
+
+    write_new(options.file)
+    print(f"{options.file} written; change it, then: evedrop run {options.file}")
+    return 0
+
+
+def demo(options: argparse.Namespace) -> int:
+    """Run `vehicle` live."""
+    options.scenario = "vehicle"
+    return run(options)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run a scenario live."""
+    from emulator.api import default_folder
+    from emulator.run.launcher import launch
+    from emulator.run.report import ProgressLine
+
+    scenario = _loaded(options)
+    folder = options.out or default_folder(options.scenario)
+    with ProgressLine(scenario.slots, "slots", options.json) as line:
+        try:
+            ended = launch(scenario, folder, options.view, options.listen, line.tell)
+        except (RunError, Interrupted):
+            _print_results(folder, options.json)
+            raise
+    _print_results(folder, options.json)
+    if ended.viewer is not None:
+        _keep_open(ended.viewer)
+    return ended.status
+
+
+def _loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
+    from emulator.run.estimates import warnings_of
+    from emulator.scenario import load
+
+    scenario = load(options.scenario, _changes(options), beyond_horizon=beyond_horizon)
+    for warning in warnings_of(scenario):
+        print(f"evedrop: warning: {warning}", file=sys.stderr)
+    return scenario
+
+
+def _print_results(folder: Path, as_json: bool) -> None:
+    from emulator.run.report import print_summary
+    from emulator.run.results import load_results
+
+    try:
+        summary = load_results(folder).summary
+    except UsageError:
+        return
+    if as_json:
+        print(json.dumps(summary, ensure_ascii=False))
+    else:
+        replay = f"evedrop run {folder}" if summary["mode"] == "exact" and summary["ended"] == "complete" else None
+        print_summary(summary, str(folder), replay)
+
+
+def _keep_open(viewer: Viewer) -> None:
+    """From a terminal the view stays until Ctrl-C or until it is closed; from a pipe it ends with the command."""
+    try:
+        if sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
+            where = f" at {viewer.address}" if viewer.address else ""
+            print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
+            viewer.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.stop()
+
+
+def montecarlo(options: argparse.Namespace) -> int:
+    """Run the trials of a scenario in memory."""
+    from emulator.api import default_folder
+    from emulator.run.montecarlo import simulate
+    from emulator.run.report import ProgressLine
+
+    options.trials = 1000 if options.trials is None else options.trials
+    plan = _plan(options)
+    scenario = _loaded(options, beyond_horizon=options.mode != "exact")
+    folder = options.out or default_folder(options.scenario)
+    with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
+        try:
+            status = simulate(scenario, folder, line.tell, plan)
+        except Interrupted:
+            _print_results(folder, options.json)
+            raise
+    _print_results(folder, options.json)
+    return status
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    from emulator.run.montecarlo import Plan
+    from emulator.run.simulation import Mode
+
+    return Plan(Mode(options.mode), options.workers, options.scheduler)
+
+
+def sweep(options: argparse.Namespace) -> int:
+    """Run Monte Carlo over a grid."""
+    from emulator.api import default_folder
+    from emulator.run.report import ProgressLine, print_sweep
+    from emulator.run.sweep import grid_of, sweep_over
+
+    options.trials = 1000 if options.trials is None else options.trials
+    grid = grid_of(options.over)
+    plan = _plan(options)
+    folder = options.out or default_folder(f"{Path(options.scenario).stem}-sweep")
+    with ProgressLine(0, "trial-slots", options.json) as line:
+        table = sweep_over(options.scenario, _changes(options), grid, folder, line.tell, plan)
+    if options.json:
+        print(json.dumps(table.to_pylist(), ensure_ascii=False))
+    else:
+        print_sweep(table, tuple(grid), str(folder))
+    return 0
+
+
+def design(options: argparse.Namespace) -> int:
+    """Say which μ_d may be chosen, and what each costs and gives."""
+    from emulator.api import design as design_of
+    from emulator.run.report import print_design
+
+    found = design_of(options.scenario, max_trace=options.max_trace, changes=_changes(options))
+    if options.json:
+        print(json.dumps(found.as_dict(), ensure_ascii=False))
+    else:
+        print_design(found)
+    return 0
+
+
+def figures(options: argparse.Namespace) -> int:
+    """Draw the paper's figures."""
+    from emulator.view.figures import Size
+    from emulator.view.figures import figures as draw
+
+    try:
+        report = draw(
+            options.folder,
+            lambda text: print(text, file=sys.stderr),
+            Size(microgrid_trials=1000) if options.full else Size(),
+        )
+    except OSError as error:
+        raise UsageError(f"{options.folder} cannot be written ({error.strerror}); give another folder") from error
+    print(report)
+    return 0
+
+
+def view(options: argparse.Namespace) -> int:
+    """Open a finished run."""
+    from emulator.run.viewer import open_run
+
+    _keep_open(open_run(options.run, options.view))
+    return 0
+
+
+def diff(options: argparse.Namespace) -> int:
+    """Compare two runs."""
+    from emulator.run.diff import difference
+    from emulator.run.results import load_results
+
+    found = difference(*(load_results(run) for run in options.runs))
+    print(found.text)
+    return 0 if found.same else 1
+
+
+def check(options: argparse.Namespace) -> int:
+    """Validate scenarios."""
+    from emulator.run.estimates import warnings_of
+    from emulator.scenario import load
+
+    status = 0
+    for name in options.scenarios:
+        try:
+            scenario = load(name, _changes(options))
+        except UsageError as error:
+            print(error, file=sys.stderr)
+            status = error.exit_status
+            continue
+        print(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
+        for warning in warnings_of(scenario):
+            print(f"  warning: {warning}")
+    return status
+
+
+def selftest(_: argparse.Namespace) -> int:
+    """Compare this machine with every other."""
+    from emulator.run.selftest import GOLDEN, selftest
+
+    check = selftest()
+    for name, value in check.machine.items():
+        print(f"{name:<16}{value}")
+    for name, digest in check.digests.items():
+        print(f"{name:<16}{digest}  {'golden' if GOLDEN.get(name) == digest else 'NOT the golden digest'}")
+    if not check.passed:
+        raise RunError("this machine does not compute the golden digests; please report the lines above")
+    return 0
+
+
+def brief(options: argparse.Namespace) -> int:
+    """Write the briefs."""
+    from emulator.run.briefs import write_briefs
+
+    for path in write_briefs(_loaded(options), options.listen, options.results, options.out):
+        print(path)
+    return 0
+
+
+def process(options: argparse.Namespace) -> int:
+    """Be one process of a run."""
+    from emulator.brief import read_brief
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    brief = read_brief(options.brief, options.role)
+    match options.role:
+        case "router":
+            from emulator.network.router import route as play
+        case "sensor":
+            from peers.sensor import sense as play
+        case "legitimate":
+            from peers.legitimate import estimate as play
+        case "eavesdropper":
+            from peers.eavesdropper import eavesdrop as play
+        case "observer":
+            from emulator.run.observer import observe
+
+            return observe(brief)
+        case _:
+            raise BriefError(f"no role {options.role}; give one of those that `evedrop --help` lists")
+    play(brief)
+    return 0
