@@ -144,12 +144,12 @@ def test_one_state_is_drawn_over_time(simulated: Callable[..., Simulated], tmp_p
 
 def test_long_runs_have_bounded_frames() -> None:
     """200 000 slots as fast as they go have some thousand frames, the last slot among them; real time has 30 a second."""
-    fast = Scene("", "r", 200_000, 1, 2, 0.0, ())
+    fast = Scene("", "r", 200_000, 1, 2, 0.0, (), 1.0)
     offsets = np.concatenate([first + plane.frames(fast, first, 1000) for first in range(0, 200_000, 1000)])
     assert len(offsets) <= 4001
     assert offsets[-1] == 199_999
-    assert plane.stride(Scene("", "r", 3000, 1, 2, 0.02, ())) == 2
-    assert plane.stride(Scene("", "r", 300, 1, 2, 0.0, ())) == 1
+    assert plane.stride(Scene("", "r", 3000, 1, 2, 0.02, (), 1.0)) == 2
+    assert plane.stride(Scene("", "r", 300, 1, 2, 0.0, (), 1.0)) == 1
 
 
 def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) -> None:
