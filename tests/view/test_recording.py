@@ -3,14 +3,14 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from read_back import rows
 from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
-from emulator.view import paths, plane
+from emulator.view import plane
 from emulator.view.recording import Recording, Scene
 
 SLOTS = 400
@@ -25,15 +25,6 @@ def record(run: Simulated, rrd: Path, chunk: int = 60) -> None:
     assert recording.close()
     assert recording.failure is None
     assert recording.dropped == 0
-
-
-def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
-    """The component's values of one entity, by slot."""
-    found: dict[int, Any] = {}
-    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
-        columns = chunk.to_record_batch().to_pydict()
-        found |= dict(zip(columns[paths.TIMELINE], columns[component], strict=True))
-    return found
 
 
 def lane(rrd: Path, entity: str, slots: int) -> list[str]:
