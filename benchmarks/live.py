@@ -22,8 +22,8 @@ from emulator.brief import Brief
 from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
 from emulator.network.session import Session
 from emulator.network.wire import progress, uplink
-from emulator.run.briefs import Observation, briefs_of
-from emulator.run.launcher import free_port
+from emulator.runs.briefs import Observation, briefs_of
+from emulator.runs.launcher import free_port
 from emulator.scenario import load
 
 RECEIVERS = 4
@@ -129,7 +129,7 @@ def _receive(brief: Brief) -> None:
 
 def _watch(brief: Brief) -> None:
     """The conductor's part: start when all are there, end when the journal is complete."""
-    from emulator.run.conductor import Conductor, Stop  # noqa: PLC0415
+    from emulator.runs.conductor import Conductor, Stop  # noqa: PLC0415
 
     receivers = tuple(brief.part["scenario"]["eavesdroppers"])
     with Session(brief) as session:
@@ -170,7 +170,7 @@ def start_up(rounds: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             code = (
                 "import sys, time\nfrom pathlib import Path\nfrom emulator.scenario import load\n"
-                "from emulator.run.launcher import launch\n"
+                "from emulator.runs.launcher import launch\n"
                 "def tell(news):\n    if news['event'] == 'started': print(time.monotonic(), flush=True)\n"
                 f"launch(load('eavesdroppers', {{'slots': 10}}), Path({folder!r}) / 'run', {view!r}, None, tell)\n"
             )

@@ -17,7 +17,7 @@ import msgpack
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from emulator.run.launcher import free_port
+from emulator.runs.launcher import free_port
 
 _KEY = "raw/uplink"
 

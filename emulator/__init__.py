@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from emulator.api import design, montecarlo, run
-    from emulator.run.results import load_results
+    from emulator.runs.results import load_results
 
 __all__ = ["design", "load_results", "montecarlo", "run"]
 
 _HOMES = {
     "design": "emulator.api",
-    "load_results": "emulator.run.results",
+    "load_results": "emulator.runs.results",
     "montecarlo": "emulator.api",
     "run": "emulator.api",
 }

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.network.access import LEGITIMATE
-from emulator.run.results import Results, load_results
+from emulator.runs.results import Results, load_results
 from emulator.scenario import Scenario, load
 
 if TYPE_CHECKING:
     from emulator.model.design import Design
-    from emulator.run.montecarlo import Plan
+    from emulator.runs.montecarlo import Plan
 
 Tell = Callable[[Mapping[str, Any]], None]
 
@@ -51,7 +51,7 @@ def run(
     >>> results.summary["peers"]["smart"]["mean_squared_error"]         # doctest: +SKIP
     >>> results.slots.to_pandas()                                       # doctest: +SKIP
     """
-    from emulator.run.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
+    from emulator.runs.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
 
     checked, folder = _prepared(scenario, out, changes)
     ended = launch(checked, folder, view, listen, tell)
@@ -73,7 +73,7 @@ def montecarlo(
 
     Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: mode and workers.
     """
-    from emulator.run.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
+    from emulator.runs.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
 
     checked, folder = _prepared(scenario, out, {**changes, "trials": trials})
     simulate(checked, folder, tell, plan or Plan())

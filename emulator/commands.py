@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from emulator.errors import BriefError, Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
-    from emulator.run.montecarlo import Plan
-    from emulator.run.viewer import Viewer
+    from emulator.runs.montecarlo import Plan
+    from emulator.runs.viewer import Viewer
     from emulator.scenario import Scenario
 
 
@@ -65,8 +65,8 @@ def demo(options: argparse.Namespace) -> int:
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
     from emulator.api import default_folder
-    from emulator.run.launcher import launch
-    from emulator.run.report import ProgressLine
+    from emulator.runs.launcher import launch
+    from emulator.runs.report import ProgressLine
 
     scenario = _loaded(options)
     folder = options.out or default_folder(options.scenario)
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
-    from emulator.run.estimates import warnings_of
+    from emulator.runs.estimates import warnings_of
     from emulator.scenario import load
 
     scenario = load(options.scenario, _changes(options), beyond_horizon=beyond_horizon)
@@ -93,8 +93,8 @@ def _loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenar
 
 
 def _print_results(folder: Path, as_json: bool) -> None:
-    from emulator.run.report import print_summary
-    from emulator.run.results import load_results
+    from emulator.runs.report import print_summary
+    from emulator.runs.results import load_results
 
     try:
         summary = load_results(folder).summary
@@ -123,8 +123,8 @@ def _keep_open(viewer: Viewer) -> None:
 def montecarlo(options: argparse.Namespace) -> int:
     """Run the trials of a scenario in memory."""
     from emulator.api import default_folder
-    from emulator.run.montecarlo import simulate
-    from emulator.run.report import ProgressLine
+    from emulator.runs.montecarlo import simulate
+    from emulator.runs.report import ProgressLine
 
     options.trials = 1000 if options.trials is None else options.trials
     plan = _plan(options)
@@ -141,8 +141,8 @@ def montecarlo(options: argparse.Namespace) -> int:
 
 
 def _plan(options: argparse.Namespace) -> Plan:
-    from emulator.run.montecarlo import Plan
-    from emulator.run.simulation import Mode
+    from emulator.runs.montecarlo import Plan
+    from emulator.runs.simulation import Mode
 
     return Plan(Mode(options.mode), options.workers, options.scheduler)
 
@@ -150,8 +150,8 @@ def _plan(options: argparse.Namespace) -> Plan:
 def sweep(options: argparse.Namespace) -> int:
     """Run Monte Carlo over a grid."""
     from emulator.api import default_folder
-    from emulator.run.report import ProgressLine, print_sweep
-    from emulator.run.sweep import grid_of, sweep_over
+    from emulator.runs.report import ProgressLine, print_sweep
+    from emulator.runs.sweep import grid_of, sweep_over
 
     options.trials = 1000 if options.trials is None else options.trials
     grid = grid_of(options.over)
@@ -169,7 +169,7 @@ def sweep(options: argparse.Namespace) -> int:
 def design(options: argparse.Namespace) -> int:
     """Say which μ_d may be chosen, and what each costs and gives."""
     from emulator.api import design as design_of
-    from emulator.run.report import print_design
+    from emulator.runs.report import print_design
 
     found = design_of(options.scenario, max_trace=options.max_trace, changes=_changes(options))
     if options.json:
@@ -198,7 +198,7 @@ def figures(options: argparse.Namespace) -> int:
 
 def view(options: argparse.Namespace) -> int:
     """Open a finished run, or draw it."""
-    from emulator.run.viewer import open_run
+    from emulator.runs.viewer import open_run
 
     recording = options.run / "recording.rrd"
     if not recording.is_file():
@@ -217,8 +217,8 @@ def view(options: argparse.Namespace) -> int:
 
 def diff(options: argparse.Namespace) -> int:
     """Compare two runs."""
-    from emulator.run.diff import difference
-    from emulator.run.results import load_results
+    from emulator.runs.diff import difference
+    from emulator.runs.results import load_results
 
     found = difference(*(load_results(run) for run in options.runs))
     print(found.text)
@@ -227,7 +227,7 @@ def diff(options: argparse.Namespace) -> int:
 
 def check(options: argparse.Namespace) -> int:
     """Validate scenarios."""
-    from emulator.run.estimates import warnings_of
+    from emulator.runs.estimates import warnings_of
     from emulator.scenario import load
 
     status = 0
@@ -246,7 +246,7 @@ def check(options: argparse.Namespace) -> int:
 
 def selftest(_: argparse.Namespace) -> int:
     """Compare this machine with every other."""
-    from emulator.run.selftest import GOLDEN, selftest
+    from emulator.runs.selftest import GOLDEN, selftest
 
     check = selftest()
     for name, value in check.machine.items():
@@ -260,7 +260,7 @@ def selftest(_: argparse.Namespace) -> int:
 
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
-    from emulator.run.briefs import write_briefs
+    from emulator.runs.briefs import write_briefs
 
     for path in write_briefs(_loaded(options), options.listen, options.results, options.out):
         print(path)
@@ -283,7 +283,7 @@ def process(options: argparse.Namespace) -> int:
         case "eavesdropper":
             from peers.eavesdropper import eavesdrop as play
         case "observer":
-            from emulator.run.observer import observe
+            from emulator.runs.observer import observe
 
             return observe(brief)
         case _:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from emulator.brief import Brief, read_brief
-from emulator.run.results import Results, load_results
+from emulator.runs.results import Results, load_results
 
 LIMIT = 40.0
 """Seconds after which a condition that a test waits for counts as never met: far above what a busy machine needs."""

@@ -13,7 +13,7 @@ import pytest
 
 from emulator.brief import Brief, Flow, Model, read_brief
 from emulator.errors import BriefError
-from emulator.run.briefs import Observation, StreamKeys, briefs_of
+from emulator.runs.briefs import Observation, StreamKeys, briefs_of
 from emulator.scenario import Scenario
 
 BRIEF = Brief(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.run.results import load_results
+from emulator.runs.results import load_results
 from emulator.scenario import load, shipped
 from tests.conftest import Done, Evedrop
 
@@ -222,7 +222,7 @@ def test_the_selftest_passes(evedrop: Evedrop) -> None:
 def test_a_wrong_golden_digest_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit 3, and the receiver whose digest is not the golden one is marked."""
     from emulator import cli
-    from emulator.run import selftest
+    from emulator.runs import selftest
 
     monkeypatch.setattr(selftest, "GOLDEN", {**selftest.GOLDEN, "smart": "0" * 64})
     assert cli.main(["selftest"]) == 3

@@ -46,7 +46,7 @@ def packages(names: set[str]) -> set[str]:
 
 
 def ours(names: set[str]) -> set[str]:
-    """Our own parts among modules: such as emulator.run."""
+    """Our own parts among modules: such as emulator.runs."""
     return {".".join(name.split(".")[:2]) for name in names if name.startswith(("emulator.", "peers."))}
 
 
@@ -54,7 +54,7 @@ def test_peers_and_network_stay_light() -> None:
     """Peers and network load zenoh, msgpack, numpy, cryptography, and neither view nor results nor scenarios."""
     for module, names in loaded_by(*modules_of("peers"), *modules_of("emulator/network")).items():
         assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "_cffi_backend"}, module
-        assert not ours(names) & {"emulator.view", "emulator.run", "emulator.scenario", "emulator.api"}, module
+        assert not ours(names) & {"emulator.view", "emulator.runs", "emulator.scenario", "emulator.api"}, module
 
 
 THEORY = ("design", "markov", "theory")
@@ -76,7 +76,7 @@ def test_theory_may_use_scipy_and_no_more() -> None:
         assert ours(names) <= {"emulator.model", "emulator.streams", "emulator.errors"}, module
 
 
-@pytest.mark.parametrize("module", ["emulator.run.launcher", "emulator.run.montecarlo", "emulator.api"])
+@pytest.mark.parametrize("module", ["emulator.runs.launcher", "emulator.runs.montecarlo", "emulator.api"])
 def test_launcher_and_memory_load_neither_zenoh_nor_rerun(module: str) -> None:
     """The launcher stays clear of what could hang, so that it can end it; Monte Carlo and the Python calls need neither."""
     assert not packages(loaded_by(module)[module]) & {"zenoh", "rerun", "matplotlib"}

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.errors import ScenarioError, UsageError
-from emulator.run.estimates import warnings_of
-from emulator.run.scorekeeper import resolved
+from emulator.runs.estimates import warnings_of
+from emulator.runs.scorekeeper import resolved
 from emulator.scenario import Scenario, load, parse, shipped, value_of, write_new
 
 GOOD: dict[str, Any] = {

@@ -14,8 +14,8 @@ from pathlib import Path
 from rerun.experimental import ViewerClient
 
 from emulator.errors import UsageError
-from emulator.run.launcher import free_port
-from emulator.run.viewer import end, spawn
+from emulator.runs.launcher import free_port
+from emulator.runs.viewer import end, spawn
 from emulator.view.paths import TIMELINE
 
 _LOAD_SECONDS = 60.0

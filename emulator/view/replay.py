@@ -11,8 +11,8 @@ import pyarrow.compute as pc
 from emulator.errors import UsageError
 from emulator.model.process import Floats
 from emulator.model.receiver import Action
-from emulator.run.observer import open_recording
-from emulator.run.results import Results, load_results
+from emulator.runs.observer import open_recording
+from emulator.runs.results import Results, load_results
 from emulator.scenario import load
 from emulator.view.scene import PeerSlots, Slots
 

@@ -20,8 +20,8 @@ import zenoh
 from emulator.brief import Brief, Flow
 from emulator.network.access import Keys
 from emulator.network.session import client_config
-from emulator.run.briefs import Observation, briefs_of
-from emulator.run.launcher import free_port
+from emulator.runs.briefs import Observation, briefs_of
+from emulator.runs.launcher import free_port
 from emulator.scenario import Scenario
 
 LIMIT_SECONDS = 20.0

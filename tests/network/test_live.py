@@ -22,8 +22,8 @@ from emulator import montecarlo
 from emulator.brief import Brief, read_brief
 from emulator.network import wire
 from emulator.network.access import Keys
-from emulator.run.briefs import StreamKeys
-from emulator.run.results import load_results
+from emulator.runs.briefs import StreamKeys
+from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
 from emulator.streams import stream_key
 

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from emulator.errors import EvedropError, Gap, MalformedMessage, RunError
 from emulator.network import wire
-from emulator.run.joined import Joiner
+from emulator.runs.joined import Joiner
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)

@@ -18,9 +18,9 @@ from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.process import Trajectory
 from emulator.model.schemes import SCHEMES
 from emulator.network import wire
-from emulator.run.briefs import Observation, StreamKeys, briefs_of
-from emulator.run.launcher import free_port
-from emulator.run.results import load_results
+from emulator.runs.briefs import Observation, StreamKeys, briefs_of
+from emulator.runs.launcher import free_port
+from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
 from emulator.streams import Batch
 

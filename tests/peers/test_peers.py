@@ -21,7 +21,7 @@ from emulator.errors import Gap, MalformedMessage
 from emulator.network import wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
-from emulator.run.briefs import Observation, briefs_of
+from emulator.runs.briefs import Observation, briefs_of
 from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
 from peers.legitimate import estimate

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from emulator.api import load_results, montecarlo, run
-from emulator.run.results import Results
+from emulator.runs.results import Results
 from emulator.scenario import load, shipped
 
 SLOTS = 300

@@ -6,8 +6,8 @@ from read_back import rows
 
 from emulator import load_results, montecarlo
 from emulator.errors import UsageError
-from emulator.run.montecarlo import Plan
-from emulator.run.simulation import Mode
+from emulator.runs.montecarlo import Plan
+from emulator.runs.simulation import Mode
 from emulator.view.replay import replay
 
 SLOTS = 120

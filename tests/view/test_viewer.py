@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
 from emulator.errors import UsageError
-from emulator.run.viewer import Viewer, choose, open_run
+from emulator.runs.viewer import Viewer, choose, open_run
 from emulator.view.recording import Recording
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -110,7 +110,7 @@ def test_hung_viewer_is_stopped(viewer: Viewer) -> None:
 STARTER = """
 import sys, time
 from pathlib import Path
-from emulator.run.viewer import Viewer
+from emulator.runs.viewer import Viewer
 viewer = Viewer.start("web", Path(sys.argv[1]))
 print(viewer._process.pid, flush=True)
 time.sleep(600)

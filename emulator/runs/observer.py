@@ -26,10 +26,10 @@ from emulator.brief import Brief
 from emulator.errors import EvedropError, Interrupted, RunError
 from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
 from emulator.network.session import Session
-from emulator.run.conductor import Conductor, Stop
-from emulator.run.joined import Joiner, Slots
-from emulator.run.results import ResultsWriter, write_summary
-from emulator.run.scorekeeper import Ending, Scored, Scorekeeper, digest_of, resolved, summary_of
+from emulator.runs.conductor import Conductor, Stop
+from emulator.runs.joined import Joiner, Slots
+from emulator.runs.results import ResultsWriter, write_summary
+from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, resolved, summary_of
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:

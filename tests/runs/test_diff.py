@@ -10,8 +10,8 @@ import pytest
 
 from emulator.api import load_results, montecarlo
 from emulator.errors import UsageError
-from emulator.run.diff import difference
-from emulator.run.results import Results
+from emulator.runs.diff import difference
+from emulator.runs.results import Results
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.model.digest import BLOCK_SLOTS
-from emulator.run.results import Results
+from emulator.runs.results import Results
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")
 

@@ -16,15 +16,15 @@ import numpy as np
 
 from emulator.errors import Interrupted, UsageError
 from emulator.model.digest import BLOCK_SLOTS, RunDigest
-from emulator.run.histogram import SlotHistograms
-from emulator.run.joined import concatenated
-from emulator.run.results import ResultsWriter, new_folder, write_summary
-from emulator.run.score import SlotSums, Tally, merged, squared_errors
-from emulator.run.scorekeeper import Ending, expected_traces_of, resolved, summary_of
-from emulator.run.signals import stop_on_signals
-from emulator.run.simulation import Mode
-from emulator.run.trials import BatchResult, Task, tasks_of
-from emulator.run.workers import in_processes, in_this_process, on_cluster
+from emulator.runs.histogram import SlotHistograms
+from emulator.runs.joined import concatenated
+from emulator.runs.results import ResultsWriter, new_folder, write_summary
+from emulator.runs.score import SlotSums, Tally, merged, squared_errors
+from emulator.runs.scorekeeper import Ending, expected_traces_of, resolved, summary_of
+from emulator.runs.signals import stop_on_signals
+from emulator.runs.simulation import Mode
+from emulator.runs.trials import BatchResult, Task, tasks_of
+from emulator.runs.workers import in_processes, in_this_process, on_cluster
 from emulator.scenario import Scenario
 
 _WORTH_A_PROCESS = 2_000_000  # trial-slots and receivers: below, starting workers costs more than it saves

@@ -23,9 +23,9 @@ from emulator.model.digest import DIGEST_BYTES, Digests
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
 from emulator.network.wire import packed_flags
-from emulator.run.histogram import LEVELS
-from emulator.run.joined import Slots
-from emulator.run.score import SlotSums
+from emulator.runs.histogram import LEVELS
+from emulator.runs.joined import Slots
+from emulator.runs.score import SlotSums
 
 _ROWS = 65_536  # rows of a table held back until they are worth writing
 

@@ -16,10 +16,10 @@ from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.process import Floats
 from emulator.model.theory import ExpectedCovariance, Outcomes, expected_traces, has_infinite_variance
 from emulator.network.access import LEGITIMATE
-from emulator.run.histogram import LEVELS
-from emulator.run.joined import Slots
-from emulator.run.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
-from emulator.run.verdict import Secrecy, secrecy
+from emulator.runs.histogram import LEVELS
+from emulator.runs.joined import Slots
+from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
+from emulator.runs.verdict import Secrecy, secrecy
 from emulator.scenario import ExpectTable, Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials

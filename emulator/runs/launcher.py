@@ -27,14 +27,14 @@ from typing import TYPE_CHECKING, Any
 from emulator.brief import Brief
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
-from emulator.run.briefs import Observation, briefs_of
-from emulator.run.results import ResultsWriter, load_results, new_folder, write_summary
-from emulator.run.score import Tally
-from emulator.run.scorekeeper import Ending, summary_of
+from emulator.runs.briefs import Observation, briefs_of
+from emulator.runs.results import ResultsWriter, load_results, new_folder, write_summary
+from emulator.runs.score import Tally
+from emulator.runs.scorekeeper import Ending, summary_of
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
-    from emulator.run.viewer import Viewer
+    from emulator.runs.viewer import Viewer
 
 News = Mapping[str, Any]
 _GRACE_SECONDS = 3.0  # for the observer to begin to write what there is, and for the others to leave
@@ -155,7 +155,7 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
 def _viewer(view: str, logs: Path) -> Viewer | None:
     if view == "off":
         return None
-    from emulator.run.viewer import Viewer, choose  # noqa: PLC0415 - a run without view needs none of it
+    from emulator.runs.viewer import Viewer, choose  # noqa: PLC0415 - a run without view needs none of it
 
     return Viewer.start(choose(view), logs)
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from emulator import scenario
 from emulator.api import montecarlo
-from emulator.run.results import ACTIONS, DIGESTS, JOURNAL, Results, load_results
+from emulator.runs.results import ACTIONS, DIGESTS, JOURNAL, Results, load_results
 from emulator.scenario import parse
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -15,7 +15,7 @@ from queue import Empty
 from typing import Any
 
 from emulator.errors import RunError, UsageError
-from emulator.run.trials import BatchResult, Task, carry_out
+from emulator.runs.trials import BatchResult, Task, carry_out
 
 _LOOK_SECONDS = 0.1
 

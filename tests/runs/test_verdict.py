@@ -7,8 +7,8 @@ import pytest
 
 from emulator.model.process import Floats, Process
 from emulator.model.theory import Outcomes
-from emulator.run.score import WINDOWS, Tally, window_means, window_of
-from emulator.run.verdict import Secrecy, Verdict, secrecy
+from emulator.runs.score import WINDOWS, Tally, window_means, window_of
+from emulator.runs.verdict import Secrecy, Verdict, secrecy
 
 STABLE = Process(np.diag([1.0, 0.9]), np.eye(2) * 1e-3, np.eye(2))
 SLOTS, TRIALS = 81, 60

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulator.run.montecarlo import simulate
-from emulator.run.results import load_results
+from emulator.runs.montecarlo import simulate
+from emulator.runs.results import load_results
 from emulator.scenario import Scenario
 
 GOLDEN: Mapping[str, str] = {

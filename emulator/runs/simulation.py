@@ -26,9 +26,9 @@ from emulator.model.receiver import Codes, Flags, Receiver, trace_of
 from emulator.model.schemes import SCHEMES
 from emulator.model.theory import misled_covariances
 from emulator.network.access import LEGITIMATE
-from emulator.run.briefs import StreamKeys
-from emulator.run.joined import ReceiverSlots, Slots
-from emulator.run.score import squared_errors
+from emulator.runs.briefs import StreamKeys
+from emulator.runs.joined import ReceiverSlots, Slots
+from emulator.runs.score import squared_errors
 from emulator.scenario import Scenario
 from emulator.streams import Batch
 

@@ -14,11 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.errors import Interrupted, ScenarioError, UsageError
-from emulator.run.montecarlo import Merger, Plan, check_mode, results_of, teller
-from emulator.run.results import new_folder
-from emulator.run.scorekeeper import Ending
-from emulator.run.signals import stop_on_signals
-from emulator.run.trials import tasks_of
+from emulator.runs.montecarlo import Merger, Plan, check_mode, results_of, teller
+from emulator.runs.results import new_folder
+from emulator.runs.scorekeeper import Ending
+from emulator.runs.signals import stop_on_signals
+from emulator.runs.trials import tasks_of
 from emulator.scenario import FIGURES, Scenario, load, value_of
 
 Grid = Mapping[str, Sequence[Any]]

@@ -14,7 +14,7 @@ import numpy as np
 
 from emulator.model.process import Floats, Process
 from emulator.model.theory import Outcomes, expected_traces, has_infinite_variance, limit_trace
-from emulator.run.score import WINDOWS, Tally, window_means
+from emulator.runs.score import WINDOWS, Tally, window_means
 
 CONFIDENCE = 0.99
 
