@@ -125,6 +125,8 @@ def _live(parser: argparse.ArgumentParser) -> None:
 
 def _finished_view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it into a file instead; needs no screen")
+    parser.add_argument("--slot", type=int, metavar="K", help="the moment to draw; default the last")
 
 
 def _memory(parser: argparse.ArgumentParser) -> None:

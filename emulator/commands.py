@@ -197,10 +197,21 @@ def figures(options: argparse.Namespace) -> int:
 
 
 def view(options: argparse.Namespace) -> int:
-    """Open a finished run."""
+    """Open a finished run, or draw it."""
     from emulator.run.viewer import open_run
 
-    _keep_open(open_run(options.run, options.view))
+    recording = options.run / "recording.rrd"
+    if not recording.is_file():
+        from emulator.view.replay import replay
+
+        recording = replay(options.run)
+    if options.picture is None:
+        _keep_open(open_run(options.run, options.view))
+        return 0
+    from emulator.view.picture import picture
+
+    for complaint in picture(recording, options.picture, slot=options.slot):
+        print(complaint, file=sys.stderr)
     return 0
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from emulator.run.results import load_results
-from emulator.scenario import shipped
+from emulator.scenario import load, shipped
 from tests.conftest import Done, Evedrop
 
 QUICK = ("--slots", "40", "--view", "off")
@@ -247,7 +247,7 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
     assert evedrop("brief", "numerical", "--out", "briefs").status == 0
     briefs = sorted((evedrop.folder / "briefs").iterdir())
     assert [path.name for path in briefs] == [
-        f"{name}.json" for name in ("legitimate", "naive", "observer", "router", "sensor", "smart")
+        f"{name}.json" for name in sorted({"observer", "router", "sensor", *load("numerical").receivers})
     ]
     assert {path.stat().st_mode & 0o777 for path in briefs} == {0o600}
     refused(evedrop("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")

@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 import pytest
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -25,6 +25,7 @@ def counter_mode(key: bytes, k: int, r: int, per_trial: int) -> list[int]:
     return np.frombuffer(keystream, "<u8")[:per_trial].tolist()
 
 
+@settings(deadline=None)
 @given(
     st.binary(min_size=32, max_size=32),
     SLOTS,
@@ -59,6 +60,7 @@ def test_keys_are_keyed_blake2b() -> None:
     assert len(found) == 15
 
 
+@settings(deadline=None)
 @given(st.data(), st.integers(1, 40), st.integers(1, 6), st.integers(1, 3), st.integers(0, 1000))
 def test_reader_gives_the_same_numbers_in_any_order(
     data: st.DataObject, slots: int, trials: int, per_trial: int, first: int

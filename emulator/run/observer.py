@@ -219,6 +219,7 @@ def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -
         n=len(scenario.process.A),
         pace=scenario.pace,
         receivers=tuple(receivers),
+        noise=float(np.trace(scenario.process.process.Q)),
     )
     return Recording(path, scene, live)
 

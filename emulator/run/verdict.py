@@ -39,7 +39,7 @@ class Secrecy:
     perfect_by_theory: bool
     """J bounded and J_e not."""
     ratio: float
-    """Mean error, eavesdropper's over legitimate."""
+    """Mean error, eavesdropper's over legitimate; NaN before the first slot."""
     trials: int
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance and a mean is no measure."""
@@ -59,6 +59,8 @@ class Secrecy:
     def sentence(self) -> str:
         """One sentence for the closing report."""
         theory = "perfect" if self.perfect_by_theory else "relative" if self.relative_by_theory else "no"
+        if math.isnan(self.ratio):
+            return f"{self.eavesdropper}: nothing was measured; theory promises {theory} secrecy"
         times = "∞" if math.isinf(self.ratio) else f"{self.ratio:.3g}"
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",
@@ -138,7 +140,7 @@ def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: 
         perfect = Verdict.FAILED
     else:
         perfect = _perfect(other_means, user_means, user_bound, bounds_of) if complete else Verdict.UNDECIDED
-    ratio = other.error / user.error if user.error else math.inf
+    ratio = other.error / user.error if user.error else math.inf if user.done else math.nan
     return Secrecy(
         name,
         relative,

@@ -17,9 +17,6 @@ from emulator.view.lanes import Lane
 from emulator.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
 from emulator.view.scene import PeerSlots, Scene, Slots
 
-_DECADES_BELOW = 1.0
-_FLOOR_WITHOUT_THEORY = 1e-6
-
 
 @dataclass(frozen=True)
 class Column:
@@ -51,7 +48,7 @@ class Columns:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._floor: float | None = None
+        self._floor = _floor(scene)
         self._last: dict[str, int] = {}
         self._frame = plane.Frame()
         every = plane.stride(scene)
@@ -60,8 +57,6 @@ class Columns:
 
     def of(self, slots: Slots) -> Batch:
         """The columns of the next slots."""
-        if self._floor is None:
-            self._floor = _floor(self._scene, slots)
         k = np.arange(slots.first, slots.first + slots.count)
         columns: list[Column] = []
         opening: list[tuple[str, int, str]] = []
@@ -91,7 +86,6 @@ class Columns:
 
     def _log10(self, values: Floats) -> Floats:
         """log10 with everything below the floor on it: a state that was received is known exactly."""
-        assert self._floor is not None  # noqa: S101 - set before the first curve
         with np.errstate(invalid="ignore"):
             logarithms: Floats = np.log10(np.maximum(values, self._floor))
         return logarithms
@@ -224,10 +218,7 @@ def _scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
     return Column(path, k, rr.Scalars.columns(scalars=values))
 
 
-def _floor(scene: Scene, slots: Slots) -> float:
-    """Smallest value a curve shows: one to two decades below what the legitimate estimator's error should be."""
-    expected = slots.peers[scene.receivers[0].name].expected_trace
-    usable = expected[np.isfinite(expected) & (expected > 0.0)]
-    if not usable.size:
-        return _FLOOR_WITHOUT_THEORY
-    return float(10.0 ** (np.floor(np.log10(usable.min())) - _DECADES_BELOW))
+def _floor(scene: Scene) -> float:
+    """Smallest value a curve shows: a decade below one step's noise, two below it for a mean of trials with and without."""
+    decades = 1 if scene.trials == 1 else 2
+    return float(10.0 ** (np.floor(np.log10(scene.noise)) - decades))

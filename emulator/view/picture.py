@@ -22,13 +22,16 @@ _LOAD_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
 
 
-def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950)) -> list[str]:
-    """Draw the last moment of a recording into a PNG file of this size; what the panels complain about, if anything.
+def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int | None = None) -> list[str]:
+    """Draw a moment of a recording, by default its last, into a PNG file; what the panels complain about, if anything.
 
-    Raises UsageError if there is no Vulkan driver or the recording cannot be loaded.
+    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written.
     """
-    with opened(rrd, size) as viewer:
-        png.write_bytes(viewer.take_screenshot())
+    with opened(rrd, size, slot) as viewer:
+        try:
+            png.write_bytes(viewer.take_screenshot())
+        except OSError as error:
+            raise UsageError(f"{png} cannot be written ({error.strerror}); give another file") from error
         return reports(viewer)
 
 
@@ -38,8 +41,8 @@ def reports(viewer: ViewerClient) -> list[str]:
 
 
 @contextmanager
-def opened(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
-    """A headless viewer that has loaded a recording and shows its last moment, ready to be drawn.
+def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterator[ViewerClient]:
+    """A headless viewer that has loaded a recording and shows a moment of it, by default the last, ready to be drawn.
 
     Raises UsageError as `picture` does.
     """
@@ -56,7 +59,7 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
             raise UsageError(_without_driver(str(error)) or str(error)) from error
         try:
             viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            _show_the_end(viewer)
+            _show(viewer, slot)
             yield viewer
         except (RuntimeError, ConnectionError) as error:
             log = (logs / "viewer.log").read_text(errors="replace")
@@ -65,13 +68,13 @@ def opened(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
             end(process)
 
 
-def _show_the_end(viewer: ViewerClient) -> None:
+def _show(viewer: ViewerClient, slot: int | None) -> None:
     deadline = time.monotonic() + _LOAD_SECONDS
     while (last := _last_slot(viewer)) is None:
         if time.monotonic() > deadline:
             raise RuntimeError(f"the recording was not loaded within {_LOAD_SECONDS:.0f} s")
         time.sleep(0.05)
-    viewer.set_time(TIMELINE, sequence=last, play_state="paused")
+    viewer.set_time(TIMELINE, sequence=last if slot is None else min(slot, last), play_state="paused")
     deadline = time.monotonic() + _SETTLE_SECONDS
     before, now = b"", viewer.take_screenshot()
     while now != before and time.monotonic() < deadline:

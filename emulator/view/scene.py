@@ -38,6 +38,8 @@ class Scene:
     """Seconds a slot; 0 as fast as it goes."""
     receivers: tuple[Shown, ...]
     """The legitimate one first."""
+    noise: float
+    """Trace of Q: the squared error of one step."""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def logged(beliefs: list[Belief], n: int, trials: int) -> dict[int, np.ndarray]:
     return found
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.sampled_from([1, 5, 255, 256, 257, 512, 600]), st.integers(1, 3), st.integers(1, 5), st.integers(0, 2**31))
 def test_digests_are_as_defined(slots: int, n: int, trials: int, seed: int) -> None:
     """Every block of every trial, and the receiver's digest ordered by trial, then block."""
@@ -92,6 +92,7 @@ def test_trials_may_come_in_parts() -> None:
     assert swapped.hexadecimal != whole.hexadecimal
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from(["x_hat", "P", "gamma"]), st.data())
 def test_any_bit_counts(seed: int, what: str, data: st.DataObject) -> None:
     """One changed bit of one trial in one slot changes that trial's digest and no other's."""

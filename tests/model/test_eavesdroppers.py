@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -62,6 +62,7 @@ def uses(name: str, k: int, r: int) -> bool:
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
+@settings(deadline=None)
 @given(seed=st.integers(0, 2**31), first=st.integers(0, 10_000))
 def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, first: int) -> None:
     """Used: (z, 0); lost or discarded: (A x̂, A P Aᵀ + Q); before slot 0: (0, Σ0), not predicted."""

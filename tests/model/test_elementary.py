@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtri
 
@@ -17,6 +17,7 @@ PROBABILITIES = st.integers(1, 2**53 - 1).map(lambda i: i * 2.0**-53)
 ENTRIES = st.floats(-10, 10, allow_subnormal=False).map(lambda v: round(v, 6))
 
 
+@settings(deadline=None)
 @given(st.lists(POSITIVE, min_size=1, max_size=50))
 def test_log_is_within_one_unit_in_the_last_place(x: list[float]) -> None:
     """The logarithm is math.log's to one unit in the last place."""
@@ -36,6 +37,7 @@ def test_log_at_landmarks() -> None:
     assert np.all(np.abs(log(powers) - expected) <= np.spacing(np.abs(expected)))
 
 
+@settings(deadline=None)
 @given(st.lists(PROBABILITIES, min_size=1, max_size=50))
 def test_quantile_is_scipys(u: list[float]) -> None:
     """The normal quantile agrees with scipy's to 1e-14, relatively."""
@@ -54,6 +56,7 @@ def test_quantile_in_every_region() -> None:
     assert np.array_equal(normal_quantile(1.0 - dyadic), -normal_quantile(dyadic))
 
 
+@settings(deadline=None)
 @given(st.lists(PROBABILITIES, min_size=2, max_size=40), st.data())
 def test_a_number_alone_has_the_same_bits(u: list[float], data: st.DataObject) -> None:
     """Alone, among others and in any shape, a number's logarithm and quantile are the same bits."""
@@ -79,6 +82,7 @@ def wide_matrices(draw: st.DrawFn) -> np.ndarray:
     return np.array(rows)
 
 
+@settings(deadline=None)
 @given(wide_matrices())
 def test_triangular_factor_is_one(M: np.ndarray) -> None:
     """L is lower triangular with a diagonal that is not negative, and L Lᵀ = M Mᵀ to rounding."""

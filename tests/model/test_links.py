@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -22,6 +22,7 @@ def test_every_model_is_tested() -> None:
 
 
 @pytest.mark.parametrize("model", SPECS)
+@settings(deadline=None)
 @given(data=st.data(), slots=st.integers(1, 60), trials=st.integers(1, 9), first=st.integers(0, 2**40))
 def test_fates_do_not_depend_on_blocks_or_batch(
     model: str, data: st.DataObject, slots: int, trials: int, first: int
@@ -60,6 +61,7 @@ def test_links_are_independent() -> None:
         assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 4.9 / np.sqrt(left.size)
 
 
+@settings(deadline=None)
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 2**31))
 def test_losses_account_for_every_packet(slots: int, trials: int, seed: int) -> None:
     """Delivered and the losses of all reasons add up to what was offered, slot by slot."""

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -45,6 +45,7 @@ def test_horizon_beyond_all_numbers() -> None:
     assert 0 < (Process(10.0 * np.eye(1), np.eye(1), np.eye(1)).horizon(5000) or 0) < 20
 
 
+@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(1, 5), st.integers(0, 2**31))
 def test_products_are_numpys(n: int, trials: int, seed: int) -> None:
     """A x, A P Aᵀ and M x are numpy's to rounding, for every trial and in stacks."""
@@ -60,6 +61,7 @@ def test_products_are_numpys(n: int, trials: int, seed: int) -> None:
     )
 
 
+@settings(deadline=None)
 @given(st.integers(1, 4), st.integers(2, 40), st.integers(0, 2**31), st.data())
 def test_products_do_not_depend_on_the_batch(n: int, trials: int, seed: int, data: st.DataObject) -> None:
     """A trial's bits are the same alone and among others."""

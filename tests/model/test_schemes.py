@@ -79,7 +79,7 @@ def test_packets_are_the_papers(process: Process, slots: int) -> None:
 
 
 @pytest.mark.parametrize(("process", "slots"), [(STABLE, 60), (UNSTABLE, 40)])
-@settings(max_examples=12)
+@settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 2**31), quality=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
 def test_legitimate_estimator_is_the_textbooks(process: Process, slots: int, seed: int, quality: float) -> None:
     """Lost: (A x̂, A P Aᵀ + Q); state: (z, 0); innovation: (A x̂ + z − χ, A P Aᵀ); before slot 0: (0, Σ0), not predicted."""

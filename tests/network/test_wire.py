@@ -7,7 +7,7 @@ import contextlib
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -20,6 +20,7 @@ SLOTS = st.integers(0, 2**40)
 SIZES = st.integers(1, 19)
 
 
+@settings(deadline=None)
 @given(st.data(), SLOTS, st.integers(1, 4), SIZES)
 def test_packet(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A packet reads back bit by bit, negative zeros and subnormal numbers included."""
@@ -27,6 +28,7 @@ def test_packet(data: st.DataObject, k: int, n: int, trials: int) -> None:
     assert wire.read_uplink("u", wire.uplink(k, z), k, (n, trials)).tobytes() == z.tobytes()
 
 
+@settings(deadline=None)
 @given(st.data(), SLOTS, st.integers(1, 4), SIZES)
 def test_delivery(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A receiver gets γ, and z of exactly the trials that received; of the others not a bit is in the message."""
@@ -39,6 +41,7 @@ def test_delivery(data: st.DataObject, k: int, n: int, trials: int) -> None:
     assert len(msgpack.unpackb(raw).get("z", b"")) == 8 * n * gamma.sum()
 
 
+@settings(deadline=None)
 @given(st.data(), SLOTS, st.integers(1, 3), SIZES, st.integers(1, 5))
 def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> None:
     """Truth reads back."""
@@ -49,6 +52,7 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     assert np.array_equal(found.nu, nu)
 
 
+@settings(deadline=None)
 @given(st.data(), SLOTS, st.integers(1, 3), SIZES, st.integers(1, 5))
 def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) -> None:
     """A report reads back, with any number of blocks' digests."""
@@ -68,6 +72,7 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
     assert found.count == count
 
 
+@settings(deadline=None)
 @given(st.data(), SLOTS, SIZES, st.integers(1, 5))
 def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
     """A journal reads back, receiver by receiver, reason by reason."""
@@ -100,6 +105,7 @@ VALUES = st.one_of(
 )
 
 
+@settings(deadline=None)
 @given(
     st.sampled_from(sorted(READERS)),
     st.one_of(st.binary(max_size=60), st.dictionaries(st.sampled_from(FIELDS), VALUES)),

@@ -74,6 +74,13 @@ def test_a_run_cut_short_decides_nothing() -> None:
     assert (verdict.relative, verdict.relative_by_theory) == (Verdict.UNDECIDED, True)
 
 
+def test_a_run_that_measured_nothing_says_so() -> None:
+    """An interrupt before the first slot is neither an infinite advantage nor a verdict."""
+    verdict = judged(tally(around(0.0), done=0), tally(around(0.0), done=0))
+    assert verdict.sentence == "eve: nothing was measured; theory promises relative secrecy"
+    assert verdict.relative is Verdict.UNDECIDED
+
+
 @pytest.mark.parametrize("slots", [1, 2, 5, 8])
 def test_fewer_slots_than_windows_are_judged_by_those_there_are(slots: int) -> None:
     """Windows without slots are left out; without any window there is no verdict."""

@@ -95,7 +95,9 @@ def simulate(
     for s in shown:
         x_hat, P, action, error, trace = (np.array(column) for column in zip(*seen[s.name], strict=True))
         peers[s.name] = PeerSlots(x_hat, P, action.astype(np.uint8), error, trace, expected(process, s, slots))
-    scene = Scene("Simulated", f"simulated-{seed}-{slots}", slots, trials, process.n, pace, shown)
+    scene = Scene(
+        "Simulated", f"simulated-{seed}-{slots}", slots, trials, process.n, pace, shown, float(np.trace(process.Q))
+    )
     return Simulated(scene, Slots(0, np.array(truth), np.array(nus), peers))
 
 

@@ -14,7 +14,7 @@ LOST, STATE, MISLED = 0, 1, 4
 def watch(codes: list[int], cuts: list[int], slots: int = 1000) -> list[Event]:
     """Events of an eavesdropper's lane that is handed over in pieces."""
     shown = Shown("eve", "eavesdropper", "naive", 0.9)
-    watcher = Watcher(shown, Scene("", "r", slots, 1, 2, 0.0, (shown,)))
+    watcher = Watcher(shown, Scene("", "r", slots, 1, 2, 0.0, (shown,), 1.0))
     found: list[Event] = []
     bounds = [0, *sorted(cuts), len(codes)]
     for start, end in pairwise(bounds):

@@ -3,14 +3,14 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from read_back import rows
 from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
-from emulator.view import paths, plane
+from emulator.view import plane
 from emulator.view.recording import Recording, Scene
 
 SLOTS = 400
@@ -25,15 +25,6 @@ def record(run: Simulated, rrd: Path, chunk: int = 60) -> None:
     assert recording.close()
     assert recording.failure is None
     assert recording.dropped == 0
-
-
-def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
-    """The component's values of one entity, by slot."""
-    found: dict[int, Any] = {}
-    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
-        columns = chunk.to_record_batch().to_pydict()
-        found |= dict(zip(columns[paths.TIMELINE], columns[component], strict=True))
-    return found
 
 
 def lane(rrd: Path, entity: str, slots: int) -> list[str]:
@@ -144,12 +135,12 @@ def test_one_state_is_drawn_over_time(simulated: Callable[..., Simulated], tmp_p
 
 def test_long_runs_have_bounded_frames() -> None:
     """200 000 slots as fast as they go have some thousand frames, the last slot among them; real time has 30 a second."""
-    fast = Scene("", "r", 200_000, 1, 2, 0.0, ())
+    fast = Scene("", "r", 200_000, 1, 2, 0.0, (), 1.0)
     offsets = np.concatenate([first + plane.frames(fast, first, 1000) for first in range(0, 200_000, 1000)])
     assert len(offsets) <= 4001
     assert offsets[-1] == 199_999
-    assert plane.stride(Scene("", "r", 3000, 1, 2, 0.02, ())) == 2
-    assert plane.stride(Scene("", "r", 300, 1, 2, 0.0, ())) == 1
+    assert plane.stride(Scene("", "r", 3000, 1, 2, 0.02, (), 1.0)) == 2
+    assert plane.stride(Scene("", "r", 300, 1, 2, 0.0, (), 1.0)) == 1
 
 
 def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) -> None:

@@ -1,0 +1,97 @@
+"""The recording of a run that was made without a view, or in memory, from the tables of its results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from emulator.errors import UsageError
+from emulator.model.process import Floats
+from emulator.model.receiver import Action
+from emulator.run.observer import open_recording
+from emulator.run.results import Results, load_results
+from emulator.scenario import load
+from emulator.view.scene import PeerSlots, Slots
+
+_CHUNK = 1000  # slots handed over at once
+_CODES = {
+    "dropped": Action.LOST,
+    "state": Action.STATE,
+    "misled": Action.STATE,
+    "innovation": Action.INNOVATION,
+    "discarded": Action.DISCARDED,
+}
+
+
+def replay(folder: Path) -> Path:
+    """Write the recording.rrd of a results folder; its path.
+
+    Raises UsageError if the folder's tables cannot be read, or hold no recorded trial.
+    """
+    results = load_results(folder)
+    scenario = load(folder / "scenario.toml", beyond_horizon=True)
+    path = folder / "recording.rrd"
+    peers = {name: _peer(results, name) for name in scenario.receivers}
+    x, nu = _truth(results, scenario.receivers[0])
+    if not len(x):
+        raise UsageError(f"{folder} has no recorded trial to show; run it again without --covariance-only or the like")
+    recording = open_recording(scenario, folder.name, path, None)
+    for first in range(0, len(x), _CHUNK):
+        rows = slice(first, min(first + _CHUNK, len(x)))
+        recording.add(Slots(first, x[rows], nu[rows], {name: _cut(peer, rows) for name, peer in peers.items()}))
+    recording.close()
+    if recording.failure is not None:
+        raise UsageError(f"{path} cannot be written ({recording.failure}); make the folder writable")
+    return path
+
+
+def _first_trial(results: Results, name: str) -> pa.Table:
+    """The rows of a peer's first recorded trial, slot by slot."""
+    rows = results.trials.filter(pc.field("peer") == name)
+    if rows.num_rows:
+        rows = rows.filter(pc.field("trial") == pc.min(rows["trial"]))
+    return rows.sort_by("slot")
+
+
+def _truth(results: Results, name: str) -> tuple[Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
+    rows = _first_trial(results, name)
+    sent = rows["sent"].cast(pa.string()).to_pylist()
+    return _matrix(rows["x"]), np.array([word == "innovation" for word in sent], np.bool_)
+
+
+def _peer(results: Results, name: str) -> PeerSlots:
+    rows = _first_trial(results, name)
+    means = results.slots.filter(pc.field("peer") == name).sort_by("slot").slice(0, rows.num_rows)
+    x_hat, P = _matrix(rows["x_hat"]), _matrix(rows["P"])
+    n = x_hat.shape[1] if x_hat.ndim == 2 else 0
+    words = rows["action"].cast(pa.string()).to_pylist()
+    return PeerSlots(
+        x_hat=x_hat,
+        P=P.reshape(-1, n, n),
+        action=np.array([_CODES[word] for word in words], np.uint8),
+        squared_error=means["mean_squared_error"].to_numpy(),
+        trace=means["mean_trace_covariance"].to_numpy(),
+        expected_trace=means["expected_trace_covariance"].to_numpy(),
+    )
+
+
+def _cut(peer: PeerSlots, rows: slice) -> PeerSlots:
+    return PeerSlots(
+        peer.x_hat[rows],
+        peer.P[rows],
+        peer.action[rows],
+        peer.squared_error[rows],
+        peer.trace[rows],
+        peer.expected_trace[rows],
+    )
+
+
+def _matrix(column: pa.ChunkedArray) -> Floats:
+    """A column of lists of equal length as an array, (rows, length)."""
+    flat: Floats = (
+        pa.concat_arrays([chunk.flatten() for chunk in column.chunks]).to_numpy() if len(column) else np.empty(0)
+    )
+    return flat.reshape(len(column), column.type.list_size)

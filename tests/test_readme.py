@@ -1,0 +1,52 @@
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from emulator.scenario import parse
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """The README's code blocks in a language."""
+    return re.findall(rf"```{language}\n(.*?)```", README, re.S)
+
+
+def test_scenario_is_one() -> None:
+    """The scenario that the README shows is accepted as it stands."""
+    (text,) = blocks("toml")
+    assert parse(text, "README.md").receivers == ("legitimate", "antenna")
+
+
+def test_python_runs(tmp_path: Path) -> None:
+    """The Python that the README shows runs, and prints a number and the columns."""
+    (code,) = blocks("python")
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    error, columns = done.stdout.splitlines()
+    assert float(error) > 0.0
+    assert "mean_squared_error" in columns
+
+
+def test_every_command_is_one() -> None:
+    """Each `evedrop` command that the README quotes exists, with its options."""
+    quoted = [
+        line.split("#")[0].split() for block in blocks("") for line in block.splitlines() if line[:8] == "evedrop "
+    ]
+    assert len(quoted) >= 9
+    for words in quoted:
+        done = subprocess.run(
+            [sys.executable, "-m", "emulator", words[1], "--help"], check=False, capture_output=True, text=True
+        )
+        assert done.returncode == 0, words
+        for option in (word for word in words if word.startswith("--")):
+            assert option in done.stdout, words
+
+
+@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\((docs/[^)]+)\)", README))))
+def test_links_lead_somewhere(link: str) -> None:
+    """Every document and picture that the README links to is there."""
+    assert (ROOT / link).is_file()
