@@ -23,8 +23,9 @@ _LOG_EVEN = (3.999999999940941908e-01, 2.222219843214978396e-01, 1.5313837699209
 
 def polynomial(coefficients: Sequence[float], x: Floats) -> Floats:
     """Evaluate c₀ + c₁x + c₂x² + … by Horner's rule, elementwise (any shape)."""
-    value = np.full_like(x, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
+    value: Floats = coefficients[-1] * x
+    value += coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
         value *= x
         value += coefficient
     return value

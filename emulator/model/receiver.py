@@ -50,6 +50,14 @@ def select(flags: Flags, yes: Callable[[], Floats], no: Callable[[], Floats]) ->
     return np.where(flags, yes(), no())
 
 
+def cleared(flags: Flags, shape: tuple[int, ...], value: Callable[[], Floats]) -> Floats:
+    """0 in the trials where flags (R,) is true, `value()`, of a shape (…, R), in the others."""
+    count = np.count_nonzero(flags)
+    if count == flags.size:
+        return np.zeros(shape)
+    return np.where(flags, 0.0, value()) if count else value()
+
+
 def trace_of(P: Floats) -> Floats:
     """Tr P of every trial: P (n, n, R) → (R,)."""
     trace: Floats = P[0, 0].copy()

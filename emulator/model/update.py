@@ -19,7 +19,9 @@ from collections.abc import Callable
 import numpy as np
 
 from emulator.model.process import Floats, Process
-from emulator.model.receiver import Action, Codes, Flags, select
+from emulator.model.receiver import Action, Codes, Flags, cleared, select
+
+_STATE, _INNOVATION = int(Action.STATE), int(Action.INNOVATION)  # numpy compares with an int ten times as fast
 
 
 def estimate(
@@ -31,9 +33,9 @@ def estimate(
         predicted = process.predict(x_hat) if k else x_hat
         if w is None:
             return predicted
-        return select(action == Action.INNOVATION, lambda: predicted + w(), lambda: predicted)
+        return select(action == _INNOVATION, lambda: predicted + w(), lambda: predicted)
 
-    return select(action == Action.STATE, lambda: z, kept)
+    return select(action == _STATE, lambda: z, kept)
 
 
 def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> Floats:
@@ -43,9 +45,9 @@ def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> F
         if k == 0:
             return P
         carried = process.carry(P)
-        return select(action == Action.INNOVATION, lambda: carried, lambda: process.diffuse(carried))
+        return select(action == _INNOVATION, lambda: carried, lambda: process.diffuse(carried))
 
-    return select(action == Action.STATE, lambda: np.zeros_like(P), kept)
+    return cleared(action == _STATE, P.shape, kept)
 
 
 def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Flags, f: Floats) -> Floats:
@@ -55,7 +57,7 @@ def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Fl
     trials estimates `theory.expected_covariances`.
     """
     return select(
-        (action == Action.STATE) & nu,
+        (action == _STATE) & nu,
         lambda: np.repeat(f[:, :, None], P.shape[2], axis=2),
         lambda: believed_covariance(process, k, P, action),
     )
@@ -69,10 +71,10 @@ def error(process: Process, e: Floats, action: Codes, nu: Flags, w: Floats, misl
 
     def kept() -> Floats:
         carried = process.predict(e)
-        return select(action == Action.INNOVATION, lambda: carried, lambda: carried + w)
+        return select(action == _INNOVATION, lambda: carried, lambda: carried + w)
 
     return select(
-        (action == Action.STATE) & nu,
+        (action == _STATE) & nu,
         misled,
-        lambda: select(action == Action.STATE, lambda: np.zeros_like(e), kept),
+        lambda: cleared(action == _STATE, e.shape, kept),
     )

@@ -49,17 +49,21 @@ def squared_errors(x: Floats, x_hat: Floats) -> Floats:
     return squared
 
 
-def slot_sums(error: Floats, action: Codes, trace: Floats) -> SlotSums:
-    """The sums of some slots, from error (c, R), action (c, R), and the sums of tr P and of its square, (c, 2)."""
+def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> SlotSums:
+    """The sums of some slots, from error (c, R), action (c, R), and the sums of tr P and of its square, (c, 2).
+
+    Without the latter the error is tr P itself.
+    """
     count, trials = error.shape
+    errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
     received = np.count_nonzero(action != Action.LOST, axis=1).astype(np.float64)
     discarded = np.count_nonzero(action == Action.DISCARDED, axis=1)
     return SlotSums(
         trials=np.full(count, float(trials)),
-        error=error.sum(axis=1),
-        error_squared=(error * error).sum(axis=1),
-        trace=trace[:, 0],
-        trace_squared=trace[:, 1],
+        error=errors,
+        error_squared=squares,
+        trace=errors if trace is None else trace[:, 0],
+        trace_squared=squares if trace is None else trace[:, 1],
         received=received,
         used=received - discarded,
     )

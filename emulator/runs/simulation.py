@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -164,11 +164,12 @@ class Simulation:
 
         def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
             measured = self._blank(chunk, fates)
+            delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
             for row, k in enumerate(chunk):
                 nu, w = self._shared.nu(k), noise.at(k)
                 if trajectory is not None:
                     trajectory.advance()
-                for name, action, one in self._acts(k, row, measured):
+                for name, action, one in self._acts(k, row, measured, delivered):
                     errors[name] = update.error(
                         self._process,
                         errors[name],
@@ -192,17 +193,17 @@ class Simulation:
 
         def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
             measured = self._blank(chunk, fates)
+            delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
             for row, k in enumerate(chunk):
                 nu = self._shared.nu(k)
-                for name, action, one in self._acts(k, row, measured):
+                for name, action, one in self._acts(k, row, measured, delivered):
                     believed[name] = update.believed_covariance(self._process, k, believed[name], action)
                     one.trace[row] = trace_of(believed[name])
                     if f is not None and name in misled:
                         actual[name] = update.actual_covariance(self._process, k, actual[name], action, nu, f[k])
                         one.error[row] = trace_of(actual[name])
-                    else:
-                        one.error[row] = one.trace[row]
-            return Chunk(chunk.start, measured, None)
+            honest = {name: replace(one, error=one.trace) for name, one in measured.items() if name not in misled}
+            return Chunk(chunk.start, {**measured, **honest}, None)
 
         return play
 
@@ -223,10 +224,11 @@ class Simulation:
             for name, codes in fates.items()
         }
 
-    def _acts(self, k: int, row: int, measured: Mapping[str, Measured]) -> Iterator[tuple[str, Codes, Measured]]:
-        """Every receiver's action in slot k."""
+    def _acts(
+        self, k: int, row: int, measured: Mapping[str, Measured], delivered: Mapping[str, Flags]
+    ) -> Iterator[tuple[str, Codes, Measured]]:
+        """Every receiver's action in slot k, which is one row of delivered (c, R)."""
         for name, one in measured.items():
-            gamma: Flags = one.fates[row] == Fate.DELIVERED
-            action = self._receivers[name].act(k, gamma)
+            action = self._receivers[name].act(k, delivered[name][row])
             one.action[row] = action
             yield name, action, one

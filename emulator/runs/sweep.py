@@ -76,7 +76,8 @@ def sweep_over(
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
     rows: list[dict[str, Any]] = []
     with stop_on_signals() as stop:
-        tasks = [(i, task) for i, (_, s) in enumerate(scenarios) for task in tasks_of(s, plan.mode, workers)]
+        each = -(-workers // len(scenarios))  # with more points than workers, a point need not be cut for them
+        tasks = [(i, task) for i, (_, s) in enumerate(scenarios) for task in tasks_of(s, plan.mode, each)]
         results = results_of([task for _, task in tasks], workers, plan.scheduler, teller(tell, total), stop.is_set)
         new_folder(folder)
         mergers = [Merger(scenario, plan.mode) for _, scenario in scenarios]

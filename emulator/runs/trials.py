@@ -114,8 +114,11 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
     """Take a chunk. The square of a naive receiver's error may leave double precision; then it is inf, as it should."""
     for name, measured in chunk.receivers.items():
         for block, part in _parts(result.blocks, result.start, measured):
-            trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
-            sums = slot_sums(part.error, part.action, trace)
+            if measured.error is measured.trace:
+                sums = slot_sums(part.error, part.action)
+            else:
+                trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
+                sums = slot_sums(part.error, part.action, trace)
             block.sums[name].add(chunk.first, sums)
             block.tallies[name].add(chunk.first, part.error, sums, expected[name])
             block.tallies[name].account(part.fates == Fate.DELIVERED, part.action, losses(part.fates))

@@ -20,4 +20,5 @@ class Bernoulli(LossModel):
 
     def fates(self, uniforms: Floats) -> Codes:
         """Delivered where the uniform number is below the quality."""
-        return np.where(uniforms[:, 0, :] < self.quality, np.uint8(Fate.DELIVERED), np.uint8(Fate.LOST))
+        lost = uniforms[:, 0, :] >= self.quality
+        return lost * np.uint8(Fate.LOST)  # DELIVERED is 0; np.where takes ten times as long
