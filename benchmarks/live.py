@@ -23,7 +23,7 @@ from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
 from emulator.network.session import Session
 from emulator.network.wire import progress, uplink
 from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.launcher import free_port
+from emulator.runs.ports import free_port
 from emulator.scenario import load
 
 RECEIVERS = 4

@@ -17,7 +17,7 @@ import msgpack
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from emulator.runs.launcher import free_port
+from emulator.runs.ports import free_port
 
 _KEY = "raw/uplink"
 
@@ -46,7 +46,7 @@ def send(endpoint: str, slots: int, trials: int, rate: float, receivers: int) ->
         done = session.declare_subscriber("raw/done", FifoChannel(64))
         for _ in range(receivers):
             done.recv()
-        print(json.dumps({"slots_per_second": slots / (time.monotonic() - start)}), flush=True)  # noqa: T201
+        print(json.dumps({"slots_per_second": slots / (time.monotonic() - start)}), flush=True)
 
 
 def receive(endpoint: str, slots: int) -> None:
@@ -67,7 +67,7 @@ def receive(endpoint: str, slots: int) -> None:
             time.sleep(0.005)
         done.put(b"")
     delays.sort()
-    print(json.dumps([delays[len(delays) // 2] * 1e6, delays[len(delays) * 99 // 100] * 1e6]), flush=True)  # noqa: T201
+    print(json.dumps([delays[len(delays) // 2] * 1e6, delays[len(delays) * 99 // 100] * 1e6]), flush=True)
 
 
 def throughput(slots: int, trials: int, receivers: int) -> float:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.network.access import LEGITIMATE
 from emulator.runs.results import Results, load_results
-from emulator.scenario import Scenario, load
+from emulator.scenario import Scenario, checked, load
 
 if TYPE_CHECKING:
     from emulator.model.design import Design
@@ -53,8 +53,8 @@ def run(
     """
     from emulator.runs.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
 
-    checked, folder = _prepared(scenario, out, changes)
-    ended = launch(checked, folder, view, listen, tell)
+    made, folder = _prepared(scenario, out, changes)
+    ended = launch(made, folder, view, listen, tell)
     if ended.viewer is not None:
         ended.viewer.stop()
     return load_results(folder)
@@ -74,9 +74,11 @@ def montecarlo(
     Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: mode and workers.
     """
     from emulator.runs.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
+    from emulator.runs.simulation import Mode  # noqa: PLC0415 - the same
 
-    checked, folder = _prepared(scenario, out, {**changes, "trials": trials})
-    simulate(checked, folder, tell, plan or Plan())
+    plan = plan or Plan()
+    made, folder = _prepared(scenario, out, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
+    simulate(made, folder, tell, plan)
     return load_results(folder)
 
 
@@ -92,20 +94,21 @@ def design(
     from emulator.model.design import Adversary  # noqa: PLC0415 - a run does not need it
     from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
 
-    checked = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
+    made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
     adversaries = [
         Adversary(name, table.link.quality, *STRATEGIES[table.strategy].use_probabilities(table.parameters))
-        for name, table in checked.eavesdroppers.items()
+        for name, table in made.eavesdroppers.items()
     ]
-    process, mu, mu_d = checked.process.process, checked.quality[LEGITIMATE], checked.encoding.mu_d
-    return design_of(process, mu, mu_d, adversaries, checked.slots, max_trace)
+    process, mu, mu_d = made.process.process, made.quality[LEGITIMATE], made.encoding.mu_d
+    return design_of(process, mu, mu_d, adversaries, made.slots, max_trace)
 
 
 def _prepared(
-    scenario: str | Path | Scenario, out: str | Path | None, changes: Mapping[str, Any]
+    scenario: str | Path | Scenario, out: str | Path | None, changes: Mapping[str, Any], beyond_horizon: bool = False
 ) -> tuple[Scenario, Path]:
     dotted = {name.replace("__", "."): value for name, value in changes.items()}
+    place = Path(out) if out is not None else default_folder("run" if isinstance(scenario, Scenario) else scenario)
     if isinstance(scenario, Scenario):
-        checked = Scenario.model_validate({**scenario.model_dump(), **dotted}) if dotted else scenario
-        return checked, Path(out) if out is not None else default_folder("run")
-    return load(scenario, dotted), Path(out) if out is not None else default_folder(scenario)
+        tables = scenario.model_dump(mode="json", exclude_none=True)
+        return checked(tables, scenario.title, dotted, beyond_horizon=beyond_horizon), place
+    return load(scenario, dotted, beyond_horizon=beyond_horizon), place

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from emulator import commands
-from emulator.errors import EvedropError, Interrupted
+from emulator.errors import EvedropError, Interrupted, UsageError
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -22,15 +22,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     command: Command = options.command
     try:
-        return command(options)
+        status = command(options)
+        sys.stdout.flush()
+        return status
     except EvedropError as error:
         print(f"evedrop: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         return Interrupted.exit_status
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence()
         return 0
+    except OSError as error:
+        _silence()
+        print(
+            f"evedrop: {error.filename or 'standard output'}: {error.strerror}; free some room, or look at its rights",
+            file=sys.stderr,
+        )
+        return UsageError.exit_status
+
+
+def _silence() -> None:
+    """Have nothing more written to standard output, not even at the interpreter's end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Commands:

@@ -102,7 +102,8 @@ class Live:
         sensor = self.child("sensor")
         wait_until(lambda: not self.briefs(), "a run under way")
         before = processor_seconds(sensor)
-        wait_until(lambda: processor_seconds(sensor) > before + 0.05, "a sensor at work")
+        # So much work is several windows of slots: the observer must have scored one, or the sensor would be waiting.
+        wait_until(lambda: processor_seconds(sensor) > before + 0.3, "a sensor at work")
 
     def kill(self, name: str, number: signal.Signals = signal.SIGKILL) -> None:
         """Send one process a signal."""

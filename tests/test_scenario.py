@@ -55,7 +55,7 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
         ("slots", 2.5, "slots: is 2.5; expected a whole number"),
         ("slots", True, "slots: is true; expected a whole number"),
         ("slots", 0, "slots: is 0; expected a number at least 1"),
-        ("slots", 2**40, "slots: is 1099511627776; expected a number at most 4294967296"),
+        ("slots", 2**40, "slots: is 1099511627776; expected a number at most 100000000"),
         ("seed", -1, "seed: is -1; expected a number at least 0"),
         ("trials", 0, "trials: is 0; expected a number at least 1"),
         ("record_trials", 2, "record_trials: is 2; expected at most trials, which is 1"),

@@ -8,8 +8,6 @@ Source: docs/mathematics.md, model.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,8 +19,6 @@ from emulator.streams import Batch, BlockReader
 
 Floats = NDArray[np.float64]
 
-UNIT_ROUNDOFF = 2.0**-53
-HORIZON_TOLERANCE = 0.01
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding does not explain
 
 
@@ -99,42 +95,6 @@ class Process:
     def diffuse(self, carried: Floats) -> Floats:
         """A P Aᵀ + Q from A P Aᵀ, (n, n, R): the covariance when w is not known."""
         return carried + self._Q_column
-
-    def state_covariances(self, slots: int) -> Floats:
-        """Σ_k for k = 0 … slots−1, (slots, n, n): Σ_0 given, Σ_k = A Σ_{k−1} Aᵀ + Q."""
-        return np.stack(list(self._covariances(slots)))
-
-    def _covariances(self, slots: int) -> Iterator[Floats]:
-        covariance = self.initial_covariance
-        for k in range(slots):
-            if k:
-                covariance = self.A @ covariance @ self.A.T + self.Q
-            yield covariance
-
-    def horizon(self, slots: int) -> int | None:
-        """Largest k in float64's reach, if it is below slots−1; None if the whole run is.
-
-        The last k such that up to it 2⁻⁵³ √λ_max(Σ_k) ≤ 0.01 √λ_min(Q): beyond, rounding of the state drowns the
-        one-step innovation that the scheme hides in it.
-
-        Source: docs/mathematics.md, horizon.
-        """
-        limit = HORIZON_TOLERANCE * math.sqrt(float(np.linalg.eigvalsh(self.Q)[0])) / UNIT_ROUNDOFF
-        for start in range(0, slots, 4096):
-            if start == 0:
-                covariance = self.initial_covariance
-            stack = []
-            for k in range(start, min(start + 4096, slots)):
-                if k:
-                    covariance = self.A @ covariance @ self.A.T + self.Q
-                stack.append(covariance)
-                if not np.all(np.isfinite(covariance)) or np.trace(covariance) > (limit * limit) * 1e6 * self.n:
-                    break
-            largest = np.linalg.eigvalsh(np.stack([0.5 * (c + c.T) for c in stack]))[:, -1]
-            beyond = np.flatnonzero(~(np.sqrt(largest) <= limit))
-            if beyond.size:
-                return start + int(beyond[0]) - 1
-        return None
 
 
 class ProcessNoise:

@@ -69,12 +69,24 @@ class Outcomes:
         return self.predicted + self.decoded
 
 
+NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
+"""Who is told nothing: its error covariance is that of the state itself."""
+
+
+def state_covariances(process: Process, slots: int) -> Floats:
+    """Σ_k = E[x_k x_kᵀ] for k = 0 … slots−1, (slots, n, n): Σ_0 given, Σ_k = A Σ_{k−1} Aᵀ + Q; inf once it overflows.
+
+    Source: docs/mathematics.md, model.
+    """
+    return expected_covariances(process, NOBODY, slots)
+
+
 def noise_covariances(process: Process, slots: int) -> Floats:
     """E[χ_k χ_kᵀ] = A Σ_{k−1} Aᵀ for k = 0 … slots−1, (slots, n, n); 0 at k = 0. inf from where it overflows.
 
     Source: docs/mathematics.md, encoding noise.
     """
-    sigma = ExpectedCovariance(process, Outcomes(1.0, 0.0, 0.0, 0.0, 1.0)).next(max(slots - 1, 0))
+    sigma = state_covariances(process, max(slots - 1, 0))
     with np.errstate(over="ignore", invalid="ignore"):
         carried = process.A @ sigma @ process.A.T
     zero = np.zeros((min(slots, 1), process.n, process.n))

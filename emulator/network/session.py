@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
-import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
@@ -20,6 +18,7 @@ from zenoh.handlers import FifoChannel
 
 from emulator.brief import Brief
 from emulator.errors import BriefError, RunError
+from emulator.launched import when_launcher_is_gone
 from emulator.network.access import Keys
 from emulator.network.wire import read_control
 
@@ -70,7 +69,7 @@ class Session:
     def __init__(self, brief: Brief, config: dict[str, Any] | None = None) -> None:
         zenoh.init_log_from_env_or("error")
         if brief.ends_with_stdin:
-            _end_with_stdin()
+            when_launcher_is_gone(lambda: os._exit(3))
         self.keys = Keys(brief.run)
         self._process = brief.process
         try:
@@ -136,14 +135,3 @@ class Session:
         """Wait for one command of the conductor: `start` or `end`."""
         while read_control(str(self._control.key_expr), self._control.recv().payload.to_bytes()) != command:
             pass
-
-
-def _end_with_stdin() -> None:
-    """End this process when whoever started it is gone."""
-
-    def wait() -> None:
-        while sys.stdin.buffer.read(4096):
-            pass
-        os._exit(3)
-
-    threading.Thread(target=wait, name="launcher-watch", daemon=True).start()

@@ -253,8 +253,8 @@ def read_report(key: str, payload: bytes, first: int, shape: tuple[int, int], re
         k,
         message.finite("x_hat", (c, n, trials)),
         action,
-        message.array("P", "<f8", (c, n, n, recorded)),
-        message.array("trace", "<f8", (c, 2)),
+        message.finite("P", (c, n, n, recorded)),
+        message.finite("trace", (c, 2)),
         digests,
     )
 

@@ -13,7 +13,7 @@ from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE, OBSERVER, ROUTER, SENSOR
-from emulator.runs.results import new_folder
+from emulator.runs.folder import new_folder
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
 

@@ -11,6 +11,7 @@ from emulator.network.access import OBSERVER, ROUTER, SENSOR
 from emulator.network.session import READY_SECONDS, Session
 from emulator.network.wire import control, progress
 
+_AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 
 
@@ -20,8 +21,11 @@ class Stop:
     def __init__(self) -> None:
         self.wanted = False
 
-    def check(self) -> None:
-        """Raise Interrupted if the end was asked for."""
+    def check(self, patience: float = 0.0) -> None:
+        """Raise Interrupted if the end was asked for, or is within so many seconds."""
+        deadline = time.monotonic() + patience
+        while not self.wanted and time.monotonic() < deadline:
+            time.sleep(0.01)
         if self.wanted:
             raise Interrupted("interrupted; what was measured is in the results folder")
 
@@ -77,6 +81,7 @@ class Conductor:
         if news is None or not isinstance(news[1], bytes):
             self._note(news)
             if self.missing:
+                self._stop.check(_AFTERTHOUGHT_SECONDS)
                 raise RunError(f"{', '.join(self.missing)} left the network before the run ended; look at the logs")
             return None
         return news[0], news[1]

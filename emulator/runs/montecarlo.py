@@ -16,9 +16,10 @@ import numpy as np
 
 from emulator.errors import Interrupted, UsageError
 from emulator.model.digest import BLOCK_SLOTS, RunDigest
+from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
-from emulator.runs.results import ResultsWriter, new_folder, write_summary
+from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.score import SlotSums, Tally, merged, squared_errors
 from emulator.runs.scorekeeper import Ending, expected_traces_of, resolved, summary_of
 from emulator.runs.signals import stop_on_signals

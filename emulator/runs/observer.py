@@ -10,8 +10,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
-import threading
 import time
 import traceback
 from collections.abc import Mapping
@@ -24,6 +22,7 @@ import numpy as np
 
 from emulator.brief import Brief
 from emulator.errors import EvedropError, Interrupted, RunError
+from emulator.launched import when_launcher_is_gone
 from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
 from emulator.network.session import Session
 from emulator.runs.conductor import Conductor, Stop
@@ -46,7 +45,7 @@ def observe(brief: Brief) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     if brief.ends_with_stdin:
-        threading.Thread(target=_stop_with_stdin, name="launcher-watch", daemon=True).start()
+        when_launcher_is_gone(_end_orphaned)
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario)
@@ -68,10 +67,8 @@ def observe(brief: Brief) -> int:
     return observation.finish(status, how)
 
 
-def _stop_with_stdin() -> None:
-    """Write what there is, and end, when the launcher is gone."""
-    while os.read(sys.stdin.fileno(), 4096):
-        pass
+def _end_orphaned() -> None:
+    """Write what there is, and end."""
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_ORPHAN_SECONDS)
     os._exit(RunError.exit_status)

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 News = Mapping[str, Any]
 
+_DIGEST_WIDTH = 100  # columns of a terminal that has room for digests
+
 
 class ProgressLine:
     """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
@@ -62,7 +64,7 @@ class ProgressLine:
     def tell(self, news: News) -> None:
         """Take one piece of news."""
         kind = news["event"]
-        if kind == "view" and not self._quiet:
+        if kind == "view" and news["address"] and not self._quiet:
             self.console.print(f"live view: {news['address']}", soft_wrap=True)
         elif kind == "started":
             self._progress.update(self._task, description="running")
@@ -79,8 +81,8 @@ class ProgressLine:
             self.console.print(f"the view stopped early: {news['view']}")
 
 
-def closing_table(summary: News) -> Table:
-    """Per receiver: what it received, its error, and what it believed of it."""
+def closing_table(summary: News, width: int) -> Table:
+    """Per receiver: what it received, its error, what it believed of it, and, where there is room, its digest."""
     trials = f"{summary['trials']:,} trials" if summary["trials"] > 1 else "1 trial"
     rate = f"{summary['slots_per_second']:,.0f} slots/s"
     if summary["mode"] != "live":
@@ -92,17 +94,19 @@ def closing_table(summary: News) -> Table:
     error = "actual tr P" if covariances else "mean |x−x̂|²"
     for head in ("received", "used", error, "believed tr P", "expected tr P"):
         table.add_column(head, justify="right", no_wrap=True)
-    table.add_column("digest", no_wrap=True)
+    wide = width >= _DIGEST_WIDTH
+    if wide:
+        table.add_column("digest", no_wrap=True)
     for name, peer in summary["peers"].items():
-        found = peer["mean_actual_trace_covariance" if covariances else "mean_squared_error"]
+        error_figure = "mean_actual_trace_covariance" if covariances else "mean_squared_error"
         table.add_row(
             name,
-            f"{float(peer['received_fraction']):.4f}",
-            f"{float(peer['used_fraction']):.4f}",
-            f"{float(found):.4g}",
-            f"{float(peer['mean_trace_covariance']):.4g}",
-            f"{float(peer['expected_trace_covariance']):.4g}",
-            (peer["digest"] or "–")[:12],
+            _figure(peer["received_fraction"], ".4f"),
+            _figure(peer["used_fraction"], ".4f"),
+            _figure(peer[error_figure]),
+            _figure(peer["mean_trace_covariance"]),
+            _figure(peer["expected_trace_covariance"]),
+            *([(peer["digest"] or "–")[:12]] if wide else []),
         )
     return table
 
@@ -112,7 +116,7 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
     console = _console()
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
-    console.print(closing_table(summary))
+    console.print(closing_table(summary, console.width))
     for verdict in summary["secrecy"].values():
         console.print(verdict["sentence"])
     for name, peer in summary["peers"].items():
@@ -200,9 +204,20 @@ def print_design(design: Design) -> None:
     console.print(table)
 
 
+def _figure(value: float | str | None, how: str = ".4g") -> str:
+    """A figure of the summary, where infinity is a string and nothing is null."""
+    return "–" if value is None else format(float(value), how)
+
+
 def _number(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else "∞"
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Whoever reads our output may leave; that is no failure of ours."""
+        raise BrokenPipeError
+
+
 def _console() -> Console:
-    return Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)
+    return _Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)

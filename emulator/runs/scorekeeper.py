@@ -99,9 +99,9 @@ def summary_of(
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
     process, outcomes = scenario.process.process, outcomes_of(scenario)
-    peers = {
+    peers: dict[str, dict[str, Any]] = {
         name: {
-            **tally.figures,
+            **(tally.figures if tally.offered else dict.fromkeys(tally.figures)),
             "error_quantiles": _quantiles(tally),
             "infinite_variance": has_infinite_variance(process, outcomes[name]),
             "digest": digests[name],

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.errors import Interrupted, ScenarioError, UsageError
+from emulator.runs.folder import new_folder
 from emulator.runs.montecarlo import Merger, Plan, check_mode, results_of, teller
-from emulator.runs.results import new_folder
 from emulator.runs.scorekeeper import Ending
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.trials import tasks_of

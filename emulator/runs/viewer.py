@@ -18,7 +18,7 @@ from typing import IO
 from urllib.parse import quote
 
 from emulator.errors import UsageError
-from emulator.runs.launcher import free_port
+from emulator.runs.ports import free_port
 
 _HOST = "127.0.0.1"
 _START_SECONDS = 20.0

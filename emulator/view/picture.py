@@ -14,7 +14,7 @@ from pathlib import Path
 from rerun.experimental import ViewerClient
 
 from emulator.errors import UsageError
-from emulator.runs.launcher import free_port
+from emulator.runs.ports import free_port
 from emulator.runs.viewer import end, spawn
 from emulator.view.paths import TIMELINE
 

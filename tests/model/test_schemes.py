@@ -13,6 +13,7 @@ from scipy import stats
 from emulator.model.process import Process, Trajectory
 from emulator.model.receiver import Action, Belief
 from emulator.model.schemes import SCHEMES
+from emulator.model.theory import state_covariances
 from emulator.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(4)
@@ -159,7 +160,7 @@ def test_a_lost_packet_desynchronises_nothing() -> None:
 def test_encoding_noise_has_its_covariance() -> None:
     """χ is white, normal, of covariance A Σ_{k−1} Aᵀ and independent of the process: 20 000 trials at 1e-6 confidence."""
     trials = 20_000
-    covariances = STABLE.state_covariances(4)
+    covariances = state_covariances(STABLE, 4)
     before = np.zeros((3, trials))
     chis: list[np.ndarray] = []
     for k, (x, z, nu) in enumerate(packets("innovation", STABLE, Batch(4, trials))):
@@ -182,7 +183,7 @@ def test_encoding_noise_has_its_covariance() -> None:
 @pytest.mark.parametrize("kind", [False, True])
 def test_packets_of_either_type_look_alike(kind: bool) -> None:
     """E z zᵀ is Σ_k for states and for innovations: whitened by Σ_k both are standard normal, at 1e-6 confidence."""
-    covariances = STABLE.state_covariances(8)
+    covariances = state_covariances(STABLE, 8)
     for k, (_, z, nu) in enumerate(packets("innovation", STABLE, Batch(8, 20_000))):
         chosen = z[:, nu == kind]
         if k == 0:

@@ -22,6 +22,7 @@ from emulator.model.theory import (
     misled_covariances,
     noise_covariances,
     stability_bound,
+    state_covariances,
     tail_index,
 )
 
@@ -191,7 +192,7 @@ def test_belief_ignores_being_misled() -> None:
 
 def test_noise_has_the_covariance_of_the_carried_state() -> None:
     """E[χ_k χ_kᵀ] + Q = Σ_k for k ≥ 1, so that either type of packet has the state's covariance."""
-    sigma = EXAMPLE.state_covariances(30)
+    sigma = state_covariances(EXAMPLE, 30)
     noise = noise_covariances(EXAMPLE, 30)
     assert np.allclose(noise[1:] + EXAMPLE.Q, sigma[1:], rtol=1e-12)
     assert np.array_equal(noise[0], np.zeros((2, 2)))
@@ -331,7 +332,7 @@ def test_second_moment_diverges_where_variance_is_said_infinite(mu_d: float) -> 
 def test_misled_error_grows_in_proportion_to_the_state(b0: float, b1: float) -> None:
     """The ratio tr E P_k / tr Σ_k tends to 2 p_i / (p_i + p_r), for naive 2 (1 − μ_d)."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, b0, b1)
-    ratio = expected_traces(EXAMPLE, outcomes, 300)[-1] / np.trace(EXAMPLE.state_covariances(300)[-1])
+    ratio = expected_traces(EXAMPLE, outcomes, 300)[-1] / np.trace(state_covariances(EXAMPLE, 300)[-1])
     assert ratio == pytest.approx(2 * 0.4 * b1 / (0.4 * b1 + 0.6 * b0), rel=1e-9)
 
 
@@ -339,7 +340,7 @@ def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
     """Why whoever is misled has no heavy tail: no sequence of events gives more than a fixed multiple of E tr P_k."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, 1, 1)
     expected = expected_traces(EXAMPLE, outcomes, 200)
-    sigma = np.trace(EXAMPLE.state_covariances(200), axis1=1, axis2=2)
+    sigma = np.trace(state_covariances(EXAMPLE, 200), axis1=1, axis2=2)
     ratio = 2.0 * sigma[5:] / expected[5:]
     assert ratio.max() < 1.01 * ratio[:20].max()
 

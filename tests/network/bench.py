@@ -21,7 +21,7 @@ from emulator.brief import Brief, Flow
 from emulator.network.access import Keys
 from emulator.network.session import client_config
 from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.launcher import free_port
+from emulator.runs.ports import free_port
 from emulator.scenario import Scenario
 
 LIMIT_SECONDS = 20.0

@@ -19,7 +19,7 @@ from emulator.model.process import Trajectory
 from emulator.model.schemes import SCHEMES
 from emulator.network import wire
 from emulator.runs.briefs import Observation, StreamKeys, briefs_of
-from emulator.runs.launcher import free_port
+from emulator.runs.ports import free_port
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
 from emulator.streams import Batch

@@ -1,0 +1,218 @@
+"""The processes of a run as the launcher sees them: started, listened to, ended, and asked what went wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from emulator.brief import Brief
+from emulator.errors import RunError
+from emulator.network.access import OBSERVER, ROUTER, SENSOR
+
+News = Mapping[str, Any]
+GRACE_SECONDS = 3.0  # for the observer to begin to write what there is, and for the others to leave
+_FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
+_LOG_LINES = 12
+_COMPLAINT = "evedrop: "
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_ZENOH_CLOSES = "Received Data for unknown expr_id"
+_REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
+
+
+def _sender(complaint: str) -> str | None:
+    """The process that sent what a complaint about a message is about (docs/protocol.md, keys)."""
+    found = _REFUSED.search(complaint)
+    if found is None:
+        return None
+    kind, _, name = found[1].partition("/")
+    return {"uplink": SENSOR, "journal": ROUTER, "downlink": ROUTER, "control": OBSERVER}.get(kind, name)
+
+
+@dataclass(frozen=True)
+class Exit:
+    """A child ended."""
+
+    process: str
+    status: int
+
+    @property
+    def manner(self) -> str:
+        """As a sentence goes on after the process's name."""
+        if self.status < 0:
+            return f"was ended by signal {-self.status}"
+        return f"ended with status {self.status}" if self.status else "left before the run ended"
+
+
+class Children:
+    """The processes of a run. Final; on leaving the block all are gone."""
+
+    def __init__(self, logs: Path, private: Path) -> None:
+        self._logs = logs
+        self._private = private
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._news: SimpleQueue[News | Exit] = SimpleQueue()
+        self.silent_seconds = 0.0
+        """How long the observer has given no sign of life."""
+        self.started = False
+        """Whether the conductor has started the run."""
+        self._finishing = False
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name in self._processes:
+            self.terminate(name, 0.0)
+        deadline = time.monotonic() + GRACE_SECONDS
+        for process in self._processes.values():
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+
+    def start(self, brief: Brief) -> None:
+        """Start the process of a brief. Its output goes to its log, an observer's news to us.
+
+        Raises RunError if the system does not let us.
+        """
+        conducts = brief.role == "observer"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        if brief.role == "router":
+            environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
+        try:
+            path = brief.write(self._private)
+            with (self._logs / f"{brief.process}.log").open("wb") as log:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "emulator", brief.role, str(path)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE if conducts else log,
+                    stderr=log,
+                    start_new_session=True,
+                    env=environment,
+                )
+        except OSError as error:
+            raise RunError(
+                f"{brief.process} cannot be started ({error}); free what the system lacks and run again"
+            ) from error
+        self._processes[brief.process] = process
+        threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
+
+    def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
+        if process.stdout is not None:
+            with process.stdout as lines:
+                for line in lines:
+                    with contextlib.suppress(ValueError):
+                        self._news.put(json.loads(line))
+        self._news.put(Exit(name, process.wait()))
+
+    def news(self, seconds: float) -> News | Exit | None:
+        """The next news, or None if there are none for so long."""
+        try:
+            news = self._news.get(timeout=seconds)
+        except Empty:
+            self.silent_seconds += seconds
+            return None
+        if isinstance(news, Exit):
+            return news
+        self.silent_seconds = 0.0
+        if news["event"] == "started":
+            self.started = True
+            self._forget_briefs()
+        self._finishing = self._finishing or news["event"] == "finishing"
+        return None if news["event"] in {"alive", "finishing"} else news
+
+    def _forget_briefs(self) -> None:
+        """Everybody has read its own: the keys need not lie on a disk any longer."""
+        for path in self._private.glob("*.json"):
+            path.unlink(missing_ok=True)
+
+    def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
+        """Have the observer end, at once or after so many seconds; its last news if it came to it."""
+        self.terminate(OBSERVER, patience)
+        begun = time.monotonic()
+        ending: News | None = None
+        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else GRACE_SECONDS):
+            news = self.news(0.05)
+            if isinstance(news, Exit):
+                if news.process == OBSERVER:
+                    break
+            elif news is not None:
+                tell(news)
+                ending = news if news["event"] == "ended" else ending
+        return ending
+
+    def terminate(self, name: str, after: float = 0.0) -> None:
+        """Ask a child to end, unless it ends by itself within so many seconds."""
+        process = self._processes.get(name)
+        if process is None:
+            return
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(after)
+        if process.poll() is None:
+            process.terminate()
+
+    def wait_all(self) -> None:
+        """Let everybody leave in peace, within the grace."""
+        deadline = time.monotonic() + GRACE_SECONDS
+        for process in self._processes.values():
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline - time.monotonic()))
+
+    def story(self, first: Exit | None, ending: News | None) -> str:
+        """What happened: the process at fault, and the last lines of its log and of who complained."""
+        suspects = list(ending.get("suspects", [])) if ending is not None else []
+        why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
+        if first is None or (first.process == OBSERVER and first.status > 0):
+            first = self._first_failure(suspects) or first
+        if first is not None:
+            named, head = [first.process], f"{first.process} {first.manner}"
+            words = reversed(self._log(first.process))
+            why = next((line for line in words if line.startswith(_COMPLAINT)), "")
+        elif suspects:
+            named, head = suspects, f"{', '.join(suspects)} gave no sign of life any more: hung, stopped or cut off"
+        else:
+            named, head = [], f"the run failed: {why}"
+        at_fault = _sender(why)
+        if at_fault is not None and at_fault in self._processes and at_fault not in named:
+            named, head = [at_fault, *named], f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
+
+    def _first_failure(self, suspects: list[str]) -> Exit | None:
+        """A child that failed, or left too early; never the observer. Who is missed is given a moment to be gone."""
+        deadline = time.monotonic() + (GRACE_SECONDS / 2 if suspects else 0.0)
+        while True:
+            ended = {name: process.poll() for name, process in self._processes.items() if name != OBSERVER}
+            for name, status in ended.items():
+                if status:
+                    return Exit(name, status)
+            if suspects and all(ended.get(name) == 0 for name in suspects):
+                return Exit(suspects[0], 0)
+            if time.monotonic() > deadline:
+                return None
+            time.sleep(0.01)
+
+    def _log(self, name: str) -> list[str]:
+        """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""
+        try:
+            text = _COLOUR.sub("", (self._logs / f"{name}.log").read_text(errors="replace"))
+        except OSError as error:
+            return [f"(cannot be read: {error.strerror})"]
+        return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]
+
+    def _log_lines(self, name: str) -> list[str]:
+        lines = self._log(name)[-_LOG_LINES:] or ["(it wrote nothing)"]
+        return [f"the last lines of logs/{name}.log:", *(f"    {line}" for line in lines)]

@@ -1,0 +1,26 @@
+"""How a message writes a value and a choice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import tomli_w
+
+_SHOWN = 60  # characters of a value that a message repeats
+
+
+def as_toml(value: Any) -> str:
+    """A value as a scenario writes it, cut where it is long."""
+    if isinstance(value, dict):
+        text = "{ " + ", ".join(f"{key} = {as_toml(inner)}" for key, inner in value.items()) + " }" if value else "{}"
+    elif isinstance(value, list):
+        text = f"[{', '.join(as_toml(inner) for inner in value)}]"
+    else:
+        text = tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as a choice: a, b or c."""
+    return ", ".join(names[:-1]) + (" or " if len(names) > 1 else "") + names[-1]
