@@ -86,6 +86,8 @@ def _private_folder() -> Iterator[Path]:
 def _forget(folder: Path) -> None:
     """Leave no folder of a run that was not started, so that the next one can have it."""
     with contextlib.suppress(OSError):
+        for log in (folder / "logs").iterdir():
+            log.unlink()
         (folder / "logs").rmdir()
         folder.rmdir()
 
