@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -103,8 +104,18 @@ def _print_results(folder: Path, as_json: bool) -> None:
     if as_json:
         print(json.dumps(summary, ensure_ascii=False))
     else:
-        replay = f"evedrop run {folder}" if summary["mode"] == "exact" and summary["ended"] == "complete" else None
-        print_summary(summary, str(folder), replay)
+        print_summary(summary, str(folder), None if summary["mode"] == "live" else _replay(folder))
+
+
+def _replay(folder: Path) -> str | None:
+    """The command that runs a scenario out of a results folder live, one trial of it; None if none can."""
+    from emulator.scenario import load
+
+    try:
+        recorded = load(folder).record_trials
+    except UsageError:  # float64 cannot follow the states of so many slots
+        return None
+    return f"evedrop run {shlex.quote(str(folder))}{' --record-trials 1' if recorded > 1 else ''}"
 
 
 def _keep_open(viewer: Viewer) -> None:

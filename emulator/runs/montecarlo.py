@@ -5,16 +5,18 @@ Trials run in fixed blocks of 500 and are merged in trial order: the results are
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from emulator.errors import Interrupted, UsageError
+from emulator.errors import Interrupted, RunError, UsageError
 from emulator.model.digest import BLOCK_SLOTS, RunDigest
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
@@ -25,7 +27,7 @@ from emulator.runs.scorekeeper import Ending, expected_traces_of, resolved, summ
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.simulation import Mode
 from emulator.runs.trials import BatchResult, Task, tasks_of
-from emulator.runs.workers import in_processes, in_this_process, on_cluster
+from emulator.runs.workers import connected, in_processes, in_this_process, on_cluster
 from emulator.scenario import Scenario
 
 _WORTH_A_PROCESS = 2_000_000  # trial-slots and receivers: below, starting workers costs more than it saves
@@ -51,36 +53,57 @@ class Plan:
         if self.workers is not None:
             return self.workers
         work = scenario.trials * scenario.slots * len(scenario.receivers)
-        return (os.cpu_count() or 1) if work > _WORTH_A_PROCESS else 1
+        return len(os.sched_getaffinity(0)) if work > _WORTH_A_PROCESS else 1
 
 
 def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], plan: Plan = Plan()) -> int:
     """Run all trials of a scenario into a results folder; the exit status. `tell` gets progress as it is made.
 
-    Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C, with what is done in the folder.
+    Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
+    what is done in the folder.
     """
     check_mode(scenario, plan.mode)
     workers = plan.workers_for(scenario)
-    with stop_on_signals() as stop:
-        started = time.monotonic()
+    started = time.monotonic()
+    failure: RunError | None = None
+    merger = Merger(scenario, plan.mode)
+    with stop_on_signals() as stop, connected(plan.scheduler) as client:
         tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
-        results = results_of(tasks, workers, plan.scheduler, told, stop.is_set)
         new_folder(folder)
-        (folder / "scenario.toml").write_text(resolved(scenario))
-        merger = Merger(scenario, plan.mode)
-        with ResultsWriter(folder, scenario.receivers, len(scenario.process.A)) as writer:
-            for result in results:
-                merger.add(result, writer)
+        with said_of(folder):
+            (folder / "scenario.toml").write_text(resolved(scenario), encoding="utf-8")
+            with (
+                ResultsWriter(folder, scenario.receivers, len(scenario.process.A)) as writer,
+                contextlib.closing(results_of(tasks, workers, client, told, stop.is_set)) as results,
+            ):
+                try:
+                    for result in results:
+                        merger.add(result, writer)
+                except RunError as error:
+                    failure = error
+                merger.write(writer)
             if not merger.trials:
-                raise Interrupted("interrupted before anything was done; nothing was kept")
-            merger.write(writer)
-        complete = merger.complete and not stop.is_set()
-        ending = Ending(time.monotonic() - started, "complete" if complete else "interrupted")
-        summary = merger.summary(ending)
-        write_summary(folder, summary)
-    if not complete:
+                shutil.rmtree(folder)
+                raise failure or Interrupted("interrupted before anything was done; nothing was kept")
+            how = str(failure) if failure else "complete" if merger.complete else "interrupted"
+            summary = merger.summary(Ending(time.monotonic() - started, how))
+            write_summary(folder, summary)
+    if failure is not None:
+        raise failure
+    if not merger.complete:
         raise Interrupted("interrupted; what was done is in the results folder")
     return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0
+
+
+@contextlib.contextmanager
+def said_of(folder: Path) -> Iterator[None]:
+    """Make a full disk, or whatever else keeps results from being written, an error that says so: RunError."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{folder} cannot be written ({error.strerror or error}); free some space, or give another --out"
+        ) from error
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
@@ -97,14 +120,15 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
 
 
 def results_of(
-    tasks: list[Task], workers: int, scheduler: str | None, tell: Callable[[int], None], stopped: Callable[[], bool]
-) -> Iterator[BatchResult]:
-    """What the tasks came to, in their order, done where the plan says."""
-    if scheduler is not None:
-        return on_cluster(tasks, scheduler, tell, stopped)
-    if workers == 1 or len(tasks) == 1:
-        return in_this_process(tasks, tell, stopped)
-    return in_processes(tasks, min(workers, len(tasks)), tell, stopped)
+    tasks: list[Task], workers: int, client: Any, tell: Callable[[int], None], stopped: Callable[[], bool]
+) -> Generator[BatchResult]:
+    """What the tasks came to, in their order: done on the cluster of a client, else by workers here."""
+    if client is not None:
+        yield from on_cluster(tasks, client, tell, stopped)
+    elif workers == 1 or len(tasks) == 1:
+        yield from in_this_process(tasks, tell, stopped)
+    else:
+        yield from in_processes(tasks, min(workers, len(tasks)), tell, stopped)
 
 
 def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
@@ -184,11 +208,16 @@ class Merger:
 
     @np.errstate(over="ignore")
     def write(self, writer: ResultsWriter) -> None:
-        """Write the rows of all slots."""
+        """Write the rows of all slots that some trial came to."""
+        if not self.trials:
+            return
         expected = expected_traces_of(self._scenario)
         for name in self._scenario.receivers:
+            sums = self._sums[name].measured()
             quantiles = np.hstack([self._errors[name].quantiles(), self._traces[name].quantiles()])
-            writer.slot_rows(0, name, self._sums[name], expected[name], quantiles, self._mode is Mode.COVARIANCE_ONLY)
+            count = len(sums.trials)
+            covariances = self._mode is Mode.COVARIANCE_ONLY
+            writer.slot_rows(0, name, sums, expected[name][:count], quantiles[:count], covariances)
 
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> dict[str, Any]:

@@ -40,6 +40,11 @@ class SlotSums:
         for one in fields(self):
             getattr(self, one.name)[rows] += getattr(other, one.name)
 
+    def measured(self) -> SlotSums:
+        """The slots that any trial came to: all but the last ones of a run cut short."""
+        rows = slice(0, int(np.count_nonzero(self.trials)))
+        return SlotSums(*(getattr(self, one.name)[rows] for one in fields(self)))
+
 
 def squared_errors(x: Floats, x_hat: Floats) -> Floats:
     """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
+import re
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from emulator.errors import Interrupted, ScenarioError, UsageError
+from emulator.errors import Interrupted, RunError, ScenarioError, UsageError
 from emulator.runs.folder import new_folder
-from emulator.runs.montecarlo import Merger, Plan, check_mode, results_of, teller
+from emulator.runs.montecarlo import Merger, Plan, check_mode, results_of, said_of, teller
 from emulator.runs.scorekeeper import Ending
 from emulator.runs.signals import stop_on_signals
-from emulator.runs.trials import tasks_of
+from emulator.runs.trials import BatchResult, tasks_of
+from emulator.runs.workers import connected
 from emulator.scenario import FIGURES, Scenario, load, value_of
 
 Grid = Mapping[str, Sequence[Any]]
 Point = Mapping[str, Any]
 
 _MOST_POINTS = 10_000
+_RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and nothing that makes a list of it
+_WHOLE = re.compile(r"[+-]?\d+")
 
 
 def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
@@ -39,24 +46,31 @@ def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
             raise UsageError(f"--over {text}: expected KEY=first:last:step or KEY=a,b,c, such as slots=100,200")
         if key in grid:
             raise UsageError(f"--over {text}: {key} is there twice; give all its values in one")
-        grid[key] = _range(text, values) if ":" in values else [value_of(value) for value in values.split(",")]
+        grid[key] = _range(text, values) if _RANGE.fullmatch(values) else _listed(values)
     if math.prod(len(values) for values in grid.values()) > _MOST_POINTS:
         raise UsageError(f"--over asks for more than {_MOST_POINTS} points; take wider steps")
     return grid
 
 
-def _range(text: str, values: str) -> list[float]:
+def _listed(values: str) -> list[Any]:
+    """What stands between commas: TOML values, lists and quoted strings among them; else strings."""
+    whole = value_of(f"[{values}]")
+    return whole if isinstance(whole, list) else [value_of(value.strip()) for value in values.split(",")]
+
+
+def _range(text: str, values: str) -> list[Any]:
+    """Whole numbers if all three are; decimal steps give decimal values, 0.3 and not 0.30000000000000004."""
     try:
-        first, last, step = (float(value) for value in values.split(":"))
-    except ValueError:
+        first, last, step = (Decimal(value.strip()) for value in values.split(":"))
+    except (ValueError, InvalidOperation):
         raise UsageError(f"--over {text}: expected three numbers first:last:step, such as 0.1:0.9:0.1") from None
-    count = math.floor((last - first) / step + 1e-9) + 1 if step else 0
-    if not math.isfinite(first + last + step) or count < 1:
+    if not all(number.is_finite() for number in (first, last, step)) or not step or (last - first) / step < 0:
         raise UsageError(f"--over {text}: the range is empty; expected first:last:step with the step towards last")
-    if count > _MOST_POINTS:
+    if (last - first) / step >= _MOST_POINTS:
         raise UsageError(f"--over {text} asks for more than {_MOST_POINTS} values; take a wider step")
-    # Decimal steps should give decimal values, 0.3 and not 0.30000000000000004.
-    return [round(first + i * step, 12) for i in range(count)]
+    found = [first + i * step for i in range(int((last - first) / step) + 1)]
+    whole = all(_WHOLE.fullmatch(value.strip()) for value in values.split(":"))
+    return [int(value) if whole else float(value) for value in found]
 
 
 def sweep_over(
@@ -69,38 +83,56 @@ def sweep_over(
 ) -> pa.Table:
     """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot. The table: a row a point and peer.
 
-    Raises ScenarioError if any point is no scenario, before anything is run; Interrupted, with the points done so far.
+    Raises ScenarioError if any point is no scenario, before anything is run; Interrupted, or RunError if a worker fails,
+    with the points done so far in the folder.
     """
     scenarios = _checked(source, changes, grid, plan)
     workers = max(plan.workers_for(scenario) for _, scenario in scenarios)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
+    each = -(-workers // len(scenarios))  # with more points than workers, a point need not be cut for them
+    tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
     rows: list[dict[str, Any]] = []
-    with stop_on_signals() as stop:
-        each = -(-workers // len(scenarios))  # with more points than workers, a point need not be cut for them
-        tasks = [(i, task) for i, (_, s) in enumerate(scenarios) for task in tasks_of(s, plan.mode, each)]
-        results = results_of([task for _, task in tasks], workers, plan.scheduler, teller(tell, total), stop.is_set)
+    failure: RunError | None = None
+    done = 0
+    with stop_on_signals() as stop, connected(plan.scheduler) as client:
         new_folder(folder)
-        mergers = [Merger(scenario, plan.mode) for _, scenario in scenarios]
-        started = time.monotonic()
-        for (i, _), result in zip(tasks, results, strict=False):
-            mergers[i].add(result)
-            if mergers[i].complete:
-                point, scenario = scenarios[i]
-                summary = mergers[i].summary(Ending(time.monotonic() - started))
-                rows += _rows(point, scenario, summary)
-        complete = all(merger.complete for merger in mergers)
+        told = teller(tell, total)
+        everything = list(itertools.chain(*tasks))
+        with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+            try:
+                for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
+                    summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
+                    if summary is None:
+                        break
+                    rows += _rows(point, scenario, summary)
+                    done += 1
+            except RunError as error:
+                failure = error
     if not rows:
-        raise Interrupted("interrupted before a point was done; nothing was kept")
+        shutil.rmtree(folder)
+        raise failure or Interrupted("interrupted before a point was done; nothing was kept")
     table = pa.Table.from_pylist(rows)
-    pq.write_table(table, folder / "sweep.parquet")
     description = {"scenario": str(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
-    (folder / "sweep.json").write_text(json.dumps(description, indent=1, ensure_ascii=False) + "\n")
     from emulator.view.sweeps import draw  # noqa: PLC0415 - matplotlib takes half a second
 
-    draw(folder / "sweep", table, tuple(grid))
-    if not complete:
-        raise Interrupted(f"interrupted; the points done so far are in {folder}")
+    with said_of(folder):
+        pq.write_table(table, folder / "sweep.parquet")
+        (folder / "sweep.json").write_text(json.dumps(description, indent=1, ensure_ascii=False, default=str) + "\n")
+        draw(folder / "sweep", table, tuple(grid))
+    if failure is not None:
+        raise failure
+    if done < len(scenarios):
+        raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
     return table
+
+
+def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:
+    """The summary of a point; None if it was cut short."""
+    started = time.monotonic()
+    merger = Merger(scenario, plan.mode)
+    for result in results:
+        merger.add(result)
+    return merger.summary(Ending(time.monotonic() - started)) if merger.complete else None
 
 
 def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: Plan) -> list[tuple[Point, Scenario]]:

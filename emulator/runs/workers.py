@@ -1,23 +1,29 @@
-"""Carries tasks out: here, in worker processes on this machine, or on a Dask cluster. Results come in task order."""
+"""Carries tasks out: here, in worker processes on this machine, or on a Dask cluster. Results come in task order.
+
+A worker process has a pipe of its own and shares no lock with anybody, so that killing one cannot hang the others.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import multiprocessing as mp
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing.process import BaseProcess
-from multiprocessing.queues import Queue
-from multiprocessing.sharedctypes import Synchronized
-from multiprocessing.synchronize import Event
-from queue import Empty
+from multiprocessing import connection, resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from typing import Any
 
 from emulator.errors import RunError, UsageError
 from emulator.runs.trials import BatchResult, Task, carry_out
 
 _LOOK_SECONDS = 0.1
+_LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
+_REACH_SECONDS = 5
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 Tell = Callable[[int], None]
 Stopped = Callable[[], bool]
@@ -33,94 +39,88 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
 
 def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
     """By worker processes of our own. Raises RunError if one dies."""
-    context = mp.get_context("spawn")
-    waiting: Queue[tuple[int, Task] | None] = context.Queue()
-    results: Queue[tuple[int, BatchResult | str]] = context.Queue()
-    done: Synchronized[int] = context.Value("q", 0)
-    stop = context.Event()
-    for entry in [*enumerate(tasks), *[None] * workers]:
-        waiting.put(entry)
-    processes = [
-        context.Process(target=_work, args=(waiting, results, done, stop), daemon=True) for _ in range(workers)
-    ]
-    for process in processes:
-        process.start()
+    crew = [_Worker() for _ in range(workers)]
     try:
-        yield from _in_order(_results(len(tasks), results, processes, _Progress(done, tell), stop, stopped))
+        yield from _in_order(_results(tasks, crew, tell, stopped))
     finally:
-        stop.set()
-        for process in processes:
-            process.terminate()
-            process.join()
+        for worker in crew:
+            worker.end()
 
 
-class _Progress:
-    """Passes on how far a shared counter has come. Final."""
+class _Worker:
+    """A worker process and this end of its pipe. Final."""
 
-    def __init__(self, done: Synchronized[int], tell: Tell) -> None:
-        self._done = done
-        self._tell = tell
-        self._told = 0
-
-    def look(self) -> None:
-        done = self._done.value
-        if done > self._told:
-            self._tell(done - self._told)
-            self._told = done
-
-
-def _work(
-    waiting: Queue[tuple[int, Task] | None],
-    results: Queue[tuple[int, BatchResult | str]],
-    done: Synchronized[int],
-    stop: Event,
-) -> None:
-    """A worker's life: tasks until there are none."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def tell(count: int) -> None:
-        with done.get_lock():
-            done.value += count
-
-    while (entry := waiting.get()) is not None:
-        number, task = entry
+    def __init__(self) -> None:
+        context = mp.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.number: int | None = None
+        """Of the task under way."""
+        self.process: SpawnProcess = context.Process(target=_work, args=(theirs,), daemon=True)
+        # Until it has handlers of its own, a Ctrl-C in the terminal must not reach it; the mask is inherited.
+        resource_tracker.ensure_running()  # which otherwise lifts the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
         try:
-            results.put((number, carry_out(task, tell, stop.is_set)))
-        except Exception as error:
-            results.put((number, f"{type(error).__name__}: {error}"))
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        theirs.close()
+
+    def give(self, number: int, task: Task) -> None:
+        self.number = number
+        with contextlib.suppress(OSError):  # it died; the next look at its pipe says so
+            self.pipe.send(task)
+
+    def stop(self) -> None:
+        """Ask for what is done of the task under way."""
+        self.process.terminate()
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
 
 
-def _results(
-    count: int,
-    results: Queue[tuple[int, BatchResult | str]],
-    processes: list[BaseProcess] | list[Any],
-    progress: _Progress,
-    stop: Event,
-    stopped: Stopped,
-) -> Iterator[tuple[int, BatchResult]]:
-    """The results as they come; after a stop, those of the tasks under way."""
-    left, deadline = count, None
-    while left:
-        progress.look()
-        if stopped() and not stop.is_set():
-            stop.set()
-            deadline = time.monotonic() + 10.0
-        try:
-            number, result = results.get(timeout=_LOOK_SECONDS)
-        except Empty:
-            if deadline is not None and time.monotonic() > deadline:
-                return
-            if any(process.exitcode not in {None, 0} for process in processes):
-                raise RunError("a worker process died; was it killed, or out of memory? try fewer --workers") from None
-            continue
-        if isinstance(result, str):
-            raise RunError(f"a worker failed: {result}")
-        left -= 1
-        yield number, result
+def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stopped) -> Iterator[tuple[int, BatchResult]]:
+    """The results as they come, with their numbers; after a stop, what is done of the tasks under way."""
+    waiting = iter(enumerate(tasks))
+    for worker, (number, task) in zip(crew, waiting, strict=False):
+        worker.give(number, task)
+    deadline: float | None = None
+    while busy := {worker.pipe: worker for worker in crew if worker.number is not None}:
+        if deadline is None and stopped():
+            deadline = time.monotonic() + _LAST_SECONDS
+            for worker in busy.values():
+                worker.stop()
+        if deadline is not None and time.monotonic() > deadline:
+            return
+        for pipe in connection.wait(list(busy), _LOOK_SECONDS):
+            worker = busy[pipe]  # type: ignore[index]  # of the kinds of things to wait for, these are pipes
+            news = _received(worker)
+            if isinstance(news, int):
+                tell(news)
+                continue
+            if isinstance(news, str):
+                raise RunError(f"a worker failed: {news}")
+            if worker.number is not None:
+                yield worker.number, news
+            worker.number = None
+            if deadline is None and (following := next(waiting, None)) is not None:
+                worker.give(*following)
+
+
+def _received(worker: _Worker) -> int | str | BatchResult:
+    try:
+        news: int | str | BatchResult = worker.pipe.recv()
+    except (EOFError, OSError) as error:
+        worker.process.join(_LAST_SECONDS)
+        code = worker.process.exitcode
+        how = f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with status {code}"
+        raise RunError(f"a worker process {how}; was it killed, or out of memory? try fewer --workers") from error
+    return news
 
 
 def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResult]:
-    """Results in the order of their numbers."""
+    """Results in the order of their numbers; what lies beyond one that never came is left out."""
     held: dict[int, BatchResult] = {}
     due = 0
     for number, result in results:
@@ -128,42 +128,88 @@ def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResul
         while due in held:
             yield held.pop(due)
             due += 1
-    for number in sorted(held):
-        yield held[number]
 
 
-def on_cluster(tasks: list[Task], scheduler: str, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
-    """By the workers of a Dask cluster, which must have this version of evedrop installed.
+def _work(pipe: Connection) -> None:
+    """A worker's life: tasks from its pipe until it is ended, or whoever started it is gone."""
+    stop = threading.Event()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
 
-    Raises UsageError if the scheduler cannot be reached or the extra `cluster` is not installed.
+
+def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
+    try:
+        return carry_out(task, tell, stopped)
+    except OSError:
+        raise
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+
+
+@contextlib.contextmanager
+def connected(scheduler: str | None) -> Iterator[Any]:
+    """A client of the Dask scheduler at an address; None without an address.
+
+    Raises UsageError if it cannot be reached or the extra `cluster` is not installed.
     """
+    if scheduler is None:
+        yield None
+        return
     try:
         from distributed import Client  # noqa: PLC0415 - an optional extra
+        from distributed.comm.core import connect  # noqa: PLC0415 - the same
     except ImportError as error:
         raise UsageError("--scheduler needs Dask: pip install 'evedrop[cluster]'") from error
+
+    async def reach() -> None:  # a client that finds nobody may hang, and prints what nobody wants to read
+        reached = connect(scheduler, timeout=_REACH_SECONDS)  # type: ignore[no-untyped-call]
+        comm = await asyncio.wait_for(reached, _REACH_SECONDS)
+        await comm.close()
+
     try:
-        client = Client(scheduler, timeout=5, set_as_default=False)  # type: ignore[no-untyped-call]
+        asyncio.run(reach())
+        client = Client(scheduler, timeout=_REACH_SECONDS, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there within 5 s; start one with `dask scheduler`, "
-            "and give its address, such as tcp://127.0.0.1:8786"
+            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS} s; start one with "
+            "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
         ) from error
-    return _from_cluster(client, tasks, tell, stopped)
-
-
-def _from_cluster(client: Any, tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
     with contextlib.closing(client):
-        futures = [client.submit(_on_worker, task, pure=False) for task in tasks]
-        try:
-            for task, future in zip(tasks, futures, strict=True):
-                while not future.done():
-                    if stopped():
-                        return
-                    time.sleep(_LOOK_SECONDS)
-                yield future.result()
-                tell((task.stop - task.start) * int(task.scenario["slots"]))
-        finally:
-            client.cancel(futures)
+        yield client
+
+
+def on_cluster(tasks: list[Task], client: Any, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
+    """By the workers of a Dask cluster, which must have this version of evedrop installed.
+
+    Raises RunError if one fails or the cluster is gone. After a stop, what is under way there is given up.
+    """
+    futures = [client.submit(_on_worker, task, pure=False) for task in tasks]
+    try:
+        for task, future in zip(tasks, futures, strict=True):
+            while not future.done():
+                if stopped():
+                    return
+                time.sleep(_LOOK_SECONDS)
+            yield _result(future)
+            tell((task.stop - task.start) * int(task.scenario["slots"]))
+    finally:
+        client.cancel(futures)
+
+
+def _result(future: Any) -> BatchResult:
+    try:
+        result: BatchResult = future.result()
+    except Exception as error:
+        raise RunError(
+            f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "
+            "every worker needs this version of evedrop installed, and its log says more"
+        ) from error
+    return result
 
 
 def _on_worker(task: Task) -> BatchResult:

@@ -112,7 +112,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
         process = None
     if process is not None and not beyond_horizon and type(slots) is int and 1 <= slots <= 100_000_000:
         found += _horizon_mistakes(process, slots)
-    if type(trials) is int and type(recorded) is int and recorded > trials:
+    if type(trials) is int and type(recorded) is int and recorded > trials > 0:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
     eavesdroppers, expectations = tables.get("eavesdroppers", {}), tables.get("expect", [])
     if isinstance(eavesdroppers, dict) and isinstance(expectations, list):

@@ -1,0 +1,157 @@
+"""Monte Carlo: the same results however the work is spread, and every trial the one that runs live."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+
+from emulator.api import load_results, montecarlo, run
+from emulator.errors import UsageError
+from emulator.runs.montecarlo import Plan
+from emulator.runs.results import Results
+from tests.conftest import Evedrop
+
+CASES: dict[str, dict[str, Any]] = {
+    "two blocks and a part": {"trials": 1037, "slots": 150},
+    "whole blocks, later trials": {"trials": 1000, "slots": 40, "first_trial": 77, "record_trials": 3},
+}
+TABLES = ("slots", "trials", "digests")
+
+Study = Callable[[str, int], Results]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """A case with a number of workers, run once."""
+
+    @cache
+    def made(case: str, workers: int) -> Results:
+        out = tmp_path_factory.mktemp("study") / "run"
+        return montecarlo("eavesdroppers", out=out, plan=Plan(workers=workers), **CASES[case])
+
+    return made
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("workers", [2, 3])
+def test_results_do_not_depend_on_the_number_of_workers(case: str, workers: int, study: Study) -> None:
+    """Digests, tables to the last bit, and the whole summary but its times."""
+    alone, spread = study(case, 1), study(case, workers)
+    for table in TABLES:
+        assert getattr(alone, table).equals(getattr(spread, table)), table
+    times = {"wall_seconds", "slots_per_second"}
+    assert alone.summary.keys() == spread.summary.keys()
+    assert {key: value for key, value in alone.summary.items() if key not in times} == {
+        key: value for key, value in spread.summary.items() if key not in times
+    }
+    assert all(peer["digest"] for peer in alone.summary["peers"].values())
+
+
+def test_later_trials_are_those_of_the_whole(tmp_path: Path, study: Study) -> None:
+    """Trials 700 to 719 alone, from the middle of a block, have the digests they have among 1037."""
+    few = montecarlo("eavesdroppers", slots=150, trials=20, first_trial=700, out=tmp_path / "few")
+    whole = study("two blocks and a part", 1).digests
+    some = pc.and_(pc.greater_equal(whole["trial"], 700), pc.less(whole["trial"], 720))
+    assert few.digests.num_rows == 20 * 4
+    names = ("peer", "trial", "block", "digest")
+    rows = [set(zip(*(t[name].to_pylist() for name in names), strict=True)) for t in (few.digests, whole.filter(some))]
+    assert rows[0] == rows[1]
+
+
+def test_the_tables_are_the_means_of_the_trials(tmp_path: Path) -> None:
+    """With every trial recorded, means, standard errors and fractions are those of plain numpy."""
+    results = montecarlo("eavesdroppers", slots=12, trials=7, record_trials=7, out=tmp_path / "run")
+    table = results.trials.to_pydict()
+    for row in results.slots.to_pylist():
+        mine = [
+            i for i, at in enumerate(zip(table["slot"], table["peer"], strict=True)) if at == (row["slot"], row["peer"])
+        ]
+        errors = np.array([table["squared_error"][i] for i in mine])
+        assert len(mine) == row["trials"] == 7
+        assert row["mean_squared_error"] == pytest.approx(errors.mean(), rel=1e-12)
+        assert row["standard_error"] == pytest.approx(errors.std(ddof=1) / np.sqrt(7), rel=1e-6, abs=1e-18)
+        assert row["mean_trace_covariance"] == pytest.approx(np.mean([table["trace_covariance"][i] for i in mine]))
+        actions = [table["action"][i] for i in mine]
+        assert row["received_fraction"] == pytest.approx(1 - actions.count("dropped") / 7)
+        assert row["used_fraction"] == pytest.approx(1 - (actions.count("dropped") + actions.count("discarded")) / 7)
+
+
+def test_the_most_surprising_trial_is_the_one_furthest_off(tmp_path: Path) -> None:
+    """Recomputed from every recorded trial: median deviations of the logarithm of a trial's mean error over k ≥ 1."""
+    results = montecarlo("eavesdroppers", slots=30, trials=40, record_trials=40, first_trial=5, out=tmp_path / "run")
+    table, found = results.trials.to_pydict(), results.summary["surprising"]
+    scores = {}
+    for peer in results.summary["peers"]:
+        rows = zip(table["slot"], table["peer"], table["trial"], table["squared_error"], strict=True)
+        errors: dict[int, list[float]] = {}
+        for slot, name, trial, error in rows:
+            if name == peer and slot >= 1:
+                errors.setdefault(trial, []).append(error)
+        logarithms = {trial: np.log(np.mean(of_slots)) for trial, of_slots in errors.items()}
+        middle = np.median(list(logarithms.values()))
+        deviations = {trial: abs(value - middle) for trial, value in logarithms.items()}
+        spread = np.median(list(deviations.values()))
+        scores.update({(trial, peer): value / spread for trial, value in deviations.items()})
+    assert max(scores, key=lambda at: scores[at]) == (found["trial"], found["receiver"])
+
+
+def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -> None:
+    """It is run as printed, with a folder whose name has a blank in it: same digests, same error, one trial."""
+    done = evedrop(
+        "montecarlo", "eavesdroppers", "--slots", "300", "--trials", "30", "--record-trials", "2", "--out", "a study"
+    )
+    assert (done.status, done.err) == (0, "")
+    study = load_results(evedrop.folder / "a study")
+    surprising = study.summary["surprising"]
+    line = next(line for line in done.out.splitlines() if "watch it live: " in line)
+    words = shlex.split(line.partition("watch it live: ")[2])
+    assert words[0] == "evedrop"
+    assert words[-4:] == ["--first-trial", str(surprising["trial"]), "--trials", "1"]
+    again = evedrop(*words[1:], "--view", "off", "--out", "live")
+    assert (again.status in {0, 1}, again.err) == (True, "")  # 1: its error is too large for the scenario's expectation
+    live = load_results(evedrop.folder / "live")
+    assert live.summary["mode"] == "live"
+    of_trial = study.digests.filter(pc.equal(study.digests["trial"], surprising["trial"])).to_pylist()
+    key = lambda row: (row["peer"], row["block"])  # noqa: E731 - once
+    assert sorted(live.digests.to_pylist(), key=key) == sorted(of_trial, key=key)
+    errors = [
+        row["squared_error"]
+        for row in live.trials.to_pylist()
+        if row["peer"] == surprising["receiver"] and row["slot"] >= 1
+    ]
+    assert np.mean(errors) == pytest.approx(surprising["mean_error"], rel=1e-12)
+    assert re.search(rf"most surprising: trial {surprising['trial']}, {surprising['receiver']}", done.out)
+
+
+def test_a_live_run_has_the_same_digests_and_figures(tmp_path: Path, study: Study) -> None:
+    """The first two trials of the study, live."""
+    live = run("eavesdroppers", slots=150, trials=2, out=tmp_path / "live")
+    whole = study("two blocks and a part", 1).digests
+    first = whole.filter(pc.less(whole["trial"], 2))
+    key = lambda row: (row["peer"], row["trial"], row["block"])  # noqa: E731 - once
+    assert sorted(live.digests.to_pylist(), key=key) == sorted(first.to_pylist(), key=key)
+
+
+def test_a_scenario_of_ones_own_runs_with_changes(tmp_path: Path) -> None:
+    """From Python, a checked scenario with dotted changes is what the command runs with --set."""
+    from emulator.scenario import load
+
+    ours = montecarlo(load("eavesdroppers"), trials=3, slots=20, legitimate__link__quality=0.5, out=tmp_path / "a")
+    named = montecarlo("eavesdroppers", trials=3, slots=20, legitimate__link__quality=0.5, out=tmp_path / "b")
+    assert ours.summary["peers"] == named.summary["peers"]
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_no_workers_are_refused(workers: int, tmp_path: Path) -> None:
+    """A usage error, and no folder."""
+    with pytest.raises(UsageError, match="expected 1 or more"):
+        montecarlo("eavesdroppers", trials=3, slots=20, plan=Plan(workers=workers), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,183 @@
+"""Real processes at work: interrupted, killed, out of disk, they leave a readable folder and no process."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from emulator.errors import RunError
+from emulator.runs.results import load_results
+from emulator.runs.simulation import Mode
+from emulator.runs.trials import tasks_of
+from emulator.runs.workers import in_processes
+from emulator.scenario import load
+from tests.conftest import Done, Evedrop, Live, processor_seconds, wait_until, with_mark
+
+ENDLESS = ("--slots", "100000", "--trials", "6000")
+
+
+def started(evedrop: Evedrop, command: str, workers: int, *more: str) -> tuple[Live, list[int]]:
+    """A study that would take minutes, under way, and its worker processes."""
+    arguments = (command, "eavesdroppers", *ENDLESS, "--workers", str(workers), "--out", "run", *more)
+    live = Live(evedrop._start(arguments, {}), evedrop.temporary, evedrop.folder / "run")
+    crew = wait_until(lambda: at_work(live, workers), "workers at work")
+    return live, crew
+
+
+def at_work(live: Live, workers: int) -> list[int]:
+    """The processes that simulate, once all of them have computed for a while."""
+    if workers == 1:
+        crew = [live.process.pid] if (live.folder / "slots.parquet").exists() else []
+    else:
+        crew = [pid for pid, command in with_mark(str(live.temporary)).items() if "spawn_main" in command]
+    try:
+        enough = len(crew) == workers and all(processor_seconds(pid) > 1.5 for pid in crew)
+    except OSError:
+        return []
+    return crew if enough else []
+
+
+def no_process_left(live: Live) -> None:
+    """Neither a worker nor one of Python's own."""
+    wait_until(lambda: not live.left(), "no process left", 10.0)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number: signal.Signals) -> None:
+    """Exit 130, a summary that says interrupted, tables with the slots that were done, no process left."""
+    live, _ = started(evedrop, "montecarlo", workers)
+    live.process.send_signal(number)
+    done = live.end()
+    assert done.status == 130
+    assert "Traceback" not in done.err
+    assert "what was done is in the results folder" in done.err
+    no_process_left(live)
+    summary = live.results.summary
+    assert summary["ended"] == "interrupted"
+    assert 0 < summary["slots"] < 100_000
+    assert {peer["digest"] for peer in summary["peers"].values()} == {None}
+    slots = live.results.slots.to_pydict()
+    assert max(slots["slot"]) + 1 >= summary["slots"]
+    assert min(slots["trials"]) > 0
+    assert np.isfinite(slots["mean_squared_error"]).all()
+    assert summary["links"]["smart"]["unexplained"] == 0
+
+
+def test_a_ctrl_c_in_the_terminal_reaches_the_workers_too(evedrop: Evedrop) -> None:
+    """The whole group gets the signal, workers that have just been born among them; nobody prints a traceback."""
+    arguments = ("montecarlo", "eavesdroppers", *ENDLESS, "--workers", "2", "--out", "run")
+    live = Live(evedrop._start(arguments, {"start_new_session": True}), evedrop.temporary, evedrop.folder / "run")
+    wait_until(lambda: any("spawn_main" in command for command in live.left().values()), "a worker")
+    os.killpg(live.process.pid, signal.SIGINT)
+    done = live.end()
+    assert done.status == 130
+    assert "Traceback" not in done.err
+    no_process_left(live)
+
+
+def ended_by_fault(live: Live, done: Done) -> None:
+    """Exit 3, one line."""
+    assert (done.status, "Traceback" in done.err, live.left()) == (3, False, {})
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: ")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV], ids=["killed", "crashed"])
+def test_a_dead_worker_is_said(evedrop: Evedrop, number: signal.Signals) -> None:
+    """Exit 3 and one line with the signal and a remedy; no process left, and no folder that pretends to be a study."""
+    live, crew = started(evedrop, "montecarlo", 2)
+    os.kill(crew[-1], number)
+    done = live.end()
+    no_process_left(live)
+    ended_by_fault(live, done)
+    assert f"a worker process was ended by signal {int(number)}" in done.err
+    assert "try fewer --workers" in done.err
+    assert not live.folder.exists()
+
+
+def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
+    """Kill -9 of the command itself: the workers notice that nobody listens."""
+    live, _ = started(evedrop, "montecarlo", 2)
+    live.process.kill()
+    live.process.communicate()
+    no_process_left(live)
+
+
+def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A fault after the first batch: the tables have its trials, the summary says how the study ended."""
+    from emulator.api import montecarlo
+    from emulator.runs import montecarlo as module
+
+    def failing(tasks: list[object], *_: object) -> object:
+        from emulator.runs.trials import carry_out
+
+        yield carry_out(tasks[0], lambda _: None, lambda: False)  # type: ignore[arg-type]
+        raise RunError("a worker process died")
+
+    monkeypatch.setattr(module, "in_processes", failing)
+    with pytest.raises(RunError, match="died"):
+        montecarlo("eavesdroppers", trials=1100, slots=20, out=tmp_path / "run", plan=module.Plan(workers=2))
+    results = load_results(tmp_path / "run")
+    assert results.summary["ended"] == "a worker process died"
+    assert set(results.slots["trials"].to_pylist()) == {1000}
+    assert results.digests.num_rows == 1000 * 4
+
+
+def test_a_failing_worker_says_what_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error inside a worker comes back as one line with its kind."""
+    scenario = load("eavesdroppers", {"slots": 10, "trials": 1500})
+    tasks = tasks_of(scenario, Mode.EXACT, 2)
+    broken = [type(task)({**task.scenario, "slots": "many"}, task.mode, task.start, task.stop) for task in tasks]
+    results = in_processes(broken, 2, lambda _: None, lambda: False)
+    with pytest.raises(RunError, match="a worker failed: ValidationError"):
+        next(results)
+
+
+def small_files() -> None:
+    """Files beyond 200 kB fail to be written, as on a full disk."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+
+
+def test_a_full_disk_is_said(evedrop: Evedrop) -> None:
+    """Exit 3 and one line that names the folder, no traceback."""
+    limits: Callable[[], None] = small_files
+    done = evedrop("montecarlo", "eavesdroppers", "--slots", "3000", "--trials", "3", "--out", "run", preexec_fn=limits)
+    assert done.status == 3
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: run cannot be written (")
+
+
+def test_an_interrupted_sweep_keeps_finished_points(evedrop: Evedrop) -> None:
+    """The points that were done are in the table, the plot is drawn, exit 130."""
+    arguments = (
+        "sweep",
+        "eavesdroppers",
+        "--over",
+        "slots=20,100000",
+        "--trials",
+        "1500",
+        "--workers",
+        "2",
+        "--out",
+        "run",
+    )
+    live = Live(evedrop._start(arguments, {}), evedrop.temporary, evedrop.folder / "run")
+    wait_until(lambda: at_work(live, 2), "workers at work on the second point")
+    live.process.send_signal(signal.SIGINT)
+    done = live.end()
+    assert done.status == 130
+    assert "interrupted; 1 of 2 points were done" in done.err
+    no_process_left(live)
+    table = pq.read_table(live.folder / "sweep.parquet")
+    assert set(table["slots"].to_pylist()) == {20}
+    assert table.num_rows == 4
+    assert (live.folder / "sweep.png").is_file()
