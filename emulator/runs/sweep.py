@@ -89,7 +89,7 @@ def sweep_over(
     scenarios = _checked(source, changes, grid, plan)
     workers = max(plan.workers_for(scenario) for _, scenario in scenarios)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
-    each = -(-workers // len(scenarios))  # with more points than workers, a point need not be cut for them
+    each = workers if len(scenarios) < 4 * workers else 1  # many points need not be cut for the workers
     tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
     rows: list[dict[str, Any]] = []
     failure: RunError | None = None

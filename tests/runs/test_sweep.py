@@ -1,0 +1,191 @@
+"""Sweeps: grids, every combination of them, and each point what a study of its own gives."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from decimal import Decimal
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.api import montecarlo
+from emulator.errors import UsageError
+from emulator.runs.montecarlo import Plan
+from emulator.runs.simulation import Mode
+from emulator.runs.sweep import grid_of, sweep_over
+from emulator.scenario import FIGURES
+from tests.conftest import Evedrop
+
+decimals = st.decimals(-1000, 1000, places=3, allow_nan=False, allow_infinity=False)
+steps = st.decimals("0.001", 50, places=3)
+
+
+@given(decimals, steps, st.integers(0, 400), st.booleans())
+@settings(deadline=None, max_examples=200)
+def test_a_range_has_both_ends_and_decimal_values(first: Decimal, step: Decimal, count: int, down: bool) -> None:
+    """first:last:step gives first + i·step as a decimal fraction reads, no value more and none less."""
+    step = -step if down else step
+    last = first + count * step
+    (values,) = grid_of([f"key={first}:{last}:{step}"]).values()
+    assert values == [float(first + i * step) for i in range(count + 1)]
+
+
+@given(st.integers(-50, 50), st.integers(1, 9), st.integers(0, 30))
+@settings(deadline=None, max_examples=50)
+def test_a_range_of_whole_numbers_is_whole(first: int, step: int, count: int) -> None:
+    """Slots and trials can be swept; an end between two steps is left out."""
+    (values,) = grid_of([f"key={first}:{first + count * step + step - 1}:{step}"]).values()
+    assert values == list(range(first, first + count * step + 1, step))
+    assert all(type(value) is int for value in values)
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("k=1,2.5,true", [1, 2.5, True]),
+        ("k=smart,naive", ["smart", "naive"]),
+        ("k=smart, 3", ["smart", 3]),
+        ('k="a,b",c', ['"a', 'b"', "c"]),
+        ('k="a:b","c"', ["a:b", "c"]),
+        ("k=[[1.0,0.1],[0.0,1.0]],[[1.0,0.2],[0.0,1.0]]", [[[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.2], [0.0, 1.0]]]),
+        ("k=5", [5]),
+    ],
+)
+def test_lists_are_read_as_toml(text: str, values: list[object]) -> None:
+    """Numbers, words, quoted words, and matrices, whose commas do not part them."""
+    assert grid_of([text]) == {"k": values}
+
+
+@pytest.mark.parametrize(
+    ("texts", "said"),
+    [
+        (["slots"], "expected KEY="),
+        (["=1,2"], "expected KEY="),
+        (["slots="], "expected KEY="),
+        (["a=1", "a=2"], "is there twice"),
+        (["a=5:1:1"], "the range is empty"),
+        (["a=1:5:-1"], "the range is empty"),
+        (["a=1:5:0"], "the range is empty"),
+        (["a=1:nan:1"], "the range is empty"),
+        (["a=1:inf:1"], "the range is empty"),
+        (["a=1:2"], "expected three numbers"),
+        (["a=1:2:x"], "expected three numbers"),
+        (["a=0:1:1e-9"], "more than 10000 values"),
+        (["a=0:1:0.001", "b=0:1:0.01"], "more than 10000 points"),
+    ],
+)
+def test_what_is_no_grid_is_refused(texts: list[str], said: str) -> None:
+    """One line that names the option."""
+    with pytest.raises(UsageError, match=said) as told:
+        grid_of(texts)
+    assert str(told.value).startswith("--over")
+    assert "\n" not in str(told.value)
+
+
+GRID = {"encoding.state_probability": [0.3, 0.6, 0.9], "eavesdroppers.smart.link.quality": [0.5, 0.9]}
+CHANGES = {"slots": 40, "trials": 620}
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[pa.Table, Path]:
+    """A small sweep by two workers, and its folder."""
+    folder = tmp_path_factory.mktemp("sweep") / "run"
+    return sweep_over("eavesdroppers", CHANGES, GRID, folder, lambda _: None, Plan(workers=2)), folder
+
+
+def test_every_combination_has_a_row_for_every_peer(swept: tuple[pa.Table, Path]) -> None:
+    """In the order of the grid, and nothing else."""
+    rows = swept[0].to_pylist()
+    peers = ("legitimate", "naive", "suspicious", "smart")
+    expected = [(*point, peer) for point in itertools.product(*GRID.values()) for peer in peers]
+    assert [(*(row[key] for key in GRID), row["peer"]) for row in rows] == expected
+    assert {row["trials"] for row in rows} == {620}
+
+
+def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: Path) -> None:
+    """Figures, verdicts and digests of each point are those of `montecarlo` with the same entries, to the bit."""
+    rows = {(*(row[key] for key in GRID), row["peer"]): row for row in swept[0].to_pylist()}
+    for i, point in enumerate(itertools.product(*GRID.values())):
+        changes = {key.replace(".", "__"): value for key, value in zip(GRID, point, strict=True)}
+        alone = montecarlo(
+            "eavesdroppers", **{**CHANGES, **changes}, out=tmp_path / str(i), plan=Plan(workers=1)
+        ).summary
+        for name, peer in alone["peers"].items():
+            row = rows[(*point, name)]
+            assert row["digest"] == peer["digest"]
+            assert row["infinite_variance"] == peer["infinite_variance"]
+            for figure in FIGURES:
+                assert row[figure] == peer[figure]
+            for level, value in peer["error_quantiles"].items():
+                assert row[f"error_quantile_{level}"] == value
+            verdict = alone["secrecy"].get(name, {})
+            assert (row["relative_secrecy"], row["perfect_secrecy"]) == (
+                verdict.get("relative"),
+                verdict.get("perfect"),
+            )
+
+
+def test_the_folder_has_table_description_and_plot(swept: tuple[pa.Table, Path]) -> None:
+    """The table as it was returned, what was swept, and a drawing with something on it."""
+    from matplotlib.image import imread
+
+    table, folder = swept
+    assert pq.read_table(folder / "sweep.parquet").equals(table)
+    described = json.loads((folder / "sweep.json").read_text())
+    assert described == {"scenario": "eavesdroppers", "changes": CHANGES, "over": GRID, "mode": "exact"}
+    ink = (imread(folder / "sweep.png")[:, :, :3].min(axis=2) < 0.9).mean()
+    assert 0.005 < ink < 0.5
+    assert (folder / "sweep.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> None:
+    """A strategy and slots, covariance-only: the actual trace stands in its own column, and the plot is drawn."""
+    grid = {"eavesdroppers.smart.strategy": ["smart", "naive"], "slots": [10, 20]}
+    plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
+    table = sweep_over("eavesdroppers", {"trials": 5}, grid, tmp_path / "run", lambda _: None, plan)
+    assert table.num_rows == 2 * 2 * 4
+    assert table["mean_squared_error"].null_count == table.num_rows
+    assert table["mean_actual_trace_covariance"].null_count == table["digest"].null_count - table.num_rows == 0
+    assert (tmp_path / "run" / "sweep.png").is_file()
+
+
+BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--over", "sluts=1,2", "--trials", "5"), "sluts: is no entry of this table; did you mean slots?"),
+        (("--over", "encoding.foo=1,2", "--trials", "5"), "encoding.foo: is no entry of this table"),
+        (("--over", "seed=1,2", "--trials", "0"), "trials: is 0; expected a number at least 1"),
+        (("--over", "seed=1,2", "--trials", "-4"), "trials: is -4; expected a number at least 1"),
+        (("--over", "seed=5:1:1", "--trials", "5"), "--over seed=5:1:1: the range is empty"),
+        (("--over", "seed=1,2", "--trials", "5", "--workers", "0"), "--workers 0: expected 1 or more"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused(evedrop: Evedrop, more: tuple[str, ...], said: str) -> None:
+    """One clear line, exit 2, nothing written."""
+    done = evedrop(*BASE, *more)
+    assert (done.status, done.out) == (2, "")
+    lines = [line for line in done.err.splitlines() if not line.endswith("1 mistake, nothing was started")]
+    assert len(lines) == 1
+    assert said in lines[0]
+    assert not (evedrop.folder / "run").exists()
+
+
+def test_the_command_prints_what_it_wrote(evedrop: Evedrop) -> None:
+    """--json is the table as strict JSON and nothing else; without it, a table for people."""
+    done = evedrop(*BASE, "--over", "encoding.state_probability=0.2:0.4:0.2", "--trials", "12", "--json")
+    assert (done.status, done.err) == (0, "")
+    rows = json.loads(done.out, parse_constant=pytest.fail)
+    assert rows == pq.read_table(evedrop.folder / "run" / "sweep.parquet").to_pylist()
+    assert {row["encoding.state_probability"] for row in rows} == {0.2, 0.4}
+    done = evedrop(*BASE[:-1], "other", "--over", "encoding.state_probability=0.2", "--trials", "12")
+    assert (done.status, done.err) == (0, "")
+    for words in ("encoding.state_probability", "legitimate", "smart", "other/sweep.parquet"):
+        assert words in done.out

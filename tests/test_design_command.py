@@ -1,0 +1,161 @@
+"""`evedrop design` and `evedrop figures` as they are typed: keys, numbers, edges, refusals."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from emulator.view.figures import Size
+from tests.conftest import Evedrop
+
+LOW = 0.534206
+
+
+def designed(evedrop: Evedrop, scenario: str, *more: str) -> dict[str, Any]:
+    """The JSON of a design, which must be strict."""
+    done = evedrop("design", scenario, "--json", *more)
+    assert (done.status, done.err) == (0, "")
+    assert done.out.count("\n") == 1
+    found: dict[str, Any] = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    return found
+
+
+def changes(**entries: object) -> list[str]:
+    """--set options, `__` for the dot."""
+    return [word for key, value in entries.items() for word in ("--set", f"{key.replace('__', '.')}={value}")]
+
+
+def test_the_numerical_illustration(evedrop: Evedrop) -> None:
+    """Exactly the promised keys; bounds to 1e-6; intervals and optima for each μ_e to 1e-4."""
+    found = designed(evedrop, "numerical")
+    assert list(found) == ["rho", "legitimate", "eavesdroppers"]
+    assert set(found["legitimate"]) == {"bound", "trace"}
+    keys = {"bound", "perfect", "relative", "best_difference", "best_ratio", "trace"}
+    assert {frozenset(one) for one in found["eavesdroppers"].values()} == {frozenset(keys)}
+    assert found["rho"] == pytest.approx(1.387799, abs=1e-6)
+    assert found["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
+    near = {"abs": 1e-4}
+    for name, bound, relative, difference, ratio in (
+        ("smart", 0.565630, (LOW, 1.0), None, None),
+        ("equal", 0.534206, (LOW, 1.0), None, None),
+        ("better", 0.506090, (0.54153, 0.93882), 0.55709, 0.6297),
+        ("much-better", 0.485642, (0.54790, 0.89331), 0.57447, 0.6445),
+    ):
+        one = found["eavesdroppers"][name]
+        assert one["bound"] == pytest.approx(bound, abs=1e-6)
+        (interval,) = one["relative"]
+        assert interval == pytest.approx(relative, **near)
+        assert one["best_difference"] == (difference and pytest.approx(difference, **near))
+        assert one["best_ratio"] == (ratio and pytest.approx(ratio, **near))
+        assert one["perfect"] == (pytest.approx([LOW, 0.565630], abs=1e-6) if name == "smart" else None)
+    assert found["eavesdroppers"]["smart"]["trace"] is None
+
+
+@pytest.mark.parametrize(
+    ("entries", "legitimate", "smart"),
+    [
+        ({"legitimate__link__quality": 1.0}, {"trace": 0.0}, {}),
+        ({"eavesdroppers__smart__link__quality": 0.0}, {}, {"bound": None, "trace": None}),
+        (
+            {"process__A": [[1.0, 0.0], [0.0, 1.0]]},
+            {"bound": 0.0},
+            {"bound": 0.0, "perfect": None, "relative": [[0.0, 1.0]]},
+        ),
+        (
+            {"legitimate__link__quality": 0.4},
+            {"trace": None},
+            {"perfect": None, "relative": [], "best_difference": None, "best_ratio": None},
+        ),
+    ],
+    ids=["lossless", "deaf", "marginal", "hopeless"],
+)
+def test_edges(evedrop: Evedrop, entries: dict[str, Any], legitimate: dict[str, Any], smart: dict[str, Any]) -> None:
+    """μ = 1, μ_e = 0, ρ = 1, and a link for which no μ_d is admissible: strict JSON with null for what is unbounded."""
+    found = designed(evedrop, "numerical", *changes(**entries))
+    assert found["legitimate"] == {**found["legitimate"], **legitimate}
+    against = found["eavesdroppers"]["smart"]
+    assert against == {**against, **smart}
+
+
+def test_for_people(evedrop: Evedrop) -> None:
+    """The text has a row for every eavesdropper, the admissible range, cost and bound."""
+    done = evedrop("design", "numerical", "--max-trace", "0.01")
+    assert (done.status, done.err) == (0, "")
+    for words in (
+        "smart",
+        "equal",
+        "better",
+        "much-better",
+        "naive",
+        "0.534206 < μ_d ≤ 1",
+        "least μ_d",
+        "(0.53421, 0.56563]",
+    ):
+        assert words in done.out
+    assert "nan" not in done.out
+
+
+def test_it_is_said_that_nothing_is_admissible(evedrop: Evedrop) -> None:
+    """In words, with the number the link must exceed, and every eavesdropper still in the table."""
+    done = evedrop("design", "numerical", *changes(legitimate__link__quality=0.4))
+    assert (done.status, done.err) == (0, "")
+    assert "no μ_d is admissible" in done.out
+    assert "0.480785" in done.out
+    assert "much-better" in done.out
+
+
+def test_an_unbounded_choice_is_said(evedrop: Evedrop) -> None:
+    """A μ_d below the bound: the range is there, and the error at the scenario's own μ_d is said to be unbounded."""
+    done = evedrop("design", "numerical", *changes(encoding__state_probability=0.2))
+    assert (done.status, done.err) == (0, "")
+    assert "at this scenario's μ_d = 0.2 the legitimate error is unbounded" in done.out
+    assert "inf" not in done.out
+    assert "nan" not in done.out
+
+
+@pytest.mark.parametrize("wanted", ["1e-9", "0", "-1", "nan"])
+def test_a_trace_that_cannot_be_kept_is_refused(evedrop: Evedrop, wanted: str) -> None:
+    """Ω at or below J(1): one line with what is possible, exit 2."""
+    done = evedrop("design", "numerical", "--max-trace", wanted)
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert "no μ_d keeps the legitimate trace below" in line
+    assert "0.000228372" in line
+
+
+def test_the_least_choice_is_in_the_json_if_asked_for(evedrop: Evedrop) -> None:
+    """`minimum` beside bound and trace; at that μ_d the trace is Ω."""
+    least = designed(evedrop, "numerical", "--max-trace", "0.01")["legitimate"]["minimum"]
+    assert least == pytest.approx(0.540427, abs=1e-6)
+    again = designed(evedrop, "numerical", *changes(encoding__state_probability=least))
+    assert again["legitimate"]["trace"] == pytest.approx(0.01, rel=1e-5)
+
+
+def test_a_run_of_any_length_can_be_designed(evedrop: Evedrop) -> None:
+    """More slots than float64 can follow are no obstacle to theory."""
+    assert designed(evedrop, "numerical", *changes(slots=20000))["rho"] == pytest.approx(1.387799, abs=1e-6)
+
+
+def test_figures_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """A small set by the command: four pictures, figures.md, and its path on standard output."""
+    from emulator import cli
+    from emulator.view import figures
+
+    small = Size(microgrid_trials=5, microgrid_slots=200, strategy_trials=500, chain_trials=10, chain_slots=100)
+    monkeypatch.setattr(figures, "Size", lambda **_: small)
+    assert cli.main(["figures", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr()
+    assert told.out.strip() == str(tmp_path / "out" / "figures.md")
+    names = {"numerical", "microgrid", "strategies", "chain"}
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"figures.md", *(f"{name}.{kind}" for name in names for kind in ("png", "pdf"))}
+
+
+def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:
+    """A file where the folder should be: one line, exit 2."""
+    (evedrop.folder / "file").touch()
+    done = evedrop("figures", "file")
+    assert (done.status, done.out) == (2, "")
+    assert done.err.splitlines()[-1].startswith("evedrop: file cannot be written (")
