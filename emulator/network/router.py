@@ -56,7 +56,13 @@ class Downlink:
         """Send slot k's delivery: the packets z (n, R), or as bytes the whole of them, that the link does not erase."""
         row = k - self._first
         received = self._received[row]
-        payload = whole if received == z.shape[1] else z[:, self._delivered[row]].tobytes() if received else b""
+        payload = (
+            whole
+            if received == z.shape[1]
+            else np.compress(self._delivered[row], z, axis=1).tobytes()
+            if received
+            else b""
+        )
         self._put(delivery(k, self._masks[row], payload))
 
 

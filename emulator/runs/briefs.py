@@ -17,7 +17,7 @@ from emulator.runs.folder import new_folder
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
 
-_WINDOW_BYTES = 16 * 2**20
+_WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 1024
 _REPORT_SECONDS = 0.04
 

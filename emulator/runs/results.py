@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -58,6 +58,14 @@ ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
 """What a receiver did, as the observer knows it: `misled` is an innovation used as the state."""
 
 
+_NULLABLE = {
+    "mean_squared_error",
+    "mean_actual_trace_covariance",
+    *(field.name for field in SLOTS if "quantile" in field.name),
+}
+"""Columns in which NaN means that there is nothing."""
+
+
 def _trials_schema(n: int) -> pa.Schema:
     return pa.schema(
         [
@@ -85,37 +93,46 @@ DIGESTS = pa.schema(
 )
 
 
-def _coded(codes: NDArray[Any], names: tuple[str, ...]) -> pa.Array:
-    return pa.DictionaryArray.from_arrays(pa.array(np.ascontiguousarray(codes, np.int8)), pa.array(names))
-
-
-def _fixed(values: Floats) -> pa.Array:
-    return pa.FixedSizeListArray.from_arrays(pa.array(np.ascontiguousarray(values).reshape(-1)), values.shape[-1])
-
-
 class _Table:
-    """A Parquet file that grows. Rows are held back until there are enough for a row group."""
+    """A Parquet file that grows. Rows are held back, as arrays of one row each slot, until they make a row group."""
 
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
-        named = [field.name for field in schema if pa.types.is_dictionary(field.type)]
-        self._writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1, use_dictionary=named)
+    def __init__(self, path: Path, schema: pa.Schema, names: Mapping[str, tuple[str, ...]]) -> None:
+        """names: what the codes of each dictionary column stand for."""
+        self._writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1, use_dictionary=[*names])
         self._schema = schema
-        self._held: list[pa.RecordBatch] = []
+        self._names = {column: pa.array(words) for column, words in names.items()}
+        self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
         self._rows = 0
 
-    def add(self, columns: list[Any]) -> None:
-        batch = pa.RecordBatch.from_arrays(
-            [pa.array(c) if isinstance(c, np.ndarray) else c for c in columns], schema=self._schema
-        )
-        self._held.append(batch)
-        self._rows += batch.num_rows
+    def add(self, columns: Sequence[NDArray[Any]]) -> None:
+        """Take rows: an array for each column, codes where it has names, and two dimensions where it holds lists or bytes."""
+        for held, column in zip(self._held, columns, strict=True):
+            held.append(np.array(column))  # a copy: a view would keep a whole message from being forgotten
+        self._rows += len(columns[0])
         if self._rows >= _ROWS:
             self._write()
 
     def _write(self) -> None:
-        if self._held:
-            self._writer.write_table(pa.Table.from_batches(self._held, self._schema).combine_chunks())
-        self._held, self._rows = [], 0
+        if self._rows:
+            columns = [
+                self._column(field, np.concatenate(held)) for field, held in zip(self._schema, self._held, strict=True)
+            ]
+            self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
+        self._held, self._rows = [[] for _ in self._schema], 0
+
+    def _column(self, field: pa.Field, values: NDArray[Any]) -> pa.Array:
+        if field.name in self._names:
+            return pa.DictionaryArray.from_arrays(pa.array(values.astype(np.int8)), self._names[field.name])
+        if pa.types.is_fixed_size_list(field.type):
+            return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+        if pa.types.is_fixed_size_binary(field.type):
+            return pa.FixedSizeBinaryArray.from_buffers(field.type, len(values), [None, pa.py_buffer(values)])
+        if pa.types.is_binary(field.type):
+            ends = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
+            return pa.BinaryArray.from_buffers(
+                field.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)]
+            )
+        return pa.array(values, field.type, from_pandas=field.name in _NULLABLE)
 
     def close(self) -> None:
         try:
@@ -129,10 +146,12 @@ class ResultsWriter:
 
     def __init__(self, folder: Path, receivers: tuple[str, ...], n: int) -> None:
         self._receivers = receivers
-        self._slots = _Table(folder / "slots.parquet", SLOTS)
-        self._trials = _Table(folder / "trials.parquet", _trials_schema(n))
-        self._journal = _Table(folder / "journal.parquet", JOURNAL)
-        self._digests = _Table(folder / "digests.parquet", DIGESTS)
+        peers = {"peer": receivers}
+        words = {**peers, "sent": ("state", "innovation"), "action": ACTIONS}
+        self._slots = _Table(folder / "slots.parquet", SLOTS, peers)
+        self._trials = _Table(folder / "trials.parquet", _trials_schema(n), words)
+        self._journal = _Table(folder / "journal.parquet", JOURNAL, {"link": receivers})
+        self._digests = _Table(folder / "digests.parquet", DIGESTS, peers)
 
     def __enter__(self) -> Self:
         return self
@@ -172,7 +191,7 @@ class ResultsWriter:
             variance = np.maximum(0.0, sums.error_squared / trials - mean * mean) * trials / (trials - 1.0)
             standard_error = np.where(trials > 1, np.sqrt(variance / trials), np.nan)
             columns = [sums.trace / trials, expected, sums.received / trials, sums.used / trials]
-        nothing = pa.nulls(count, pa.float64())
+        nothing = np.full(count, np.nan)
         spread = quantiles if quantiles is not None else np.full((count, 2 * len(LEVELS)), np.nan)
         self._slots.add(
             [
@@ -183,60 +202,58 @@ class ResultsWriter:
                 mean if covariance_only else nothing,
                 standard_error,
                 *columns,
-                *(pa.array(column, from_pandas=True) for column in spread.T),
+                *spread.T,
             ]
         )
 
     def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
         """A row per slot, receiver and recorded trial, the first of which is first_trial: everything."""
+        recorded = next(iter(slots.receivers.values())).P.shape[3]
+        count = slots.count * recorded
+        k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
+        trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
+        nu = slots.nu[:, :recorded]
+        x = slots.x[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)
         for name, receiver in slots.receivers.items():
-            recorded = receiver.P.shape[3]
-            count = slots.count * recorded
-            nu = slots.nu[:, :recorded]
-            P = np.moveaxis(receiver.P, 3, 1).reshape(count, -1)
             self._trials.add(
                 [
-                    np.repeat(np.arange(slots.first, slots.first + slots.count), recorded),
+                    k,
                     self._names(name, count),
-                    np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
-                    _coded(nu.reshape(-1), ("state", "innovation")),
-                    _coded(seen_actions(receiver.action[:, :recorded], nu).reshape(-1), ACTIONS),
-                    np.ascontiguousarray(squared_errors[name][:, :recorded]).reshape(-1),
+                    trials,
+                    nu.reshape(-1),
+                    seen_actions(receiver.action[:, :recorded], nu).reshape(-1),
+                    squared_errors[name][:, :recorded].reshape(-1),
                     np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
-                    _fixed(slots.x[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)),
-                    _fixed(receiver.x_hat[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)),
-                    _fixed(P),
+                    x,
+                    receiver.x_hat[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1),
+                    np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
                 ]
             )
 
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
         for name, receiver in slots.receivers.items():
-            masks = [mask.tobytes() for mask in packed_flags(receiver.delivered)]
             self._journal.add(
                 [
                     np.arange(slots.first, slots.first + slots.count),
                     self._names(name, slots.count),
                     np.full(slots.count, slots.trials),
                     np.count_nonzero(receiver.delivered, axis=1),
-                    receiver.lost["lost"].astype(np.int64),
-                    pa.array(masks, pa.binary()),
+                    receiver.lost["lost"],
+                    packed_flags(receiver.delivered),
                 ]
             )
 
-    def _names(self, name: str, count: int) -> pa.Array:
-        return _coded(np.full(count, self._receivers.index(name)), self._receivers)
+    def _names(self, name: str, count: int) -> NDArray[np.int8]:
+        return np.full(count, self._receivers.index(name), np.int8)
 
     def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
         """A row per receiver, trial and block: receiver → block → digests (R, 32) of the trials from first_trial on."""
         for name, blocks in digests.items():
             for block, values in sorted(blocks.items()):
                 trials = len(values)
-                digest = pa.FixedSizeBinaryArray.from_buffers(
-                    pa.binary(DIGEST_BYTES), trials, [None, pa.py_buffer(np.ascontiguousarray(values))]
-                )
                 numbers = np.arange(first_trial, first_trial + trials)
-                self._digests.add([self._names(name, trials), numbers, np.full(trials, block), digest])
+                self._digests.add([self._names(name, trials), numbers, np.full(trials, block), values])
 
 
 def seen_actions(action: Codes, nu: Flags) -> Codes:
