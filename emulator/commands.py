@@ -115,20 +115,27 @@ def _replay(folder: Path) -> str | None:
         recorded = load(folder).record_trials
     except UsageError:  # float64 cannot follow the states of so many slots
         return None
-    return f"evedrop run {shlex.quote(str(folder))}{' --record-trials 1' if recorded > 1 else ''}"
+    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{' --record-trials 1' if recorded > 1 else ''}"
 
 
 def _keep_open(viewer: Viewer) -> None:
     """From a terminal the view stays until Ctrl-C or until it is closed; from a pipe it ends with the command."""
-    try:
-        if sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
-            where = f" at {viewer.address}" if viewer.address else ""
-            print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
-            viewer.wait()
-    except KeyboardInterrupt:
-        pass
-    finally:
+    if sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
+        where = f" at {viewer.address}" if viewer.address else ""
+        print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
+        _hold(viewer)
+    else:
         viewer.stop()
+
+
+def _hold(viewer: Viewer) -> None:
+    """Wait until the view is closed, or until Ctrl-C or SIGTERM ends it."""
+    from emulator.runs.signals import stop_on_signals
+
+    with stop_on_signals() as stop:
+        while viewer.alive() and not stop.wait(0.1):
+            pass
+    viewer.stop()
 
 
 def montecarlo(options: argparse.Namespace) -> int:
@@ -212,12 +219,18 @@ def view(options: argparse.Namespace) -> int:
     from emulator.runs.viewer import open_run
 
     recording = options.run / "recording.rrd"
+    if recording.is_file() and not (options.run / "summary.json").is_file():
+        raise UsageError(
+            f"{options.run} has no summary.json yet: its run goes on, or was killed; look at it when it is over"
+        )
     if not recording.is_file():
         from emulator.view.replay import replay
 
         recording = replay(options.run)
     if options.picture is None:
-        _keep_open(open_run(options.run, options.view))
+        viewer = open_run(options.run, options.view)
+        print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
+        _hold(viewer)
         return 0
     from emulator.view.picture import picture
 
@@ -266,6 +279,7 @@ def selftest(_: argparse.Namespace) -> int:
         print(f"{name:<16}{digest}  {'golden' if GOLDEN.get(name) == digest else 'NOT the golden digest'}")
     if not check.passed:
         raise RunError("this machine does not compute the golden digests; please report the lines above")
+    print("passed: this machine computes what every machine must")
     return 0
 
 

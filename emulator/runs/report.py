@@ -41,7 +41,7 @@ class ProgressLine:
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
+            *([BarColumn(bar_width=24)] if self.console.width >= _DIGEST_WIDTH + 20 else []),
             MofNCompleteColumn(),
             TextColumn(f"{unit} · {{task.fields[rate]}}"),
             TimeRemainingColumn(compact=True),
@@ -138,7 +138,7 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
         )
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
-    console.print(f"results: {folder}")
+    console.print(f"results: {folder}; to look at them: evedrop view {folder}")
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:

@@ -99,10 +99,10 @@ class Tally:
     """Packets whose fate in the journal is not the receiver's."""
     lost: dict[str, int] = field(default_factory=dict)
     window_errors: Floats = field(init=False)
-    """Sum of errors of each window and trial, (WINDOWS, R)."""
+    """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
 
     def __post_init__(self) -> None:
-        self.window_errors = np.zeros((WINDOWS, self.trials))
+        self.window_errors = np.zeros((WINDOWS + 1, self.trials))
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
         """Take c slots: their errors (c, R), sums, and expected trace (c,)."""
@@ -115,7 +115,7 @@ class Tally:
         self.received += int(sums.received.sum())
         self.used += int(sums.used.sum())
         windows = window_of(np.arange(first, first + count), self.slots)
-        for window in range(WINDOWS):
+        for window in range(-1, WINDOWS):
             inside = np.flatnonzero(windows == window)
             if inside.size:
                 self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
@@ -155,13 +155,13 @@ def window_means(tally: Tally) -> Floats:
     """Mean squared error of each window and trial, (WINDOWS, R); NaN for windows without slots."""
     lengths = np.bincount(window_of(np.arange(1, tally.slots), tally.slots), minlength=WINDOWS)
     with np.errstate(invalid="ignore", divide="ignore"):
-        means: Floats = tally.window_errors / lengths[:, None]
+        means: Floats = tally.window_errors[:WINDOWS] / lengths[:, None]
     return means
 
 
 def trial_means(tally: Tally) -> Floats:
-    """Mean error of every trial over its slots k ≥ 1, (R,)."""
-    means: Floats = tally.window_errors.sum(axis=0) / max(tally.slots - 1, 1)
+    """Mean error of every trial over its slots, (R,)."""
+    means: Floats = tally.window_errors.sum(axis=0) / tally.slots
     return means
 
 

@@ -25,6 +25,9 @@ _START_SECONDS = 20.0
 _STOP_SECONDS = 3.0
 _ATTEMPTS = 3
 
+# Rerun's settings as we want them: it reports to nobody what is looked at, and writes nothing into the user's home.
+_CONFIG = Path(__file__).with_name("rerun_config")
+
 # Ends the viewer together with us, even if we are killed: PR_SET_PDEATHSIG is 1, and survives exec.
 _GUARD = (
     "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); "
@@ -142,7 +145,7 @@ def spawn(
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env=None if environment is None else {**os.environ, **environment},
+            env={**os.environ, "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
             if all(_listens(process, awaited) for awaited in (port, web_port) if awaited):

@@ -74,7 +74,9 @@ def _show(viewer: ViewerClient, slot: int | None) -> None:
         if time.monotonic() > deadline:
             raise RuntimeError(f"the recording was not loaded within {_LOAD_SECONDS:.0f} s")
         time.sleep(0.05)
-    viewer.set_time(TIMELINE, sequence=last if slot is None else min(slot, last), play_state="paused")
+    if slot is not None and not 0 <= slot <= last:
+        raise UsageError(f"--slot {slot} is not in the run; give one from 0 to {last}")
+    viewer.set_time(TIMELINE, sequence=last if slot is None else slot, play_state="paused")
     deadline = time.monotonic() + _SETTLE_SECONDS
     before, now = b"", viewer.take_screenshot()
     while now != before and time.monotonic() < deadline:
