@@ -18,7 +18,8 @@ def warnings_of(scenario: Scenario) -> list[str]:
     """
     found = []
     process, mu, mu_d = scenario.process.process, scenario.quality[LEGITIMATE], scenario.encoding.mu_d
-    bound = stability_bound(process, mu)
+    chain = scenario.legitimate.link.model.chain
+    bound = stability_bound(process, mu) if chain is not None and chain.independent else -math.inf
     if not mu_d > bound and process.spectral_radius >= 1.0:
         needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
         found.append(
