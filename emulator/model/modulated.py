@@ -17,7 +17,7 @@ import numpy as np
 
 from emulator.model.links.link import Chain
 from emulator.model.process import Floats, Process
-from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes
+from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, lyapunov, radius
 
 OutcomesAt = Callable[[float], Outcomes]
 """From the quality of a link to what its receiver does with a slot."""
@@ -49,7 +49,9 @@ class ModulatedCovariance:
             for row in range(slots):
                 if self._before is not None:
                     mixed = np.tensordot(T.T, self._states, axes=1)
-                    misled = self._misled * (A @ self._before @ A.T)
+                    # Without the mask 0 · inf would undo a bounded expectation once Σ_k leaves double precision.
+                    grown = A @ self._before @ A.T
+                    misled = np.where(self._misled > 0.0, self._misled * grown, 0.0)
                     self._states = self._kept * (A @ mixed @ A.T) + self._diffused + misled
                 self._before = sigma[row]
                 total = float(np.trace(self._states.sum(axis=0)))
@@ -60,15 +62,22 @@ class ModulatedCovariance:
 def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> float:
     """Trace of lim E P_k; inf if it has none: the operator on (E(s)) does not contract, or misled errors grow."""
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-    if any(one.misled > 0.0 for one in outcomes) and process.spectral_radius >= 1.0:
+    misled = any(one.misled > 0.0 for one in outcomes)
+    if misled and radius(process) >= 1.0:
         return float("inf")
+    if not misled and all(one.predicted == 0.0 and one.initial == 0.0 for one in outcomes):
+        return 0.0
     n, states = process.n, len(chain.law)
     kept = np.repeat([one.kept for one in outcomes], n * n)
     operator = kept[:, None] * np.kron(chain.transitions.T, np.kron(process.A, process.A))
     if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
         return float("inf")
+    f = 2.0 * (process.A @ lyapunov(process, 1.0) @ process.A.T) if misled else np.zeros_like(process.Q)
     source = np.concatenate(
-        [law * one.predicted * process.Q.reshape(-1) for law, one in zip(chain.law, outcomes, strict=True)]
+        [
+            law * (one.predicted * process.Q + one.misled * f).reshape(-1)
+            for law, one in zip(chain.law, outcomes, strict=True)
+        ]
     )
     solution = np.linalg.solve(np.eye(len(operator)) - operator, source).reshape(states, n, n)
     return float(np.trace(solution.sum(axis=0)))
@@ -80,6 +89,8 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     Source: docs/mathematics.md, losses in bursts.
     """
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
+    if all(one.predicted == 0.0 for one in outcomes):
+        return outcomes[0]
     keeps = np.array([one.kept for one in outcomes])[:, None] * chain.transitions.T
     rate = min(1.0, float(np.max(np.abs(np.linalg.eigvals(keeps)))))
     misled = max(one.misled for one in outcomes)

@@ -49,6 +49,11 @@ class Expectation:
         return self.chain is not None
 
     @property
+    def independent(self) -> bool:
+        """Whether the link's losses are independent, as in the paper."""
+        return self.chain is not None and self.chain.independent
+
+    @property
     def _outcomes(self) -> Outcomes | None:
         """Of a link whose losses are independent, as in the paper."""
         if self.chain is None or not self.chain.independent:
@@ -81,6 +86,8 @@ class Expectation:
         """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
         if self.chain is None:
             return False
+        if self._outcomes is not None:
+            return theory.has_infinite_variance(self.process, self._outcomes)
         return theory.has_infinite_variance(self.process, modulated.tail_outcomes(self.chain, self.outcomes_at))
 
 

@@ -63,7 +63,7 @@ class Secrecy:
         if self.relative_by_theory is not None:
             promise = f"theory promises {theory} secrecy"
         if math.isnan(self.ratio):
-            return f"{self.eavesdropper}: nothing was measured; theory promises {theory} secrecy"
+            return f"{self.eavesdropper}: nothing was measured; {promise}"
         times = "∞" if math.isinf(self.ratio) else f"{self.ratio:.3g}"
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",

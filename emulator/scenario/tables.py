@@ -206,7 +206,8 @@ class LinkTable(_Table):
             for name in given
             if name not in model.parameters
         ]
-        return found or [(f"loss.{name}", what) for name, what in model.mistakes(given)]
+        known = {name: value for name, value in given.items() if name in model.parameters}
+        return found + [(f"loss.{name}", what) for name, what in model.mistakes(known)]
 
     @property
     def spec(self) -> dict[str, Any]:

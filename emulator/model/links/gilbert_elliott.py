@@ -35,7 +35,7 @@ class GilbertElliott(LossModel):
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """All are probabilities, and the link must be able to change."""
         found = probability_mistakes(given, "p", "r", "good", "bad")
-        if not found and given["p"] == 0.0 and given["r"] == 0.0:
+        if not found and given.get("p") == 0.0 and given.get("r") == 0.0:
             found.append(
                 ("p", "and r are both 0, so the link keeps a state that nothing tells; expected p or r above 0")
             )

@@ -67,7 +67,7 @@ class LossModel(ABC):
     @classmethod
     @abstractmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """What is wrong with parameters that are all known and there: (entry, what was found and expected)."""
+        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
 
     @property
     @abstractmethod

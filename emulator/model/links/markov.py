@@ -29,32 +29,24 @@ class Markov(LossModel):
     uniforms_per_slot = 2
 
     def __init__(self, transitions: list[list[float]], loss: list[float]) -> None:
-        matrix = self._transitions = np.array(transitions)
+        matrix = self._transitions = np.array(transitions, np.float64)
         self._cumulative = np.cumsum(matrix, axis=1)[:, :-1]
-        self._loss = np.array(loss)
+        self._loss = np.array(loss, np.float64)
         self._stationary = stationary(matrix)
         self._state: np.ndarray[tuple[int, ...], np.dtype[np.intp]] | None = None
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A square matrix of probabilities whose rows sum to 1, one recurrent class, and a loss for each state."""
-        rows, loss = given["transitions"], given["loss"]
-        if not isinstance(rows, list) or not rows or any(not isinstance(row, list) for row in rows):
-            return [("transitions", "is no matrix; expected a list of rows")]
-        found = []
-        if len(rows) > _MOST_STATES or any(len(row) != len(rows) for row in rows):
-            return [("transitions", f"is not square, or has more than {_MOST_STATES} rows; expected one row a state")]
-        for i, row in enumerate(rows):
-            if not all(is_probability(value) for value in row):
-                found.append(("transitions", f"row {i} is {row}; expected numbers from 0 to 1"))
-            elif abs(sum(row) - 1.0) > _SUM:
-                found.append(("transitions", f"row {i} sums to {sum(row):.6g}; expected 1"))
-        if not isinstance(loss, list) or len(loss) != len(rows) or not all(is_probability(value) for value in loss):
-            found.append(("loss", f"is {loss!r}; expected {len(rows)} numbers from 0 to 1, one for each state"))
-        if not found and np.sum(np.abs(np.linalg.eigvals(np.array(rows)) - 1.0) < _SUM) > 1:
-            found.append(
-                ("transitions", "falls apart into states that never meet; expected one that can be reached from all")
-            )
+        found = (
+            [("transitions", what) for what in _matrix_mistakes(given["transitions"])] if "transitions" in given else []
+        )
+        if "loss" in given:
+            loss, rows = given["loss"], given.get("transitions")
+            count = f"{len(rows)} numbers" if isinstance(rows, list) and rows else "numbers"
+            right = isinstance(loss, list) and all(is_probability(value) for value in loss)
+            if not right or (isinstance(rows, list) and rows and len(loss) != len(rows)):
+                found.append(("loss", f"is {loss!r}; expected {count} from 0 to 1, one for each state"))
         return found
 
     @property
@@ -64,8 +56,9 @@ class Markov(LossModel):
 
     @property
     def chain(self) -> Chain:
-        """As given."""
-        return Chain(self._transitions, self._stationary, 1.0 - self._loss)
+        """As given, without the states that the chain never comes back to, and so is never in."""
+        met = self._stationary > 0.0
+        return Chain(self._transitions[met][:, met], self._stationary[met], 1.0 - self._loss[met])
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
         """By the state of every slot and a second uniform number."""
@@ -78,6 +71,30 @@ class Markov(LossModel):
             self._state = (u[:, None] >= bounds).sum(axis=1)
             loss[row] = self._loss[self._state]
         return fates_of(uniforms[:, 1, :] < loss)
+
+
+def _matrix_mistakes(rows: Any) -> list[str]:
+    if not isinstance(rows, list) or not rows or any(not isinstance(row, list) for row in rows):
+        return ["is no matrix; expected a list of rows"]
+    if len(rows) > _MOST_STATES or any(len(row) != len(rows) for row in rows):
+        return [f"is not square, or has more than {_MOST_STATES} rows; expected one row a state"]
+    found = []
+    for i, row in enumerate(rows):
+        if not all(is_probability(value) for value in row):
+            found.append(f"row {i} is {row}; expected numbers from 0 to 1")
+        elif abs(sum(row) - 1.0) > _SUM:
+            found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
+    if not found and not _common(rows):
+        found.append("falls apart into states that never meet; expected one that can be reached from all")
+    return found
+
+
+def _common(rows: list[list[float]]) -> bool:
+    """Whether there is a state that can be reached from all, so that there is one recurrent class and one stationary law."""
+    reaches = (np.array(rows) > 0.0) | np.eye(len(rows), dtype=np.bool_)
+    for _ in range(len(rows).bit_length()):
+        reaches = reaches @ reaches
+    return bool(reaches.all(axis=0).any())
 
 
 def stationary(transitions: Floats) -> Floats:

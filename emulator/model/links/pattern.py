@@ -1,4 +1,4 @@
-"""Losses by rote: a given sequence of outcomes, over and over or once."""
+"""Losses by rote: a given sequence of outcomes, over and over."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Pattern(LossModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A word of zeros and ones."""
-        outcomes = given["outcomes"]
+        outcomes = given.get("outcomes", "1")
         if not isinstance(outcomes, str) or not outcomes or set(outcomes) - {"0", "1"}:
             return [("outcomes", f'is {outcomes!r}; expected a word of 0 (lost) and 1 (delivered), such as "1101"')]
         return []
