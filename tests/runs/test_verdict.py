@@ -173,7 +173,7 @@ def test_theory_of_secrecy_knows_bursts() -> None:
 @pytest.mark.parametrize("links", [(ROTE, good(0.5)), (good(0.9), ROTE), (ROTE, ROTE)])
 def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str, Any], dict[str, Any]]) -> None:
     """Neither claim of theory is made, and the sentence says so; what the run shows is said all the same."""
-    user, other = tally(around(0.001)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     expected = expectation(links[0], 0.5), expectation(links[1], 0.5, (1.0, 0.0))
     found = secrecy((user, expected[0]), ("eve", other, expected[1]))
     assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
