@@ -87,7 +87,7 @@ def test_slots_may_be_asked_for_in_any_pieces(good: float, bad: float, p: float,
 
 
 def enumerated(process: Process, chain: Chain, use: tuple[float, float] | None, slots: int) -> Floats:
-    """tr E P_k, (slots,), as a sum over all words of link states, losses, packet types and guesses.
+    """The trace of E P_k, (slots,), as a sum over all words of link states, losses, packet types and guesses.
 
     use: P(b | state), P(b | innovation) of an eavesdropper; None: the estimator that holds the secret.
     """
@@ -156,7 +156,7 @@ def test_bursts_that_last_too_long_have_no_limit(r: float) -> None:
     bounded = (1.0 - r) * rho**2 < 1.0
     assert math.isfinite(limit_trace(UNSTABLE, chain, Outcomes.plain)) is bounded
     traces = ModulatedCovariance(UNSTABLE, chain, Outcomes.plain).next_traces(4000)
-    assert (traces[-1] < 1.001 * traces[2000]) is bounded
+    assert bool(traces[-1] < 1.001 * traces[2000]) is bounded
 
 
 def test_a_perfect_link_has_no_error() -> None:
