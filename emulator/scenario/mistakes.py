@@ -18,7 +18,6 @@ from emulator.model.process import Process
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.tables import (
     FIGURES,
-    LinkTable,
     SECRET_BYTES,
     EavesdropperTable,
     EncodingTable,

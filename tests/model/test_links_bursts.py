@@ -214,6 +214,21 @@ def test_stationary_laws_that_are_known(rows: list[list[float]], law: list[float
     assert [value == 0.0 for value in found] == [value == 0.0 for value in law]
 
 
+def test_the_stationary_law_is_summed_in_order() -> None:
+    """Its bits are those of the protocol's recipe, in binary64: no compensated sum, whatever Python's version does."""
+    rows = [[0.1, 0.2, 0.3, 0.4], [0.7, 0.1, 0.1, 0.1], [0.3, 0.3, 0.2, 0.2], [0.15, 0.25, 0.35, 0.25]]
+    T, last = np.array(rows), 3
+    while last:
+        leaves = np.cumsum(T[last, :last])[-1]  # in order, unlike np.sum
+        T[:last, last] /= leaves
+        T[:last, :last] += T[:last, last, None] * T[last, :last]
+        last -= 1
+    law = np.ones(1)
+    for state in range(1, 4):
+        law = np.append(law, np.cumsum(law * T[:state, state])[-1])
+    assert np.array_equal(stationary(np.array(rows)), law / np.cumsum(law)[-1])
+
+
 def test_states_that_are_never_come_back_to_are_no_part_of_the_chain() -> None:
     """Theory is told of the recurrent states alone."""
     chain = loss_of({"model": "markov", "transitions": [[0.9, 0.1], [0.0, 1.0]], "loss": [0.3, 0.2]}).chain

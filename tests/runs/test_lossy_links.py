@@ -102,7 +102,7 @@ def test_the_report_survives_a_figure_that_is_not_there(every_model: Path, evedr
     assert (done.status, done.err) == (0, "")
     (row,) = [line for line in done.out.splitlines() if line.split()[:1] == ["pattern"]]
     assert " – " in row
-    swept = evedrop("montecarlo", str(every_model), "--trials", "3", "--over", "slots=20,40", "--out", "swept")
+    swept = evedrop("sweep", str(every_model), "--trials", "3", "--over", "slots=20,40", "--out", "swept")
     assert (swept.status, swept.err) == (0, "")
 
 

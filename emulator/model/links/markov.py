@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import reduce
+from operator import add
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -43,9 +45,9 @@ class Markov(LossModel):
         )
         if "loss" in given:
             loss, rows = given["loss"], given.get("transitions")
-            count = f"{len(rows)} numbers" if isinstance(rows, list) and rows else "numbers"
             right = isinstance(loss, list) and all(is_probability(value) for value in loss)
-            if not right or (isinstance(rows, list) and rows and len(loss) != len(rows)):
+            if not right or (_square(rows) and len(loss) != len(rows)):
+                count = f"{len(rows)} numbers" if _square(rows) else "numbers"
                 found.append(("loss", f"is {loss!r}; expected {count} from 0 to 1, one for each state"))
         return found
 
@@ -73,10 +75,18 @@ class Markov(LossModel):
         return fates_of(uniforms[:, 1, :] < loss)
 
 
+def _square(rows: Any) -> TypeGuard[list[list[Any]]]:
+    return (
+        isinstance(rows, list)
+        and len(rows) > 0
+        and all(isinstance(row, list) and len(row) == len(rows) for row in rows)
+    )
+
+
 def _matrix_mistakes(rows: Any) -> list[str]:
     if not isinstance(rows, list) or not rows or any(not isinstance(row, list) for row in rows):
         return ["is no matrix; expected a list of rows"]
-    if len(rows) > _MOST_STATES or any(len(row) != len(rows) for row in rows):
+    if len(rows) > _MOST_STATES or not _square(rows):
         return [f"is not square, or has more than {_MOST_STATES} rows; expected one row a state"]
     found = []
     for i, row in enumerate(rows):
@@ -110,7 +120,7 @@ def stationary(transitions: Floats) -> Floats:
     kept = count
     while kept > 1:
         last = kept - 1
-        leaves = sum(rows[last][:last])
+        leaves = _in_order(rows[last][:last])
         if leaves == 0.0:
             break
         for i in range(last):
@@ -121,6 +131,11 @@ def stationary(transitions: Floats) -> Floats:
     weights = [0.0] * count
     weights[kept - 1] = 1.0
     for state in range(kept, count):
-        weights[state] = sum(weights[i] * rows[i][state] for i in range(state))
-    total = sum(weights)
+        weights[state] = _in_order(weights[i] * rows[i][state] for i in range(state))
+    total = _in_order(weights)
     return np.array([weight / total for weight in weights])
+
+
+def _in_order(values: Iterable[float]) -> float:
+    """Their sum, each added to those before it: Python's own `sum` rounds otherwise from 3.12 on."""
+    return reduce(add, values, 0.0)
