@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.network.access import LEGITIMATE
 from emulator.runs.results import Results, load_results
@@ -95,8 +96,15 @@ def design(
     from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
+    for name in made.receivers:
+        chain = made.link(name).model.chain
+        if chain is None or not chain.independent:
+            raise UsageError(
+                f"the design of μ_d is for independent losses, and the link of {name} has others; give it a quality, "
+                f"such as --set '{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}'"
+            )
     adversaries = [
-        Adversary(name, table.link.quality, *STRATEGIES[table.strategy].use_probabilities(table.parameters))
+        Adversary(name, made.quality[name], *STRATEGIES[table.strategy].use_probabilities(table.parameters))
         for name, table in made.eavesdroppers.items()
     ]
     process, mu, mu_d = made.process.process, made.quality[LEGITIMATE], made.encoding.mu_d

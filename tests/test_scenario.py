@@ -148,6 +148,82 @@ def test_all_mistakes_are_named_at_once() -> None:
     assert len(found) == 13
 
 
+BURSTS = {"model": "gilbert-elliott", "p": 0.05, "r": 0.5}
+CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("link", "said"),
+    [
+        ({}, "link.quality: is missing; expected quality = 0.9, or a loss model"),
+        ({"quality": 0.9, "loss": BURSTS}, "link.quality: is there beside loss, of which it is the short form"),
+        ({"loss": 3}, "link.loss: is 3; expected a table, such as"),
+        ({"loss": {}}, 'link.loss.model: is ""; expected bernoulli, gilbert-elliott, markov or pattern'),
+        ({"loss": {"model": "gilbert"}}, 'link.loss.model: is "gilbert"; expected bernoulli'),
+        ({"loss": {"model": ["x"]}}, 'link.loss.model: is ["x"]; expected bernoulli'),
+        ({"loss": {"model": "bernoulli", "quality": 1.5}}, "link.loss.quality: is 1.5; expected a number from 0 to 1"),
+        ({"loss": {"model": "gilbert-elliott", "p": 0.1}}, "link.loss.r: is missing; expected r = 0.5"),
+        ({"loss": {**BURSTS, "q": 0.1}}, "link.loss.q: is no parameter of gilbert-elliott; expected bad, good, p or r"),
+        ({"loss": {**BURSTS, "p": "often"}}, "link.loss.p: is 'often'; expected a number from 0 to 1"),
+        ({"loss": {**BURSTS, "good": True}}, "link.loss.good: is True; expected a number from 0 to 1"),
+        ({"loss": {**BURSTS, "bad": float("nan")}}, "link.loss.bad: is nan; expected a number from 0 to 1"),
+        ({"loss": {**BURSTS, "p": 0, "r": 0.0}}, "link.loss.p: and r are both 0"),
+        ({"loss": {**CHAIN, "transitions": 0.5}}, "link.loss.transitions: is no matrix"),
+        ({"loss": {**CHAIN, "transitions": []}}, "link.loss.transitions: is no matrix"),
+        ({"loss": {**CHAIN, "transitions": [[0.5, 0.5]]}}, "link.loss.transitions: is not square"),
+        ({"loss": {**CHAIN, "transitions": [[0.9, 0.2], [0.5, 0.5]]}}, "link.loss.transitions: row 0 sums to 1.1; expe"),
+        ({"loss": {**CHAIN, "transitions": [[1.5, -0.5], [0.5, 0.5]]}}, "link.loss.transitions: row 0 is [1.5, -0.5]; e"),
+        ({"loss": {**CHAIN, "transitions": [[1, 0], [0, 1]]}}, "link.loss.transitions: falls apart into states"),
+        ({"loss": {**CHAIN, "loss": [0.0]}}, "link.loss.loss: is [0.0]; expected 2 numbers from 0 to 1, one for each"),
+        ({"loss": {**CHAIN, "loss": [0.0, 2.0]}}, "link.loss.loss: is [0.0, 2.0]; expected 2 numbers"),
+        ({"loss": {"model": "pattern", "outcomes": "11x1"}}, "link.loss.outcomes: is '11x1'; expected a word of 0"),
+        ({"loss": {"model": "pattern", "outcomes": ""}}, "link.loss.outcomes: is ''; expected a word of 0 (lost)"),
+        ({"loss": {"model": "pattern", "outcomes": 11}}, "link.loss.outcomes: is 11; expected a word of 0 (lost)"),
+    ],
+)  # fmt: skip
+def test_a_mistake_of_a_link_is_named(link: dict[str, Any], said: str) -> None:
+    """Of the legitimate link and of an eavesdropper's: one line each, with the path."""
+    for receiver in ("legitimate", "eavesdroppers.smart"):
+        (line,) = mistakes({f"{receiver}.link": link})
+        assert line.startswith(f"{receiver}.{said}")
+
+
+def test_all_mistakes_of_links_are_named_at_once() -> None:
+    """What is missing, unknown and wrong, in one loss model and in several."""
+    found = mistakes(
+        {
+            "legitimate.link": {"loss": {"model": "gilbert-elliott", "p": 2.0, "q": 0.1}},
+            "eavesdroppers.smart.link": {
+                "loss": {"model": "markov", "transitions": [[0.9, 0.2], [0.5, 0.4]], "loss": [0]}
+            },
+            "eavesdroppers.other": {"strategy": "smart", "link": {"loss": {"model": "pattern", "word": "1"}}},
+            "slots": 0,
+        }
+    )
+    for path, count in (
+        ("legitimate.link.loss.p: ", 1),
+        ("legitimate.link.loss.r: ", 1),
+        ("legitimate.link.loss.q: ", 1),
+        ("eavesdroppers.smart.link.loss.transitions: ", 2),
+        ("eavesdroppers.smart.link.loss.loss: ", 1),
+        ("eavesdroppers.other.link.loss.outcomes: ", 1),
+        ("eavesdroppers.other.link.loss.word: ", 1),
+        ("slots: ", 1),
+    ):
+        assert len([line for line in found if line.startswith(path)]) == count, path
+    assert len(found) == 9
+
+
+def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
+    """A pattern has no expected trace, so nothing can be asked of it; of its other figures something can."""
+    pattern = {"eavesdroppers.smart.link": {"loss": {"model": "pattern", "outcomes": "10"}}}
+    expect = [
+        {"figure": f"smart.{figure}", "below": 1.0} for figure in ("received_fraction", "expected_trace_covariance")
+    ]
+    (line,) = mistakes({**pattern, "expect": expect})
+    assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but there is no theory for')
+
+
 def test_more_slots_than_the_horizon_are_refused() -> None:
     """The bound and three ways out are named, and the bound is exact."""
     (said,) = mistakes({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})

@@ -191,6 +191,15 @@ def expected_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:
     return ExpectedCovariance(process, outcomes).next_traces(slots)
 
 
+def radius(process: Process) -> float:
+    """ρ(A), exactly 1 for a marginally stable process whatever its eigenvalues' rounding.
+
+    Source: docs/mathematics.md, limits.
+    """
+    rho = process.spectral_radius
+    return 1.0 if abs(rho - 1.0) <= _MARGINAL else rho
+
+
 def stability_bound(process: Process, mu: float) -> float:
     """(1 − ρ⁻²)/μ: a receiver behind a link of quality μ, never misled, has a bounded error iff μ_d lies above it.
 
@@ -198,7 +207,7 @@ def stability_bound(process: Process, mu: float) -> float:
 
     Source: docs/mathematics.md, limits.
     """
-    rho = _radius(process)
+    rho = radius(process)
     if rho < 1.0:
         return 0.0
     return (1.0 - rho**-2.0) / mu if mu > 0.0 else math.inf
@@ -219,7 +228,7 @@ def limit(process: Process, outcomes: Outcomes) -> Floats:
     """
     source = outcomes.predicted * process.Q
     if outcomes.misled:
-        if _radius(process) >= 1.0:
+        if radius(process) >= 1.0:
             return np.full_like(process.Q, np.inf)
         source = source + 2.0 * outcomes.misled * (process.A @ lyapunov(process, 1.0) @ process.A.T)
     elif outcomes.predicted == 0.0 and outcomes.initial == 0.0:
@@ -242,7 +251,7 @@ def tail_index(process: Process, outcomes: Outcomes) -> float:
 
     Source: docs/mathematics.md, heavy tails.
     """
-    rho = _radius(process)
+    rho = radius(process)
     if rho <= 1.0 or outcomes.misled or outcomes.predicted == 0.0 or outcomes.state >= 1.0:
         return math.inf
     return -math.log1p(-outcomes.state) / (2.0 * math.log(rho))
@@ -256,17 +265,11 @@ def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
     return tail_index(process, outcomes) <= 2.0
 
 
-def _radius(process: Process) -> float:
-    """ρ(A), exactly 1 for a marginally stable process whatever its eigenvalues' rounding."""
-    rho = process.spectral_radius
-    return 1.0 if abs(rho - 1.0) <= _MARGINAL else rho
-
-
 def _stationary(process: Process, kept: float, source: Floats) -> Floats:
     from scipy.linalg import LinAlgError, LinAlgWarning, solve_discrete_lyapunov  # noqa: PLC0415 - slow to import
 
     unbounded = np.full_like(source, np.inf)
-    if kept * _radius(process) ** 2 >= 1.0 - _ROUNDING:
+    if kept * radius(process) ** 2 >= 1.0 - _ROUNDING:
         return unbounded
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LinAlgWarning)  # near the bound; the definiteness below decides

@@ -6,6 +6,7 @@ import math
 
 from emulator.model.theory import stability_bound
 from emulator.network.access import LEGITIMATE
+from emulator.runs.expectation import expectations_of
 from emulator.scenario import Scenario
 
 _LARGE_BYTES = 1e9
@@ -18,8 +19,15 @@ def warnings_of(scenario: Scenario) -> list[str]:
     """
     found = []
     process, mu, mu_d = scenario.process.process, scenario.quality[LEGITIMATE], scenario.encoding.mu_d
+    expectation = expectations_of(scenario)[LEGITIMATE]
     bound = stability_bound(process, mu)
-    if not mu_d > bound and process.spectral_radius >= 1.0:
+    if not expectation.independent:
+        if math.isinf(expectation.limit):
+            found.append(
+                f"the legitimate estimator's expected error grows without bound: with spectral radius "
+                f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the bursts of its link last too long"
+            )
+    elif not mu_d > bound and process.spectral_radius >= 1.0:
         needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
         found.append(
             f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "

@@ -18,12 +18,13 @@ import numpy as np
 
 from emulator.errors import Interrupted, RunError, UsageError
 from emulator.model.digest import BLOCK_SLOTS, RunDigest
+from emulator.runs.expectation import expected_traces_of
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.score import SlotSums, Tally, merged, squared_errors
-from emulator.runs.scorekeeper import Ending, expected_traces_of, resolved, summary_of
+from emulator.runs.scorekeeper import Ending, resolved, summary_of
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.simulation import Mode
 from emulator.runs.trials import BatchResult, Task, tasks_of
@@ -111,7 +112,7 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
     if mode is Mode.EXACT:
         return
     for name, expected in expected_traces_of(scenario).items():
-        beyond = np.flatnonzero(~np.isfinite(expected))
+        beyond = np.flatnonzero(np.isinf(expected))
         if beyond.size:
             raise UsageError(
                 f"{name}'s expected error leaves double precision at slot {beyond[0]}; "

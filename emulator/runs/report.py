@@ -127,7 +127,7 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
     for expectation in summary["expectations"]:
-        word = {True: "held", False: "FAILED", None: "not measured in this mode"}[expectation["held"]]
+        word = {True: "held", False: "FAILED", None: "there is no such figure in this run"}[expectation["held"]]
         found = "" if expectation["found"] is None else f", found {float(expectation['found']):.4g}"
         console.print(f"expected {expectation['text']}: {word}{found}")
     surprising = summary["surprising"]
@@ -154,7 +154,7 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
             *(f"{row[key]}" for key in keys),
             row["peer"],
             f"{error:.4g}",
-            f"{row['expected_trace_covariance']:.4g}",
+            _figure(row["expected_trace_covariance"]),
             f"{row['mean_trace_covariance']:.4g}",
             row["relative_secrecy"] or "–",
         )
@@ -210,7 +210,7 @@ def print_design(design: Design) -> None:
 
 
 def _figure(value: float | str | None, how: str = ".4g") -> str:
-    """A figure of the summary, where infinity is a string and nothing is null."""
+    """A figure of the summary, where infinity is a string, and null means that there is none."""
     return "–" if value is None else format(float(value), how)
 
 

@@ -61,6 +61,7 @@ ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
 _NULLABLE = {
     "mean_squared_error",
     "mean_actual_trace_covariance",
+    "expected_trace_covariance",
     *(field.name for field in SLOTS if "quantile" in field.name),
 }
 """Columns in which NaN means that there is nothing."""

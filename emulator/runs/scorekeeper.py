@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,10 +13,9 @@ import numpy as np
 import tomli_w
 
 from emulator.model.digest import BLOCK_SLOTS, Digests, RunDigest
-from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.process import Floats
-from emulator.model.theory import ExpectedCovariance, Outcomes, expected_traces, has_infinite_variance
 from emulator.network.access import LEGITIMATE
+from emulator.runs.expectation import expectations_of
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
@@ -23,22 +23,6 @@ from emulator.runs.verdict import Secrecy, secrecy
 from emulator.scenario import ExpectTable, Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
-
-
-def outcomes_of(scenario: Scenario) -> dict[str, Outcomes]:
-    """Receiver → the probabilities its expected covariance follows from."""
-    mu_d, quality = scenario.encoding.mu_d, scenario.quality
-    outcomes = {LEGITIMATE: Outcomes.legitimate(quality[LEGITIMATE], mu_d)}
-    for name, table in scenario.eavesdroppers.items():
-        use_state, use_innovation = STRATEGIES[table.strategy].use_probabilities(table.parameters)
-        outcomes[name] = Outcomes.eavesdropper(quality[name], mu_d, use_state, use_innovation)
-    return outcomes
-
-
-def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
-    """Receiver → theory: trace of the expected actual error covariance in every slot, (slots,)."""
-    process, slots = scenario.process.process, scenario.slots
-    return {name: expected_traces(process, one, slots) for name, one in outcomes_of(scenario).items()}
 
 
 class Scored(NamedTuple):
@@ -55,8 +39,7 @@ class Scorekeeper:
     """Scores the slots of a batch of trials, in order. Final."""
 
     def __init__(self, scenario: Scenario, trials: int) -> None:
-        process = scenario.process.process
-        self._theory = {name: ExpectedCovariance(process, one) for name, one in outcomes_of(scenario).items()}
+        self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self.tallies = {name: Tally(scenario.slots, trials) for name in scenario.receivers}
 
     def add(self, slots: Slots) -> dict[str, Scored]:
@@ -85,9 +68,9 @@ class Ending:
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
     """The verdict on every eavesdropper."""
-    process, outcomes = scenario.process.process, outcomes_of(scenario)
-    user = (tallies[LEGITIMATE], outcomes[LEGITIMATE])
-    return [secrecy(process, user, (name, tallies[name], outcomes[name])) for name in scenario.eavesdroppers]
+    expected = expectations_of(scenario)
+    user = (tallies[LEGITIMATE], expected[LEGITIMATE])
+    return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
 
 
 def summary_of(
@@ -98,12 +81,12 @@ def summary_of(
     mode: str = "live",
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
-    process, outcomes = scenario.process.process, outcomes_of(scenario)
+    expected = expectations_of(scenario)
     peers: dict[str, dict[str, Any]] = {
         name: {
-            **(tally.figures if tally.offered else dict.fromkeys(tally.figures)),
+            **(_figures(tally) if tally.offered else dict.fromkeys(tally.figures)),
             "error_quantiles": _quantiles(tally),
-            "infinite_variance": has_infinite_variance(process, outcomes[name]),
+            "infinite_variance": expected[name].infinite_variance,
             "digest": digests[name],
         }
         for name, tally in tallies.items()
@@ -128,6 +111,11 @@ def summary_of(
         "surprising": _surprising(scenario, tallies),
         "expectations": [_expectation(expect, peers) for expect in scenario.expect],
     }
+
+
+def _figures(tally: Tally) -> dict[str, float | None]:
+    """A receiver's figures; None for what there is no theory for."""
+    return {name: None if math.isnan(value) else value for name, value in tally.figures.items()}
 
 
 def _quantiles(tally: Tally) -> dict[str, float] | None:

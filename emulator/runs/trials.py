@@ -15,10 +15,10 @@ import numpy as np
 from emulator.model.digest import Digests
 from emulator.model.links.link import Fate, losses
 from emulator.model.process import Floats
+from emulator.runs.expectation import expected_traces_of
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums, Tally, slot_sums
-from emulator.runs.scorekeeper import expected_traces_of
 from emulator.runs.simulation import Chunk, Measured, Mode, Simulation
 from emulator.scenario import Scenario
 

@@ -12,8 +12,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from emulator.model.process import Floats, Process
-from emulator.model.theory import Outcomes, expected_traces, has_infinite_variance, limit_trace
+from emulator.model.process import Floats
+from emulator.runs.expectation import Expectation
 from emulator.runs.score import WINDOWS, Tally, window_means
 
 CONFIDENCE = 0.99
@@ -34,17 +34,17 @@ class Secrecy:
     eavesdropper: str
     relative: Verdict
     perfect: Verdict
-    relative_by_theory: bool
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded."""
-    perfect_by_theory: bool
-    """J bounded and J_e not."""
+    relative_by_theory: bool | None
+    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where there is no theory for a link."""
+    perfect_by_theory: bool | None
+    """J bounded and J_e not; None where there is no theory for a link."""
     ratio: float
     """Mean error, eavesdropper's over legitimate; NaN before the first slot."""
     trials: int
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance and a mean is no measure."""
 
-    def as_dict(self) -> dict[str, str | bool]:
+    def as_dict(self) -> dict[str, str | bool | None]:
         """As in the summary."""
         return {
             "relative": self.relative.value,
@@ -59,8 +59,11 @@ class Secrecy:
     def sentence(self) -> str:
         """One sentence for the closing report."""
         theory = "perfect" if self.perfect_by_theory else "relative" if self.relative_by_theory else "no"
+        promise = "there is no theory for these links"
+        if self.relative_by_theory is not None:
+            promise = f"theory promises {theory} secrecy"
         if math.isnan(self.ratio):
-            return f"{self.eavesdropper}: nothing was measured; theory promises {theory} secrecy"
+            return f"{self.eavesdropper}: nothing was measured; {promise}"
         times = "∞" if math.isinf(self.ratio) else f"{self.ratio:.3g}"
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",
@@ -73,7 +76,7 @@ class Secrecy:
             run = "perfect secrecy held in this run: its error grew while the legitimate one stayed bounded"
         if self.judged_by == "median" and self.trials > 1:
             run += " (judged by medians, for the variance is infinite)"
-        return f"{self.eavesdropper}: {times} × the legitimate error; {run}; theory promises {theory} secrecy"
+        return f"{self.eavesdropper}: {times} × the legitimate error; {run}; {promise}"
 
 
 Bounds = Callable[[Floats], tuple[float, float]]
@@ -124,19 +127,20 @@ def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: 
     return Verdict.HELD if growth[0] > 0.0 else Verdict.UNDECIDED
 
 
-def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: tuple[str, Tally, Outcomes]) -> Secrecy:
-    """The verdict on one eavesdropper, from both tallies and both receivers' outcome probabilities."""
-    (user, user_outcomes), (name, other, other_outcomes) = legitimate, eavesdropper
-    user_bound, other_bound = limit_trace(process, user_outcomes), limit_trace(process, other_outcomes)
-    perfect_by_theory = math.isfinite(user_bound) and math.isinf(other_bound)
+def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
+    """The verdict on one eavesdropper, from both tallies and what theory expects of both receivers."""
+    (user, user_theory), (name, other, other_theory) = legitimate, eavesdropper
+    known = user_theory.known and other_theory.known
+    user_bound = user_theory.limit if user_theory.known else math.inf
+    perfect_by_theory = math.isfinite(user_bound) and math.isinf(other_theory.limit) if known else None
     complete = user.done == user.slots
     slots = user.slots if complete else max(user.done, 2)
-    gap = expected_traces(process, other_outcomes, slots) - expected_traces(process, user_outcomes, slots)
+    gap = other_theory.traces(slots) - user_theory.traces(slots)
     user_means, other_means = window_means(user), window_means(other)
-    heavy = any(has_infinite_variance(process, one) for one in (user_outcomes, other_outcomes))
+    heavy = user_theory.infinite_variance or other_theory.infinite_variance
     bounds_of = median_bounds if heavy else mean_bounds
     relative = _relative(other_means - user_means, bounds_of) if complete else Verdict.UNDECIDED
-    if not perfect_by_theory:
+    if perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
         perfect = _perfect(other_means, user_means, user_bound, bounds_of) if complete else Verdict.UNDECIDED
@@ -145,7 +149,7 @@ def secrecy(process: Process, legitimate: tuple[Tally, Outcomes], eavesdropper: 
         name,
         relative,
         perfect,
-        bool(math.isfinite(user_bound) and np.all(gap[1:] > 0.0)),
+        bool(math.isfinite(user_bound) and np.all(gap[1:] > 0.0)) if known else None,
         perfect_by_theory,
         ratio,
         user.trials,

@@ -124,9 +124,22 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
                 hint = f"; did you mean {near[0]}?" if near else ""
                 names = f"RECEIVER ({', '.join((LEGITIMATE, *eavesdroppers))}).FIGURE ({', '.join(FIGURES)})"
                 found.append(f"expect.{i}.figure: is {as_toml(figure)}; expected {names}{hint}")
+            elif isinstance(figure, str) and figure.endswith(".expected_trace_covariance"):
+                receiver = figure.partition(".")[0]
+                if not _has_theory(tables.get(LEGITIMATE) if receiver == LEGITIMATE else eavesdroppers[receiver]):
+                    why = f"there is no theory for the losses of {receiver}'s link"
+                    found.append(f"expect.{i}.figure: is {as_toml(figure)}, but {why}; expected another figure")
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     return found
+
+
+def _has_theory(receiver: Any) -> bool:
+    """Whether there is a theory for a receiver's link, as far as it is one."""
+    try:
+        return LinkTable.model_validate(receiver["link"]).model.chain is not None
+    except (TypeError, KeyError, ValidationError):
+        return True
 
 
 def _secret_mistakes(file: str) -> list[str]:

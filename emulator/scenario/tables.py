@@ -23,6 +23,8 @@ from pydantic import (
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.links import LOSS_MODELS, loss_of
+from emulator.model.links.link import LossModel
 from emulator.model.process import Process, mistakes_of
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE, RESERVED
@@ -177,12 +179,45 @@ class EncodingTable(_Table):
 class LinkTable(_Table):
     """`link = {…}`: how packets get from the router to one receiver."""
 
-    quality: Annotated[Probability, Field(examples=[0.9])]
+    quality: Annotated[Probability | None, Field(examples=[0.9])] = None
+    loss: Annotated[dict[str, Any] | None, Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """One of the two, and a loss model with all it needs and nothing else."""
+        quality, loss = table.get("quality"), table.get("loss")
+        if quality is None and loss is None:
+            return [("quality", "is missing; expected quality = 0.9, or a loss model")]
+        if quality is not None and loss is not None:
+            return [("quality", "is there beside loss, of which it is the short form; expected one of them")]
+        if not isinstance(loss, Mapping):
+            return []
+        model = LOSS_MODELS.get(str(loss.get("model")))
+        if model is None:
+            return [("loss.model", f"is {as_toml(loss.get('model', ''))}; expected {listed(sorted(LOSS_MODELS))}")]
+        given = {name: value for name, value in loss.items() if name != "model"}
+        found = [
+            (f"loss.{name}", f"is missing; expected {name} = {as_toml(example)}")
+            for name, example in model.parameters.items()
+            if name not in given and name not in model.optional
+        ]
+        found += [
+            (f"loss.{name}", f"is no parameter of {loss['model']}; expected {listed(sorted(model.parameters))}")
+            for name in given
+            if name not in model.parameters
+        ]
+        known = {name: value for name, value in given.items() if name in model.parameters}
+        return found + [(f"loss.{name}", what) for name, what in model.mistakes(known)]
 
     @property
     def spec(self) -> dict[str, Any]:
         """What the router is told."""
-        return {"model": "bernoulli", "quality": self.quality}
+        return {"model": "bernoulli", "quality": self.quality} if self.loss is None else self.loss
+
+    @property
+    def model(self) -> LossModel:
+        """The loss model, fresh."""
+        return loss_of(self.spec)
 
 
 LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
@@ -290,8 +325,8 @@ class Scenario(_Table):
 
     @property
     def quality(self) -> dict[str, float]:
-        """Receiver → probability that a packet reaches it: μ, μ_e."""
-        return {name: self.link(name).quality for name in self.receivers}
+        """Receiver → mean probability that a packet reaches it: μ, μ_e."""
+        return {name: self.link(name).model.quality for name in self.receivers}
 
     def link(self, receiver: str) -> LinkTable:
         """A receiver's link."""

@@ -82,7 +82,9 @@ class Columns:
     def _curves(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
         curves = ((paths.ERROR, peer.squared_error), (paths.TRACE, peer.trace), (paths.THEORY, peer.expected_trace))
         for kind, values in curves:
-            yield _scalars(paths.curve(kind, name), k, self._log10(values))
+            known = ~np.isnan(values)  # there is no theory for some links
+            if known.any():
+                yield _scalars(paths.curve(kind, name), k[known], self._log10(values[known]))
 
     def _log10(self, values: Floats) -> Floats:
         """log10 with everything below the floor on it: a state that was received is known exactly."""

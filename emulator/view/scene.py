@@ -57,7 +57,7 @@ class PeerSlots:
     trace: Floats
     """tr P it believes, mean over trials, (c,)."""
     expected_trace: Floats
-    """Trace of the actual error covariance by theory, (c,)."""
+    """Trace of the actual error covariance by theory, (c,); NaN where there is none."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +15,16 @@ from emulator.model.links.link import Fate, losses
 from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(8), "link/eve")
-SPECS = {"bernoulli": {"model": "bernoulli", "quality": 0.7}}
+SPECS: dict[str, dict[str, Any]] = {
+    "bernoulli": {"model": "bernoulli", "quality": 0.7},
+    "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.05, "bad": 0.8},
+    "markov": {
+        "model": "markov",
+        "transitions": [[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.0, 1.0, 0.0]],
+        "loss": [0.01, 0.4, 1.0],
+    },
+    "pattern": {"model": "pattern", "outcomes": "1101001"},
+}
 
 
 def test_every_model_is_tested() -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from emulator.model.links import loss_of
 from emulator.model.process import Floats, Process
 from emulator.model.theory import Outcomes
+from emulator.runs.expectation import Expectation
 from emulator.runs.score import WINDOWS, Tally, window_means, window_of
 from emulator.runs.verdict import Secrecy, Verdict, secrecy
 
@@ -30,10 +34,28 @@ def around(level: float | Floats, spread: float = 0.1, trials: int = TRIALS) -> 
     return np.broadcast_to(np.asarray(level, float).reshape(-1, 1), (WINDOWS, trials)) * noise
 
 
+def expectation(link: dict[str, Any], mu_d: float, uses: tuple[float, float] | None = None) -> Expectation:
+    """Of the legitimate estimator, or of an eavesdropper with P(b|0) and P(b|1), behind a link."""
+
+    def outcomes_at(quality: float) -> Outcomes:
+        return Outcomes.legitimate(quality, mu_d) if uses is None else Outcomes.eavesdropper(quality, mu_d, *uses)
+
+    return Expectation(STABLE, loss_of(link).chain, outcomes_at)
+
+
+def good(quality: float) -> dict[str, Any]:
+    """The paper's link."""
+    return {"model": "bernoulli", "quality": quality}
+
+
+BURSTS = {"model": "gilbert-elliott", "p": 0.01, "r": 0.1}
+ROTE = {"model": "pattern", "outcomes": "110"}
+
+
 def judged(user: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> Secrecy:
     """The verdict when theory knows a good legitimate link and an eavesdropper with these probabilities."""
-    outcomes = Outcomes.legitimate(0.9, 0.5), Outcomes.eavesdropper(mu_e, 0.5, 1.0, use_innovation)
-    return secrecy(STABLE, (user, outcomes[0]), ("eve", other, outcomes[1]))
+    expected = expectation(good(0.9), 0.5), expectation(good(mu_e), 0.5, (1.0, use_innovation))
+    return secrecy((user, expected[0]), ("eve", other, expected[1]))
 
 
 def test_relative_secrecy_held_where_every_window_is_above() -> None:
@@ -133,6 +155,30 @@ def test_perfect_secrecy_is_not_claimed_where_theory_denies_it() -> None:
 def test_theory_of_relative_secrecy_needs_a_worse_eavesdropper() -> None:
     """An eavesdropper with a perfect link beside a poor one is better off, and theory says so."""
     user, other = tally(around(0.001)), tally(around(0.002))
-    outcomes = Outcomes.legitimate(0.3, 0.9), Outcomes.eavesdropper(1.0, 0.9, 1.0, 0.0)
-    assert not secrecy(STABLE, (user, outcomes[0]), ("eve", other, outcomes[1])).relative_by_theory
+    expected = expectation(good(0.3), 0.9), expectation(good(1.0), 0.9, (1.0, 0.0))
+    assert not secrecy((user, expected[0]), ("eve", other, expected[1])).relative_by_theory
     assert judged(user, other).relative_by_theory
+
+
+def test_theory_of_secrecy_knows_bursts() -> None:
+    """Behind a link that loses in bursts the claims of theory are those of its chain."""
+    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    smart, naive = expectation(BURSTS, 0.5, (1.0, 0.0)), expectation(BURSTS, 0.5, (1.0, 1.0))
+    found = secrecy((user, expectation(BURSTS, 0.5)), ("eve", other, smart))
+    assert (found.relative_by_theory, found.perfect_by_theory, found.perfect) == (True, False, Verdict.FAILED)
+    found = secrecy((user, expectation(BURSTS, 0.5)), ("eve", other, naive))
+    assert (found.relative_by_theory, found.perfect_by_theory, found.perfect) == (True, True, Verdict.HELD)
+
+
+@pytest.mark.parametrize("links", [(ROTE, good(0.5)), (good(0.9), ROTE), (ROTE, ROTE)])
+def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    """Neither claim of theory is made, and the sentence says so; what the run shows is said all the same."""
+    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    expected = expectation(links[0], 0.5), expectation(links[1], 0.5, (1.0, 0.0))
+    found = secrecy((user, expected[0]), ("eve", other, expected[1]))
+    assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
+    assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.HELD)
+    assert found.sentence.endswith("there is no theory for these links")
+    assert (found.as_dict()["relative_by_theory"], found.as_dict()["perfect_by_theory"]) == (None, None)
+    nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
+    assert nothing.sentence == "eve: nothing was measured; there is no theory for these links"

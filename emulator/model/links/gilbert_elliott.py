@@ -1,0 +1,90 @@
+"""Losses in bursts: a link that is now good, now bad, and stays so for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from emulator.model.links.checks import probability_mistakes
+from emulator.model.links.link import Chain, LossModel, fates_of
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes, Flags
+
+
+class GilbertElliott(LossModel):
+    """Goes bad with probability p and good again with r, each slot; loses with probability `good` or `bad` in each state.
+
+    At slot 0 the state has its stationary law: bad with probability p/(p+r). With good = 0 and bad = 1 a burst's length
+    is geometric with mean 1/r.
+
+    Source: Gilbert (1960), Elliott (1963); docs/mathematics.md, losses in bursts.
+    """
+
+    parameters = MappingProxyType({"p": 0.05, "r": 0.5, "good": 0.0, "bad": 1.0})
+    optional = frozenset({"good", "bad"})
+    uniforms_per_slot = 2
+
+    def __init__(self, p: float, r: float, good: float = 0.0, bad: float = 1.0) -> None:
+        self._p, self._r, self._good, self._bad = p, r, good, bad
+        self._state: Flags | None = None  # bad or not, (R,), in the slot before
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """All are probabilities, and the link must be able to change."""
+        found = probability_mistakes(given, "p", "r", "good", "bad")
+        if not found and given.get("p") == 0.0 and given.get("r") == 0.0:
+            found.append(
+                ("p", "and r are both 0, so the link keeps a state that nothing tells; expected p or r above 0")
+            )
+        return found
+
+    @property
+    def _stationary_bad(self) -> float:
+        return self._p / (self._p + self._r)
+
+    @property
+    def quality(self) -> float:
+        """(1 − good) r/(p+r) + (1 − bad) p/(p+r)."""
+        bad = self._stationary_bad
+        return (1.0 - self._good) * (1.0 - bad) + (1.0 - self._bad) * bad
+
+    @property
+    def chain(self) -> Chain:
+        """Good and bad."""
+        bad = self._stationary_bad
+        transitions = np.array([[1.0 - self._p, self._p], [self._r, 1.0 - self._r]])
+        return Chain(transitions, np.array([1.0 - bad, bad]), np.array([1.0 - self._good, 1.0 - self._bad]))
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
+        """By the state of every slot and a second uniform number."""
+        bad = self._states(uniforms[:, 0, :])
+        loss = np.where(bad, self._bad, self._good)
+        return fates_of(uniforms[:, 1, :] < loss)
+
+    def _states(self, u: Floats) -> Flags:
+        """Bad or not, (slots, R): each u maps the state before to the next; the maps are composed for all slots at once.
+
+        A u below p turns good into bad, one below r turns bad into good. Where both maps agree the past is forgotten; in
+        between, what is left are slots that keep the state and slots that swap it.
+        """
+        if self._state is None:
+            self._state = np.empty(u.shape[1], np.bool_)
+            opening = u[0] < self._stationary_bad
+        else:
+            opening = np.where(self._state, u[0] >= self._r, u[0] < self._p)
+        from_good, from_bad = u < self._p, u >= self._r
+        forgets = from_good == from_bad
+        forgets[0] = True
+        values = from_good.copy()
+        values[0] = opening
+        swaps = from_good & ~from_bad
+        swaps[0] = False
+        slots = np.arange(len(u))[:, None]
+        last = np.maximum.accumulate(np.where(forgets, slots, 0), axis=0)
+        odd = np.logical_xor.accumulate(swaps, axis=0)
+        states: Flags = np.take_along_axis(values ^ odd, last, axis=0) ^ odd
+        self._state = states[-1].copy()
+        return states

@@ -1,0 +1,141 @@
+"""Losses by any finite Markov chain: netem's four states, a link with rush hours, a jammer with habits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import reduce
+from operator import add
+from types import MappingProxyType
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from emulator.model.links.checks import is_probability
+from emulator.model.links.link import Chain, LossModel, fates_of
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes
+
+_SUM = 1e-9  # how far a row may be from summing to 1
+_MOST_STATES = 64
+
+
+class Markov(LossModel):
+    """A state for every slot, by `transitions` (row: from, column: to), and in each state a probability of `loss`.
+
+    At slot 0 the state has the chain's stationary law.
+
+    Source: docs/mathematics.md, losses in bursts.
+    """
+
+    parameters = MappingProxyType({"transitions": [[0.95, 0.05], [0.5, 0.5]], "loss": [0.0, 1.0]})
+    uniforms_per_slot = 2
+
+    def __init__(self, transitions: list[list[float]], loss: list[float]) -> None:
+        matrix = self._transitions = np.array(transitions, np.float64)
+        self._cumulative = np.cumsum(matrix, axis=1)[:, :-1]
+        self._loss = np.array(loss, np.float64)
+        self._stationary = stationary(matrix)
+        self._state: np.ndarray[tuple[int, ...], np.dtype[np.intp]] | None = None
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A square matrix of probabilities whose rows sum to 1, one recurrent class, and a loss for each state."""
+        found = (
+            [("transitions", what) for what in _matrix_mistakes(given["transitions"])] if "transitions" in given else []
+        )
+        if "loss" in given:
+            loss, rows = given["loss"], given.get("transitions")
+            right = isinstance(loss, list) and all(is_probability(value) for value in loss)
+            if not right or (_square(rows) and len(loss) != len(rows)):
+                count = f"{len(rows)} numbers" if _square(rows) else "numbers"
+                found.append(("loss", f"is {loss!r}; expected {count} from 0 to 1, one for each state"))
+        return found
+
+    @property
+    def quality(self) -> float:
+        """One minus the mean loss under the stationary law."""
+        return float(1.0 - self._stationary @ self._loss)
+
+    @property
+    def chain(self) -> Chain:
+        """As given, without the states that the chain never comes back to, and so is never in."""
+        met = self._stationary > 0.0
+        return Chain(self._transitions[met][:, met], self._stationary[met], 1.0 - self._loss[met])
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
+        """By the state of every slot and a second uniform number."""
+        loss = np.empty(uniforms[:, 0, :].shape)
+        for row, u in enumerate(uniforms[:, 0, :]):
+            if self._state is None:
+                bounds = np.broadcast_to(np.cumsum(self._stationary)[:-1], (u.size, len(self._loss) - 1))
+            else:
+                bounds = self._cumulative[self._state]
+            self._state = (u[:, None] >= bounds).sum(axis=1)
+            loss[row] = self._loss[self._state]
+        return fates_of(uniforms[:, 1, :] < loss)
+
+
+def _square(rows: Any) -> TypeGuard[list[list[Any]]]:
+    return (
+        isinstance(rows, list)
+        and len(rows) > 0
+        and all(isinstance(row, list) and len(row) == len(rows) for row in rows)
+    )
+
+
+def _matrix_mistakes(rows: Any) -> list[str]:
+    if not isinstance(rows, list) or not rows or any(not isinstance(row, list) for row in rows):
+        return ["is no matrix; expected a list of rows"]
+    if len(rows) > _MOST_STATES or not _square(rows):
+        return [f"is not square, or has more than {_MOST_STATES} rows; expected one row a state"]
+    found = []
+    for i, row in enumerate(rows):
+        if not all(is_probability(value) for value in row):
+            found.append(f"row {i} is {row}; expected numbers from 0 to 1")
+        elif abs(sum(row) - 1.0) > _SUM:
+            found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
+    if not found and not _common(rows):
+        found.append("falls apart into states that never meet; expected one that can be reached from all")
+    return found
+
+
+def _common(rows: list[list[float]]) -> bool:
+    """Whether there is a state that can be reached from all, so that there is one recurrent class and one stationary law."""
+    reaches = (np.array(rows) > 0.0) | np.eye(len(rows), dtype=np.bool_)
+    for _ in range(len(rows).bit_length()):
+        reaches = reaches @ reaches
+    return bool(reaches.all(axis=0).any())
+
+
+def stationary(transitions: Floats) -> Floats:
+    """The law π with π T = π, (states,), of a chain with one recurrent class.
+
+    By elimination of one state after the other without a subtraction, so that nothing cancels and every machine finds
+    the same bits. A state that nothing leaves for those before it is recurrent on its own.
+
+    Source: Grassmann, Taksar, Heyman (1985).
+    """
+    rows = transitions.tolist()
+    count = len(rows)
+    kept = count
+    while kept > 1:
+        last = kept - 1
+        leaves = _in_order(rows[last][:last])
+        if leaves == 0.0:
+            break
+        for i in range(last):
+            rows[i][last] /= leaves
+            for j in range(last):
+                rows[i][j] += rows[i][last] * rows[last][j]
+        kept = last
+    weights = [0.0] * count
+    weights[kept - 1] = 1.0
+    for state in range(kept, count):
+        weights[state] = _in_order(weights[i] * rows[i][state] for i in range(state))
+    total = _in_order(weights)
+    return np.array([weight / total for weight in weights])
+
+
+def _in_order(values: Iterable[float]) -> float:
+    """Their sum, each added to those before it: Python's own `sum` rounds otherwise from 3.12 on."""
+    return reduce(add, values, 0.0)

@@ -1,0 +1,237 @@
+"""Links that remember: against a slot-by-slot reference, their marginal loss, their bursts, their stationary law."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from emulator.model.links import LOSS_MODELS, link_of, loss_of
+from emulator.model.links.link import Fate
+from emulator.model.links.markov import stationary
+from emulator.model.process import Floats
+from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+
+KEY = stream_key(root_of_seed(21), "link/eve")
+BURSTS = {"model": "gilbert-elliott", "p": 0.02, "r": 0.25}
+SOFT = {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.02, "bad": 0.7}
+FOUR_STATES = {  # netem's: good, isolated loss, burst, gap within a burst
+    "model": "markov",
+    "transitions": [[0.9, 0.02, 0.08, 0.0], [1.0, 0.0, 0.0, 0.0], [0.3, 0.0, 0.5, 0.2], [0.0, 0.0, 0.4, 0.6]],
+    "loss": [0.0, 1.0, 1.0, 0.0],
+}
+ROTE = {"model": "pattern", "outcomes": "1101001"}
+
+probabilities = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 0.5, 1.0]))
+
+
+def drawn(slots: int, trials: range, per_slot: int) -> Floats:
+    """The link's uniforms as the protocol has them, (slots, trials, per slot)."""
+    return uniforms(Stream(KEY, trials, per_slot).words(range(slots)))
+
+
+def two_states(spec: dict[str, Any], u: Floats) -> list[int]:
+    """Gilbert–Elliott of one trial, slot by slot: 1 where lost."""
+    p, r = spec["p"], spec["r"]
+    bad, fates = False, []
+    for k, (first, second) in enumerate(u.tolist()):
+        if k == 0:
+            bad = first < p / (p + r)
+        elif bad:
+            bad = not first < r
+        else:
+            bad = first < p
+        fates.append(int(second < (spec.get("bad", 1.0) if bad else spec.get("good", 0.0))))
+    return fates
+
+
+def any_chain(spec: dict[str, Any], u: Floats) -> list[int]:
+    """A Markov chain's losses in one trial, slot by slot: 1 where lost."""
+    row, fates = stationary(np.array(spec["transitions"], float)).tolist(), []
+    for first, second in u.tolist():
+        state, bound = 0, row[0]
+        while first >= bound and state < len(row) - 1:
+            state += 1
+            bound += row[state]
+        fates.append(int(second < spec["loss"][state]))
+        row = spec["transitions"][state]
+    return fates
+
+
+def by_rote(spec: dict[str, Any], u: Floats) -> list[int]:
+    """A pattern's losses."""
+    return [int(spec["outcomes"][k % len(spec["outcomes"])] == "0") for k in range(len(u))]
+
+
+REFERENCES = {"gilbert-elliott": two_states, "markov": any_chain, "pattern": by_rote}
+
+
+@st.composite
+def matrices(draw: st.DrawFn, most: int = 5) -> list[list[float]]:
+    """Transitions with states that nothing enters or leaves among them, and one state that all can reach."""
+    states = draw(st.integers(1, most))
+    rows = []
+    for i in range(states):
+        weights = draw(st.lists(st.integers(0, 8), min_size=states, max_size=states))
+        if sum(weights) == 0 or not any(weights[: max(i, 1)]):
+            weights[max(i - 1, 0)] += 1  # downwards, to state 0 in the end
+        rows.append([weight / sum(weights) for weight in weights])
+    return rows
+
+
+@st.composite
+def specs(draw: st.DrawFn) -> dict[str, Any]:
+    """Any link that remembers."""
+    model = draw(st.sampled_from(sorted(REFERENCES)))
+    if model == "gilbert-elliott":
+        entries = {name: draw(probabilities) for name in ("p", "r", "good", "bad")}
+        if entries["p"] == entries["r"] == 0.0:
+            entries["r"] = 0.5
+        return {"model": model, **entries}
+    if model == "markov":
+        rows = draw(matrices())
+        return {"model": model, "transitions": rows, "loss": [draw(probabilities) for _ in rows]}
+    return {"model": model, "outcomes": draw(st.text("01", min_size=1, max_size=12))}
+
+
+@settings(deadline=None)
+@given(spec=specs(), data=st.data(), slots=st.integers(1, 80), trials=st.integers(1, 5), first=st.integers(0, 2**40))
+def test_fates_are_those_of_the_slot_by_slot_reference(
+    spec: dict[str, Any], data: st.DataObject, slots: int, trials: int, first: int
+) -> None:
+    """However the slots are asked for, alone or in a batch, every packet has the fate the reference gives it."""
+    found = {name: value for name, value in spec.items() if name != "model"}
+    assert LOSS_MODELS[spec["model"]].mistakes(found) == []
+    u = drawn(slots, range(first, first + trials), LOSS_MODELS[spec["model"]].uniforms_per_slot)
+    expected = np.array([REFERENCES[spec["model"]](spec, u[:, r]) for r in range(trials)]).T
+    link, start, parts = link_of(spec, KEY, Batch(slots, trials, first)), 0, []
+    while start < slots:
+        stop = data.draw(st.integers(start + 1, slots))
+        parts.append(link.fates(range(start, stop)).copy())
+        start = stop
+    assert np.array_equal(np.concatenate(parts), expected)
+    r = data.draw(st.integers(0, trials - 1))
+    alone = link_of(spec, KEY, Batch(slots, 1, first + r)).fates(range(slots))
+    assert np.array_equal(alone[:, 0], expected[:, r])
+
+
+@pytest.mark.parametrize("spec", [BURSTS, SOFT, FOUR_STATES, ROTE], ids=["bursts", "soft", "four states", "pattern"])
+def test_marginal_loss_of_a_million_packets(spec: dict[str, Any]) -> None:
+    """Within the normal bounds of 10⁶ packets at 1e-6 confidence, their number divided by how long a fate is remembered.
+
+    The variance of the mean of n slots is q(1−q)/n · (1 + 2 Σ c_j), with c_j the autocorrelation of the fates: from the
+    chain's transitions, computed here by powers.
+    """
+    slots, trials = 1000, 1000
+    lost = float((link_of(spec, KEY, Batch(slots, trials)).fates(range(slots)) == Fate.LOST).mean())
+    loss, chain = 1.0 - loss_of(spec).quality, loss_of(spec).chain
+    if chain is None:
+        assert lost == pytest.approx(sum(by_rote(spec, np.empty(slots))) / slots, abs=1e-12)
+        assert loss == pytest.approx(spec["outcomes"].count("0") / len(spec["outcomes"]), abs=1e-12)
+        return
+    memory, ahead, q = 1.0, np.eye(len(chain.law)), 1.0 - chain.quality
+    for _ in range(400):
+        ahead = ahead @ chain.transitions
+        memory += 2.0 * float((chain.law * q) @ ahead @ q - loss**2) / (loss * (1.0 - loss))
+    effective = slots * trials / memory
+    assert abs(lost - loss) < 4.9 * np.sqrt(loss * (1.0 - loss) / effective)
+
+
+def run_lengths(lost: np.ndarray[Any, Any]) -> list[int]:
+    """Lengths of the bursts that begin and end within a trial."""
+    edges = np.flatnonzero(np.diff(lost.astype(int)))
+    starts, ends = edges[lost[edges + 1]], edges[~lost[edges + 1]]
+    ends = ends[np.searchsorted(ends, starts[0], "right") :] if len(starts) else ends[:0]
+    return (ends - starts[: len(ends)]).tolist()
+
+
+def test_gilbert_elliott_bursts_are_geometric() -> None:
+    """With good = 0 and bad = 1 a burst has length l with probability r(1−r)^(l−1): chi-square, at 1e-6 confidence."""
+    r = BURSTS["r"]
+    lost = link_of(BURSTS, KEY, Batch(200_000, 5)).fates(range(200_000)) == Fate.LOST
+    lengths = np.array([length for trial in lost.T for length in run_lengths(trial)])
+    assert len(lengths) > 10_000
+    last = 20
+    counts = np.bincount(np.minimum(lengths, last), minlength=last + 1)[1:]
+    law = np.array([r * (1 - r) ** (length - 1) for length in range(1, last)] + [(1 - r) ** (last - 1)])
+    assert stats.chisquare(counts, law * counts.sum()).pvalue > 1e-6
+    assert lengths.mean() == pytest.approx(1 / r, rel=0.05)
+
+
+def test_slot_zero_has_the_stationary_law() -> None:
+    """The first packet is lost as often as any other, at 1e-6 confidence."""
+    for spec in (BURSTS, SOFT, FOUR_STATES):
+        fates = link_of(spec, KEY, Batch(1, 100_000)).fates(range(1))
+        assert stats.binomtest(int(fates.sum()), fates.size, 1.0 - loss_of(spec).quality).pvalue > 1e-6
+
+
+def test_two_states_are_a_markov_chain() -> None:
+    """Gilbert–Elliott and the Markov chain of its transitions have one chain and one quality."""
+    spec = {"model": "markov", "transitions": [[0.9, 0.1], [0.3, 0.7]], "loss": [0.02, 0.7]}
+    one, other = loss_of(SOFT), loss_of(spec)
+    assert one.quality == pytest.approx(other.quality, abs=1e-15)
+    assert one.chain is not None
+    assert other.chain is not None
+    for name in ("transitions", "law", "quality"):
+        np.testing.assert_allclose(getattr(one.chain, name), getattr(other.chain, name), atol=1e-15)
+
+
+@settings(deadline=None)
+@given(matrices(7))
+def test_the_stationary_law_is_the_eigenvector(rows: list[list[float]]) -> None:
+    """Elimination finds the left eigenvector of 1 that numpy finds, transient and periodic states among them."""
+    T = np.array(rows)
+    values, vectors = np.linalg.eig(T.T)
+    vector = np.real(vectors[:, np.argmin(np.abs(values - 1.0))])
+    law = stationary(T)
+    np.testing.assert_allclose(law, vector / vector.sum(), atol=1e-9)
+    np.testing.assert_allclose(law @ T, law, atol=1e-14)
+    assert (law >= 0.0).all()
+    assert law.sum() == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("rows", "law"),
+    [
+        ([[1.0]], [1.0]),
+        ([[0.0, 1.0], [1.0, 0.0]], [0.5, 0.5]),
+        ([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], [1 / 3, 1 / 3, 1 / 3]),
+        ([[1.0, 0.0], [0.5, 0.5]], [1.0, 0.0]),
+        ([[0.5, 0.5], [0.0, 1.0]], [0.0, 1.0]),
+        ([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.0, 0.25, 0.75]], [0.0, 1 / 3, 2 / 3]),
+        ([[0.5, 0.0, 0.5], [0.2, 0.6, 0.2], [0.25, 0.0, 0.75]], [1 / 3, 0.0, 2 / 3]),
+    ],
+    ids=["one state", "period 2", "period 3", "stays first", "stays last", "transient first", "transient between"],
+)
+def test_stationary_laws_that_are_known(rows: list[list[float]], law: list[float]) -> None:
+    """Periodic chains have one too, and a state that is never come back to has probability exactly 0."""
+    found = stationary(np.array(rows))
+    np.testing.assert_allclose(found, law, atol=1e-15)
+    assert [value == 0.0 for value in found] == [value == 0.0 for value in law]
+
+
+def test_the_stationary_law_is_summed_in_order() -> None:
+    """Its bits are those of the protocol's recipe, in binary64: no compensated sum, whatever Python's version does."""
+    rows = [[0.1, 0.2, 0.3, 0.4], [0.7, 0.1, 0.1, 0.1], [0.3, 0.3, 0.2, 0.2], [0.15, 0.25, 0.35, 0.25]]
+    T, last = np.array(rows), 3
+    while last:
+        leaves = np.cumsum(T[last, :last])[-1]  # in order, unlike np.sum
+        T[:last, last] /= leaves
+        T[:last, :last] += T[:last, last, None] * T[last, :last]
+        last -= 1
+    law = np.ones(1)
+    for state in range(1, 4):
+        law = np.append(law, np.cumsum(law * T[:state, state])[-1])
+    assert np.array_equal(stationary(np.array(rows)), law / np.cumsum(law)[-1])
+
+
+def test_states_that_are_never_come_back_to_are_no_part_of_the_chain() -> None:
+    """Theory is told of the recurrent states alone."""
+    chain = loss_of({"model": "markov", "transitions": [[0.9, 0.1], [0.0, 1.0]], "loss": [0.3, 0.2]}).chain
+    assert chain is not None
+    assert chain.independent
+    assert chain.quality.tolist() == [0.8]

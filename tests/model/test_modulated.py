@@ -1,0 +1,205 @@
+"""Expected covariances behind links that remember: against the independent recursion, enumeration, limits and tails."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.model.links import loss_of
+from emulator.model.links.link import Chain
+from emulator.model.modulated import ModulatedCovariance, limit_trace, tail_outcomes
+from emulator.model.process import Floats, Process
+from emulator.model.theory import (
+    Outcomes,
+    expected_traces,
+    has_infinite_variance,
+    misled_covariances,
+    tail_index,
+)
+from emulator.model.theory import limit_trace as independent_limit
+
+MARGINAL = Process(np.array([[1.0, 0.05], [0.0, 1.0]]), np.diag([1e-3, 1e-4]), np.diag([1.0, 0.01]))
+UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))
+STABLE = Process(np.array([[0.9, 0.1], [0.0, 0.7]]), np.eye(2) * 1e-2, np.eye(2))
+MU_D = 0.6
+
+
+def bursts(p: float, r: float, good: float = 0.0, bad: float = 1.0) -> Chain:
+    """A Gilbert–Elliott link's chain."""
+    chain = loss_of({"model": "gilbert-elliott", "p": p, "r": r, "good": good, "bad": bad}).chain
+    assert chain is not None
+    return chain
+
+
+def legitimate(quality: float) -> Outcomes:
+    """What the estimator does with a slot."""
+    return Outcomes.legitimate(quality, MU_D)
+
+
+def eavesdropper(use_state: float, use_innovation: float) -> Callable[[float], Outcomes]:
+    """What an eavesdropper does with a slot."""
+    return lambda quality: Outcomes.eavesdropper(quality, MU_D, use_state, use_innovation)
+
+
+RECEIVERS = {
+    "legitimate": legitimate,
+    "plain": Outcomes.plain,
+    "smart": eavesdropper(1.0, 0.0),
+    "suspicious": eavesdropper(0.8, 0.1),
+    "naive": eavesdropper(1.0, 1.0),
+}
+every_receiver = pytest.mark.parametrize("outcomes_at", RECEIVERS.values(), ids=RECEIVERS)
+every_process = pytest.mark.parametrize("process", [MARGINAL, UNSTABLE, STABLE], ids=["marginal", "unstable", "stable"])
+
+
+@every_receiver
+@every_process
+def test_a_link_whose_states_are_alike_is_the_papers(
+    process: Process, outcomes_at: Callable[[float], Outcomes]
+) -> None:
+    """One state, or several of one quality, give the independent recursion, to 1e-12, and its limit."""
+    expected = expected_traces(process, outcomes_at(0.7), 60)
+    for chain in (Chain(np.ones((1, 1)), np.ones(1), np.array([0.7])), bursts(0.1, 0.3, 0.3, 0.3)):
+        np.testing.assert_allclose(
+            ModulatedCovariance(process, chain, outcomes_at).next_traces(60), expected, rtol=1e-12
+        )
+        assert limit_trace(process, chain, outcomes_at) == pytest.approx(
+            independent_limit(process, outcomes_at(0.7)), rel=1e-9
+        )
+        tail = tail_index(process, tail_outcomes(chain, outcomes_at))
+        assert tail == pytest.approx(tail_index(process, outcomes_at(0.7)), rel=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.01, 1.0), st.integers(1, 40))
+def test_slots_may_be_asked_for_in_any_pieces(good: float, bad: float, p: float, first: int) -> None:
+    """The same numbers, whatever the pieces."""
+    chain = bursts(p, 0.3, good, bad)
+    whole = ModulatedCovariance(MARGINAL, chain, RECEIVERS["suspicious"]).next_traces(50)
+    stream = ModulatedCovariance(MARGINAL, chain, RECEIVERS["suspicious"])
+    assert np.array_equal(np.concatenate([stream.next_traces(first), stream.next_traces(50 - first)]), whole)
+
+
+def enumerated(process: Process, chain: Chain, use: tuple[float, float] | None, slots: int) -> Floats:
+    """The trace of E P_k, (slots,), as a sum over all words of link states, losses, packet types and guesses.
+
+    use: P(b | state), P(b | innovation) of an eavesdropper; None: the estimator that holds the secret.
+    """
+    A, Q, f = process.A, process.Q, misled_covariances(process, slots)
+    traces = np.zeros(slots)
+    for states in itertools.product(range(len(chain.law)), repeat=slots):
+        path = chain.law[states[0]] * math.prod(chain.transitions[a, b] for a, b in itertools.pairwise(states))
+        for events in itertools.product(itertools.product((False, True), repeat=3), repeat=slots):
+            weight, P = path, process.initial_covariance
+            for k, (received, innovation, used) in enumerate(events):
+                q, p_innovation = chain.quality[states[k]], (1.0 - MU_D) if k else 0.0
+                p_used = 1.0 if use is None else use[innovation]
+                weight *= (q if received else 1.0 - q) * (p_innovation if innovation else 1.0 - p_innovation)
+                weight *= p_used if used else 1.0 - p_used
+                if weight == 0.0:
+                    break
+                if received and used and not innovation:
+                    P = np.zeros_like(Q)
+                elif received and used:
+                    P = A @ P @ A.T if use is None else f[k]
+                elif k:
+                    P = A @ P @ A.T + Q
+            traces[-1] += weight * np.trace(P)
+    return traces
+
+
+@pytest.mark.parametrize("use", [None, (1.0, 0.0), (0.8, 0.1), (1.0, 1.0)], ids=["legitimate", "smart", "sus", "naive"])
+@pytest.mark.parametrize("slots", [1, 2, 3])
+def test_the_recursion_is_the_sum_over_all_words(use: tuple[float, float] | None, slots: int) -> None:
+    """Every word of link states and packets, weighed and added up by hand, gives the recursion's last value."""
+    chain = bursts(0.2, 0.4, 0.1, 0.9)
+    outcomes_at = legitimate if use is None else eavesdropper(*use)
+    found = ModulatedCovariance(UNSTABLE, chain, outcomes_at).next_traces(slots)
+    assert found[-1] == pytest.approx(enumerated(UNSTABLE, chain, use, slots)[-1], rel=1e-12)
+
+
+THREE = loss_of(
+    {
+        "model": "markov",
+        "transitions": [[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.0, 0.6, 0.4]],
+        "loss": [0.01, 0.4, 1.0],
+    }
+).chain
+assert THREE is not None
+
+
+@every_receiver
+@every_process
+@pytest.mark.parametrize("chain", [bursts(0.05, 0.7), bursts(0.3, 0.5, 0.1, 0.6), bursts(0.02, 0.05), THREE])
+def test_the_limit_is_that_of_the_recursion(
+    process: Process, chain: Chain, outcomes_at: Callable[[float], Outcomes]
+) -> None:
+    """A finite limit is what the recursion comes to; where it is inf, the recursion grows on and on."""
+    limit = limit_trace(process, chain, outcomes_at)
+    traces = ModulatedCovariance(process, chain, outcomes_at).next_traces(6000)
+    if math.isfinite(limit):
+        assert traces[-1] == pytest.approx(limit, rel=1e-6)
+    else:
+        assert traces[-1] > 1.5 * traces[3000] or math.isinf(traces[3000])
+
+
+@pytest.mark.parametrize("r", [0.35, 0.45, 0.479, 0.4815, 0.5, 0.7])
+def test_bursts_that_last_too_long_have_no_limit(r: float) -> None:
+    """Behind a link that loses all or nothing, and μ_d = 1, the error is bounded exactly while (1 − r) ρ² < 1."""
+    chain, rho = bursts(0.05, r), UNSTABLE.spectral_radius
+    bounded = (1.0 - r) * rho**2 < 1.0
+    assert math.isfinite(limit_trace(UNSTABLE, chain, Outcomes.plain)) is bounded
+    traces = ModulatedCovariance(UNSTABLE, chain, Outcomes.plain).next_traces(4000)
+    assert bool(traces[-1] < 1.001 * traces[2000]) is bounded
+
+
+def test_a_perfect_link_has_no_error() -> None:
+    """Whoever gets every packet is exact for ever, however unstable the process; and has no tail."""
+    chain = bursts(0.1, 0.3, 0.0, 0.0)
+
+    def rarely(quality: float) -> Outcomes:
+        return Outcomes.legitimate(quality, 0.1)
+
+    assert limit_trace(UNSTABLE, chain, rarely) == 0.0
+    assert not ModulatedCovariance(UNSTABLE, chain, rarely).next_traces(100).any()
+    assert math.isinf(tail_index(UNSTABLE, tail_outcomes(chain, rarely)))
+
+
+def test_a_bounded_expectation_stays_so_beyond_double_precision() -> None:
+    """The state's covariance leaves double precision after some thousand slots; a smart eavesdropper's does not."""
+    chain = bursts(0.05, 0.7)
+    traces = ModulatedCovariance(UNSTABLE, chain, eavesdropper(1.0, 0.0)).next_traces(3000)
+    assert traces[-1] == pytest.approx(limit_trace(UNSTABLE, chain, eavesdropper(1.0, 0.0)), rel=1e-9)
+    misled = ModulatedCovariance(UNSTABLE, chain, eavesdropper(1.0, 1.0)).next_traces(3000)
+    beyond = int(np.flatnonzero(np.isinf(misled))[0])
+    assert np.isfinite(misled[:beyond]).all()
+    assert np.isinf(misled[beyond:]).all()
+
+
+def test_tails_are_those_of_the_chain() -> None:
+    """All or nothing and μ_d = 1: a loss lasts on with 1 − r, whatever p; infinite variance exactly if (1 − r) ρ⁴ ≥ 1."""
+    rho = UNSTABLE.spectral_radius
+    for r in (0.5, 0.72, 0.74, 0.9):
+        for p in (0.01, 0.2):
+            outcomes = tail_outcomes(bursts(p, r), Outcomes.plain)
+            assert outcomes.kept == pytest.approx(1.0 - r, abs=1e-12)
+            assert tail_index(UNSTABLE, outcomes) == pytest.approx(-math.log(1.0 - r) / (2.0 * math.log(rho)))
+            assert has_infinite_variance(UNSTABLE, outcomes) is ((1.0 - r) * rho**4 >= 1.0)
+    assert math.isinf(tail_index(MARGINAL, tail_outcomes(bursts(0.1, 0.2), legitimate)))
+    assert math.isinf(tail_index(UNSTABLE, tail_outcomes(bursts(0.1, 0.2), RECEIVERS["naive"])))
+
+
+def test_the_rate_of_the_tail_is_how_long_a_word_lasts() -> None:
+    """P(no state packet in k slots), summed slot by slot over the chain, falls by the factor `kept` a slot."""
+    chain = THREE
+    kept = np.array([legitimate(q).kept for q in chain.quality])
+    alive = chain.law * kept
+    for _ in range(200):
+        before, alive = alive.sum(), (alive @ chain.transitions) * kept
+    assert alive.sum() / before == pytest.approx(tail_outcomes(chain, legitimate).kept, rel=1e-9)

@@ -1,0 +1,154 @@
+"""Runs behind links that remember: the same bits live and in memory, theory met, and no theory where there is none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+import tomli_w
+
+from emulator.api import design, montecarlo, run
+from emulator.errors import UsageError
+from emulator.model.links import LOSS_MODELS
+from emulator.runs.estimates import warnings_of
+from emulator.runs.results import Results
+from emulator.scenario import Scenario, load
+from tests.conftest import Evedrop
+
+LOSSES: dict[str, dict[str, Any]] = {
+    "bernoulli": {"model": "bernoulli", "quality": 0.8},
+    "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.05, "bad": 0.9},
+    "markov": {"model": "markov", "transitions": [[0.8, 0.2], [0.5, 0.5]], "loss": [0, 1]},
+    "pattern": {"model": "pattern", "outcomes": "1101"},
+}
+
+
+def scenario(**changes: Any) -> dict[str, Any]:
+    """An eavesdropper behind each loss model, the legitimate estimator behind bursts."""
+    eavesdroppers = {
+        name: {"strategy": "smart", "link": {"loss": loss}} for name, loss in LOSSES.items() if name != "bernoulli"
+    }
+    suspicious = {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.1}
+    return {
+        "title": "Every loss model",
+        "slots": 300,
+        "process": {
+            "A": [[1.0, 0.05], [0.0, 1.0]],
+            "Q": [[1e-3, 0.0], [0.0, 1e-4]],
+            "initial_covariance": [[1.0, 0.0], [0.0, 0.01]],
+        },
+        "encoding": {"scheme": "innovation", "state_probability": 0.3},
+        "legitimate": {"link": {"loss": LOSSES["gilbert-elliott"]}},
+        "eavesdroppers": {
+            "bernoulli": {**suspicious, "link": {"loss": LOSSES["bernoulli"]}},
+            **eavesdroppers,
+            "guesser": {**suspicious, "link": {"loss": LOSSES["markov"]}},
+        },
+        **changes,
+    }
+
+
+@pytest.fixture(scope="module")
+def every_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scenario's file."""
+    path = tmp_path_factory.mktemp("scenario") / "every.toml"
+    path.write_text(tomli_w.dumps(scenario()), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def memory(every_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Seven trials of it in memory."""
+    return montecarlo(every_model, trials=7, out=tmp_path_factory.mktemp("memory") / "run")
+
+
+def test_every_model_is_in_the_scenario() -> None:
+    """A new loss model must be added here."""
+    assert set(LOSSES) == set(LOSS_MODELS)
+
+
+def test_live_and_memory_are_the_same_bits(every_model: Path, memory: Results, tmp_path: Path) -> None:
+    """Every loss model gives one digest, in processes and in memory, and every packet is accounted for."""
+    live = run(every_model, trials=7, out=tmp_path / "live")
+    assert {name: peer["digest"] for name, peer in live.summary["peers"].items()} == {
+        name: peer["digest"] for name, peer in memory.summary["peers"].items()
+    }
+    assert all(link["unexplained"] == 0 for link in live.summary["links"].values())
+    lost = live.summary["links"]["pattern"]["lost"]
+    assert lost == 7 * 300 // 4
+
+
+def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
+    """A pattern has no expected trace: null in the summary and in the table, and no verdict of theory."""
+    peers = memory.summary["peers"]
+    assert [name for name, peer in peers.items() if peer["expected_trace_covariance"] is None] == ["pattern"]
+    assert json.loads((memory.folder / "summary.json").read_text())["peers"]["pattern"]["infinite_variance"] is False
+    nulls = memory.slots.filter(pc.is_null(memory.slots["expected_trace_covariance"]))
+    assert set(nulls["peer"].to_pylist()) == {"pattern"}
+    assert nulls.num_rows == 300
+    verdict = memory.summary["secrecy"]["pattern"]
+    assert (verdict["relative_by_theory"], verdict["perfect_by_theory"]) == (None, None)
+    assert verdict["sentence"].endswith("there is no theory for these links")
+    assert memory.summary["secrecy"]["markov"]["relative_by_theory"] is not None
+
+
+def test_the_report_survives_a_figure_that_is_not_there(every_model: Path, evedrop: Evedrop) -> None:
+    """The closing table has a dash, and a sweep goes through."""
+    done = evedrop("montecarlo", str(every_model), "--trials", "3", "--out", "here")
+    assert (done.status, done.err) == (0, "")
+    (row,) = [line for line in done.out.splitlines() if line.split()[:1] == ["pattern"]]
+    assert " – " in row
+    swept = evedrop("sweep", str(every_model), "--trials", "3", "--over", "slots=20,40", "--out", "swept")
+    assert (swept.status, swept.err) == (0, "")
+
+
+def test_simulated_errors_agree_with_the_theory_of_bursts(every_model: Path, tmp_path: Path) -> None:
+    """Receivers behind chains, 600 trials: in no slot judged is the mean error 4.5 standard errors off (7e-6 each)."""
+    table = montecarlo(every_model, slots=121, trials=600, seed=5, out=tmp_path / "many").slots.to_pydict()
+    judged = 0
+    for i, slot in enumerate(table["slot"]):
+        if slot % 20 == 0 and table["peer"][i] != "pattern":
+            deviation = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
+            assert abs(deviation) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
+            judged += 1
+    assert judged == 7 * 5
+
+
+def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -> None:
+    """μ_d is not designed for bursts: one line that names the link and the remedy, exit 2; the remedy is one."""
+    done = evedrop("design", str(every_model))
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert "the link of legitimate has others" in line
+    assert "--set 'legitimate.link={quality = 0.9}'" in line
+    quality = {"quality": 0.9}
+    with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.gilbert-elliott\.link="):
+        design(every_model, changes={"legitimate.link": quality})
+    links = {f"eavesdroppers.{name}.link": quality for name in scenario()["eavesdroppers"]}
+    design(every_model, changes={"legitimate.link": quality, **links})
+
+
+def test_bursts_that_last_too_long_are_a_warning() -> None:
+    """An unstable process behind bursts is warned of exactly where its expected error has no bound."""
+    link = {"loss": {"model": "gilbert-elliott", "p": 0.02, "r": 0.1}}
+    (warning,) = warnings_of(load("numerical", {"legitimate.link": link}))
+    assert "grows without bound" in warning
+    assert warnings_of(load("numerical", {"legitimate.link": {"loss": {**link["loss"], "r": 0.9}}})) == []
+    assert warnings_of(Scenario.model_validate(scenario())) == []
+
+
+def test_the_view_survives_where_there_is_no_theory(every_model: Path, tmp_path: Path) -> None:
+    """A recording and a replayed one of a run in which one receiver's expected trace is nowhere."""
+    from rerun.chunk import RrdReader
+
+    from emulator.view.replay import replay
+
+    live = run(every_model, slots=40, out=tmp_path / "live")
+    shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
+    assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown
+    assert "/theory/pattern" not in shown
+    assert np.isnan(live.slots.to_pandas()["expected_trace_covariance"]).sum() == 40
