@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import multiprocessing as mp
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing import connection, resource_tracker
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from multiprocessing import connection
+from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
 from emulator.errors import RunError, UsageError
@@ -23,7 +23,6 @@ from emulator.runs.trials import BatchResult, Task, carry_out
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
 _REACH_SECONDS = 5
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 Tell = Callable[[int], None]
 Stopped = Callable[[], bool]
@@ -51,16 +50,21 @@ class _Worker:
     """A worker process and this end of its pipe. Final."""
 
     def __init__(self) -> None:
-        context = mp.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
+        self.pipe, theirs = Pipe()
         self.number: int | None = None
         """Of the task under way."""
-        self.process: SpawnProcess = context.Process(target=_work, args=(theirs,), daemon=True)
-        # Until it has handlers of its own, a Ctrl-C in the terminal must not reach it; the mask is inherited.
-        resource_tracker.ensure_running()  # which otherwise lifts the mask
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+        # A session of its own, so that a Ctrl-C in the terminal does not reach it. And not multiprocessing's own kind of
+        # process, which would run the caller's script a second time.
+        command = f"from emulator.runs.workers import work; work({theirs.fileno()})"
+        # Until it can answer to it, our own stop waits: the mask is inherited.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
-            self.process.start()
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", command],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
@@ -76,7 +80,7 @@ class _Worker:
 
     def end(self) -> None:
         self.process.kill()
-        self.process.join()
+        self.process.wait()
         self.pipe.close()
 
 
@@ -112,8 +116,9 @@ def _received(worker: _Worker) -> int | str | BatchResult:
     try:
         news: int | str | BatchResult = worker.pipe.recv()
     except (EOFError, OSError) as error:
-        worker.process.join(_LAST_SECONDS)
-        code = worker.process.exitcode
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            worker.process.wait(_LAST_SECONDS)
+        code = worker.process.returncode
         how = f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with status {code}"
         raise RunError(f"a worker process {how}; was it killed, or out of memory? try fewer --workers") from error
     return news
@@ -130,14 +135,12 @@ def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResul
             due += 1
 
 
-def _work(pipe: Connection) -> None:
+def work(descriptor: int) -> None:
     """A worker's life: tasks from its pipe until it is ended, or whoever started it is gone."""
     stop = threading.Event()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
-    with contextlib.suppress(EOFError, OSError):
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    with contextlib.suppress(EOFError, OSError), Connection(descriptor) as pipe:
         while True:
             pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
 

@@ -36,7 +36,7 @@ def at_work(live: Live, workers: int) -> list[int]:
     if workers == 1:
         crew = [live.process.pid] if (live.folder / "slots.parquet").exists() else []
     else:
-        crew = [pid for pid, command in with_mark(str(live.temporary)).items() if "spawn_main" in command]
+        crew = [pid for pid, command in with_mark(str(live.temporary)).items() if "runs.workers import work" in command]
     try:
         enough = len(crew) == workers and all(processor_seconds(pid) > 1.2 for pid in crew)
     except OSError:
@@ -78,7 +78,7 @@ def test_a_ctrl_c_in_the_terminal_reaches_the_workers_too(evedrop: Evedrop) -> N
     """The whole group gets the signal, workers that have just been born among them; nobody prints a traceback."""
     arguments = ("montecarlo", "eavesdroppers", *ENDLESS, "--workers", "2", "--out", "run")
     live = Live(evedrop._start(arguments, {"start_new_session": True}), evedrop.temporary, evedrop.folder / "run")
-    wait_until(lambda: any("spawn_main" in command for command in live.left().values()), "a worker")
+    wait_until(lambda: any("runs.workers import work" in command for command in live.left().values()), "a worker")
     os.killpg(live.process.pid, signal.SIGINT)
     done = live.end()
     assert done.status == 130
