@@ -14,7 +14,7 @@ import numpy as np
 
 from emulator.model.process import Floats
 from emulator.runs.expectation import Expectation
-from emulator.runs.score import WINDOWS, Tally, window_means
+from emulator.runs.score import WINDOWS, Tally, window_means, window_of
 
 CONFIDENCE = 0.99
 
@@ -36,6 +36,10 @@ class Secrecy:
     perfect: Verdict
     relative_by_theory: bool | None
     """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where there is no theory for a link."""
+    relative_from: int | None
+    """First slot k ≥ 1 from which on tr E P_k < tr E Pᵉ_k to the end of the run; None if it does not hold there."""
+    windows: str
+    """The slots of the windows in which relative secrecy failed or stayed undecided, such as "1 to 124"; empty if in all."""
     perfect_by_theory: bool | None
     """J bounded and J_e not; None where there is no theory for a link."""
     ratio: float
@@ -44,12 +48,13 @@ class Secrecy:
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance and a mean is no measure."""
 
-    def as_dict(self) -> dict[str, str | bool | None]:
+    def as_dict(self) -> dict[str, str | bool | int | None]:
         """As in the summary."""
         return {
             "relative": self.relative.value,
             "perfect": self.perfect.value,
             "relative_by_theory": self.relative_by_theory,
+            "relative_from": self.relative_from,
             "perfect_by_theory": self.perfect_by_theory,
             "judged_by": self.judged_by,
             "sentence": self.sentence,
@@ -62,13 +67,16 @@ class Secrecy:
         promise = "there is no theory for these links"
         if self.relative_by_theory is not None:
             promise = f"theory promises {theory} secrecy"
+        if theory == "no" and self.relative_from is not None:
+            promise = f"theory promises relative secrecy from slot {self.relative_from} on"
         if math.isnan(self.ratio):
             return f"{self.eavesdropper}: nothing was measured; {promise}"
         times = "∞" if math.isinf(self.ratio) else f"{self.ratio:.3g}"
+        where = f" in slots {self.windows}" if self.windows else ""
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",
-            Verdict.FAILED: "relative secrecy failed in this run",
-            Verdict.UNDECIDED: f"{self.trials} trials are too few to decide"
+            Verdict.FAILED: f"relative secrecy failed in this run{where}",
+            Verdict.UNDECIDED: f"{self.trials} trials are too few to decide{where}"
             if self.trials > 1
             else "one trial decides nothing (try --trials 200)",
         }[self.relative]
@@ -107,12 +115,23 @@ def median_bounds(samples: Floats) -> tuple[float, float]:
     return float(ordered[rank]), float(ordered[count - 1 - rank])
 
 
-def _relative(difference: Floats, bounds_of: Bounds) -> Verdict:
-    """From the mean error differences of each window and trial, (WINDOWS, R)."""
-    bounds = [bounds_of(row) for row in difference if not np.isnan(row).any()]
-    if any(high < 0.0 for _, high in bounds):
-        return Verdict.FAILED
-    return Verdict.HELD if bounds and all(low > 0.0 for low, _ in bounds) else Verdict.UNDECIDED
+def _relative(difference: Floats, bounds_of: Bounds, slots: int) -> tuple[Verdict, str]:
+    """From the mean error differences of each window and trial, (WINDOWS, R): the verdict, and the slots it is due to."""
+    bounds = {w: bounds_of(row) for w, row in enumerate(difference) if not np.isnan(row).any()}
+    failed = [window for window, (_, high) in bounds.items() if high < 0.0]
+    doubtful = [window for window, (low, _) in bounds.items() if not low > 0.0]
+    if failed:
+        return Verdict.FAILED, _slots_of(failed, slots)
+    if doubtful or not bounds:
+        return Verdict.UNDECIDED, _slots_of(doubtful, slots) if len(doubtful) < len(bounds) else ""
+    return Verdict.HELD, ""
+
+
+def _slots_of(windows: list[int], slots: int) -> str:
+    """The slots of some windows in words: "1 to 124, 625 to 749"."""
+    window = window_of(np.arange(slots), slots)
+    spans = [np.flatnonzero(window == one) for one in windows]
+    return ", ".join(f"{span[0]} to {span[-1]}" for span in spans)
 
 
 def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: Bounds) -> Verdict:
@@ -139,7 +158,9 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     user_means, other_means = window_means(user), window_means(other)
     heavy = user_theory.infinite_variance or other_theory.infinite_variance
     bounds_of = median_bounds if heavy else mean_bounds
-    relative = _relative(other_means - user_means, bounds_of) if complete else Verdict.UNDECIDED
+    relative, windows = Verdict.UNDECIDED, ""
+    if complete:
+        relative, windows = _relative(other_means - user_means, bounds_of, slots)
     if perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
@@ -150,8 +171,17 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         relative,
         perfect,
         bool(math.isfinite(user_bound) and np.all(gap[1:] > 0.0)) if known else None,
+        _holds_from(gap) if known and math.isfinite(user_bound) else None,
+        windows,
         perfect_by_theory,
         ratio,
         user.trials,
         "median" if heavy else "mean",
     )
+
+
+def _holds_from(gap: Floats) -> int | None:
+    """First slot k ≥ 1 from which on the gap (slots,) is positive to its end."""
+    wrong = np.flatnonzero(~(gap[1:] > 0.0)) + 1
+    first = int(wrong[-1]) + 1 if wrong.size else 1
+    return first if first < len(gap) else None

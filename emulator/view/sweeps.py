@@ -25,13 +25,19 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
             for peer, colour, mark in zip(peers, _COLOURS * 8, _MARKS * 8, strict=False):
                 mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
                 x = _positions([row[keys[0]] for row in mine])
-                one.plot(x, [row["expected_trace_covariance"] for row in mine], color=colour, linewidth=1.2)
+                theory = [row["expected_trace_covariance"] for row in mine]
+                numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
+                one.plot(x, theory, "-" if numbers else "_", color=colour, linewidth=1.2, markersize=26)
                 one.plot(x, [_error(row) for row in mine], mark, color=colour, markerfacecolor="white", label=peer)
-                if x and mine and not isinstance(mine[0][keys[0]], (int, float)):
+                if not numbers:
                     one.set_xticks(x, [str(row[keys[0]]) for row in mine])
+                    one.set_xlim(-0.5, len(x) - 0.5)
             one.set_yscale("log")
             one.set_xlabel(keys[0])
             one.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
+        limits = [limit for one in axes for limit in one.get_ylim()]
+        for one in axes:
+            one.set_ylim(min(limits), max(limits))
         axes[0].set_ylabel("mean error over slots (lines: theory)")
         axes[0].legend()
 

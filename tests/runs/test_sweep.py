@@ -143,6 +143,15 @@ def test_the_folder_has_table_description_and_plot(swept: tuple[pa.Table, Path])
     assert (folder / "sweep.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_the_results_reference_has_every_column_of_a_sweep(swept: tuple[pa.Table, Path]) -> None:
+    """Each column between backquotes in docs/results.md, and each entry of sweep.json."""
+    table, folder = swept
+    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+    part = text.partition("## Sweeps")[2].partition("\n## ")[0]
+    names = {*table.column_names, *json.loads((folder / "sweep.json").read_text())} - set(list(GRID)[1:])
+    assert {name for name in names if f"`{name}`" not in part} == set()
+
+
 def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> None:
     """A strategy and slots, covariance-only: the actual trace stands in its own column, and the plot is drawn."""
     grid = {"eavesdroppers.smart.strategy": ["smart", "naive"], "slots": [10, 20]}

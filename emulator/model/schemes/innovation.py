@@ -8,7 +8,7 @@ import numpy as np
 
 from emulator.model import update
 from emulator.model.process import Floats, Process, StateFactors, product
-from emulator.model.receiver import Action, Belief, Codes, Flags, Receiver, select
+from emulator.model.receiver import Belief, Codes, Flags, Receiver, select
 from emulator.model.schedule import Schedule
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme, Shared
 from emulator.streams import Batch, BlockReader
@@ -70,9 +70,6 @@ class InnovationEncoder(Encoder):
         return Packet(select(nu, lambda: (x - predicted) + self._secret.chi(k), lambda: x), nu)
 
 
-_ACTIONS = np.array([Action.LOST, Action.STATE, Action.INNOVATION], np.uint8)
-
-
 class InnovationEstimator(Receiver):
     """The exact MMSE estimator that holds the secret.
 
@@ -85,7 +82,8 @@ class InnovationEstimator(Receiver):
 
     def act(self, k: int, gamma: Flags) -> Codes:
         """Lost, used as the state, or decoded, by the schedule."""
-        return _ACTIONS[gamma.view(np.uint8) + (gamma & self._secret.nu(k)).view(np.uint8)]
+        # The codes 0, 1, 2 of `Action` are these sums: LOST, STATE where γ, INNOVATION where γ and ν.
+        return gamma.view(np.uint8) + (gamma & self._secret.nu(k)).view(np.uint8)
 
     def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""

@@ -1,0 +1,60 @@
+"""What the documents tell people to type can be typed, and what they link to is there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from emulator import cli
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted(path.name for path in DOCS.glob("*.md"))
+
+
+def commands(page: str) -> list[list[str]]:
+    """The `evedrop` commands in a page's code blocks, and those of pytest."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
+    found = [line.partition("  #")[0] for line in lines if line.startswith(("evedrop ", "python -m pytest "))]
+    return [shlex.split(line) for line in found]
+
+
+def heading(title: str) -> str:
+    """How a heading is linked to."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_of_the_documents_is_one(page: str) -> None:
+    """Options and their values are understood; tests that are named exist."""
+    names = (DOCS.parent / "tests" / "model" / "test_errata.py").read_text(encoding="utf-8")
+    for words in commands(page):
+        if words[0] == "python":
+            assert (DOCS.parent / words[3]).is_file()
+            assert f"def test_{words[-1]}_" in names, words
+        elif words[1] != "FILE":
+            assert cli._parser().parse_args(words[1:]).command is not None
+
+
+def test_the_pages_that_show_commands_have_some() -> None:
+    """So that the test above tests something."""
+    assert {page: len(commands(page)) >= least for page, least in {"montecarlo.md": 5, "errata.md": 9}.items()} == {
+        "montecarlo.md": True,
+        "errata.md": True,
+    }
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_between_documents_lead_somewhere(page: str) -> None:
+    """The page is there, and the heading in it."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:\s]*(?:#[^)\s]*)?)\)", text):
+        name, _, anchor = target.partition("#")
+        other = DOCS / name if name else DOCS / page
+        assert other.is_file(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {heading(title) for title in titles}, target
