@@ -62,6 +62,17 @@ NAIVE = {"strategy": "naive", "link": {"quality": 0.7}}
 SUSPICIOUS = {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.3, "link": {"quality": 0.9}}
 ALL = {"smart": SMART, "naive": NAIVE, "suspicious": SUSPICIOUS}
 
+
+def outcomes_of(of: Scenario) -> dict[str, Outcomes]:
+    """Receiver → what it does with a slot, by the paper's definition of its strategy."""
+    mu_d = of.encoding.mu_d
+    found = {"legitimate": Outcomes.legitimate(of.legitimate.link.quality, mu_d)}
+    for name, table in of.eavesdroppers.items():
+        use = {"smart": (1.0, 0.0), "naive": (1.0, 1.0), "suspicious": (table.use_state, table.use_innovation)}
+        found[name] = Outcomes.eavesdropper(table.link.quality, mu_d, *use[table.strategy])
+    return found
+
+
 Arrays = dict[str, dict[str, np.ndarray[Any, Any]]]
 
 
