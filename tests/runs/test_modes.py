@@ -18,7 +18,6 @@ from emulator.api import montecarlo
 from emulator.errors import ScenarioError, UsageError
 from emulator.model.theory import Outcomes, expected_traces
 from emulator.runs.briefs import StreamKeys
-from emulator.runs.expectation import expectations_of
 from emulator.runs.montecarlo import Plan
 from emulator.runs.results import Results
 from emulator.runs.simulation import Mode, Simulation
@@ -28,16 +27,6 @@ SURE = 4.5
 COVARIANCES, ERRORS = Plan(Mode.COVARIANCE_ONLY, workers=1), Plan(Mode.ERROR_COORDINATES, workers=1)
 MARGINAL = [[1.0, 0.05], [0.0, 1.0]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
-
-
-def outcomes_of(of: Scenario) -> dict[str, Outcomes]:
-    """Receiver → what it does with a slot behind its link, whose losses are independent."""
-    found = {}
-    for name, one in expectations_of(of).items():
-        assert one.chain is not None
-        (quality,) = one.chain.quality
-        found[name] = one.outcomes_at(float(quality))
-    return found
 
 
 def scenario(A: list[list[float]], slots: int, mu_d: float = 0.6, **eavesdroppers: dict[str, Any]) -> Scenario:
