@@ -16,9 +16,22 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import BriefError
-from emulator.model.process import Process
-from emulator.streams import Batch
+from emulator.model.process import Process, mistakes_of
+from emulator.streams import KEY_BYTES, Batch
 
+_KINDS: Mapping[tuple[str, ...], type] = {
+    ("run", "process", "role", "router", "user", "password"): str,
+    ("slots", "trials", "first_trial", "recorded"): int,
+    ("flow", "model", "keys", "part"): dict,
+    ("ends_with_stdin",): bool,
+}
+_PARTS: Mapping[str, tuple[str, ...]] = {
+    "router": ("links", "users"),
+    "sensor": ("scheme", "pace", "receivers"),
+    "legitimate": ("scheme",),
+    "eavesdropper": ("strategy", "parameters"),
+    "observer": ("scenario", "results", "recording", "live"),
+}
 ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
 
 
@@ -99,7 +112,7 @@ def read_brief(path: Path, role: str | None = None) -> Brief:
         brief = _parsed(json.loads(path.read_text()))
     except OSError as error:
         raise BriefError(f"{path}: {error.strerror}; give the file that `evedrop brief` wrote") from error
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise BriefError(
             f"{path} is not a brief of this version ({error}); write it again with `evedrop brief`"
         ) from error
@@ -118,4 +131,25 @@ def _parsed(found: Any) -> Brief:
         raise TypeError(f"unknown entry {min(unknown)}")
     if found["role"] not in ROLES:
         raise ValueError(f"unknown role {found['role']}")
-    return Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"])})
+    for names, kind in _KINDS.items():
+        for name in names:
+            if type(found[name]) is not kind:
+                raise TypeError(f"{name} is no {kind.__name__}")
+    for name in _PARTS[found["role"]]:
+        if name not in found["part"]:
+            raise ValueError(f"part.{name} is missing")
+    for name, key in found["keys"].items():
+        if not isinstance(key, str) or len(bytes.fromhex(key)) != KEY_BYTES:
+            raise ValueError(f"the key of {name} is not {KEY_BYTES} bytes")
+    brief = Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"])})
+    _check_numbers(brief)
+    return brief
+
+
+def _check_numbers(brief: Brief) -> None:
+    """Raise ValueError or TypeError for numbers that no run has."""
+    if min(brief.slots, brief.trials, brief.recorded, brief.flow.window, brief.flow.batch) < 1 or brief.first_trial < 0:
+        raise ValueError("slots, trials, recorded, flow.window and flow.batch must be at least 1")
+    model = brief.model
+    if mistakes_of(*(np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance))):
+        raise ValueError("its model is no process")

@@ -263,3 +263,29 @@ def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:
         assert reader.stdin is not None
         reader.stdin.close()
     assert (done.status, done.err) == (0, "")
+
+
+def test_a_title_is_text(evedrop: Evedrop) -> None:
+    """Brackets in a title or a folder's name are printed as they stand, and break nothing."""
+    arguments = ("--slots", "5", "--trials", "2", "--set", "title=[/red] a [bold]title", "--out", "o[bold]x[y]")
+    done = evedrop("montecarlo", "eavesdroppers", *arguments)
+    assert (done.status, done.err) == (0, "")
+    assert "[/red] a [bold]title" in done.out
+    assert "o[bold]x[y]" in done.out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("check", "eavesdroppers", "--set", f"seed={'9' * 5000}"),
+        ("check", "eavesdroppers", "--set", f"seed={'[' * 20000}"),
+        ("run", "eavesdroppers", "--listen", f"tcp/127.0.0.1:{'1' * 5000}"),
+        ("design", "numerical", "--max-trace", "inf"),
+        ("check", "/dev/zero"),
+    ],
+)
+def test_absurd_arguments_are_refused(evedrop: Evedrop, arguments: tuple[str, ...]) -> None:
+    """Numbers of thousands of digits, lists without end, devices: a message and exit 2, no traceback."""
+    done = evedrop(*arguments)
+    assert done.status == 2
+    assert "Traceback" not in done.err

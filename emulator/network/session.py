@@ -33,7 +33,8 @@ Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 def _transport() -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
-    return {"link": {"tx": {"queue": {"congestion_control": wait}}}}
+    # Shared memory would put what the router sends to one receiver into the memory of all.
+    return {"link": {"tx": {"queue": {"congestion_control": wait}}}, "shared_memory": {"enabled": False}}
 
 
 def client_config(brief: Brief) -> dict[str, Any]:

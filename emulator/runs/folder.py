@@ -13,7 +13,6 @@ def new_folder(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty; give another --out, or empty it")
-        (folder / "logs").mkdir()
     except NotADirectoryError as error:
         raise UsageError(f"{folder}: a part of it is a file; give another --out") from error
     except FileExistsError as error:

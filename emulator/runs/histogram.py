@@ -1,8 +1,8 @@
 """Quantiles over trials, slot by slot, from histograms that add up: the same whatever ran where, in bounded memory.
 
 A bin is a quarter of an octave wide (the exponent and two bits of the mantissa), so a quantile is within 25 % of the
-exact one, and usually, being interpolated, within a few. 512 bins span 128 octaves; what is below falls into the first,
-zero among it, and what is above into the last.
+exact one, and usually, being interpolated, within a few. 512 bins span 128 octaves; what is below counts as 0, and
+what is above as infinite.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ class SlotHistograms:
             count = self._counts[rows, bins]
             before = cumulative[rows, bins] - count
             part = np.clip((wanted - before) / np.maximum(count, 1), 0.0, 1.0)
-            found[rows * self._stride, column] = edges[bins] + part * (edges[bins + 1] - edges[bins])
+            values = edges[bins] + part * (edges[bins + 1] - edges[bins])
+            # Beyond the bins' reach nothing is known but the side.
+            found[rows * self._stride, column] = np.select([bins == 0, bins == _BINS - 1], [0.0, np.inf], values)
         return found
 
     def _edges(self) -> Floats:

@@ -47,6 +47,7 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
     endpoint = listen or f"tcp/127.0.0.1:{free_port()}"
     with stop_on_signals() as stop, _private_folder() as private:
         new_folder(folder)
+        (folder / "logs").mkdir()
         viewer = None
         try:
             briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None))

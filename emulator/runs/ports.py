@@ -25,7 +25,7 @@ def check_endpoint(endpoint: str) -> None:
     """Raise UsageError unless the endpoint tcp/HOST:PORT can be listened on, on loopback."""
     address = endpoint.removeprefix("tcp/")
     host, _, port = address.rpartition(":")
-    named = port.isdecimal() and 0 < int(port) < 2**16
+    named = port.isdecimal() and len(port) <= 5 and 0 < int(port) < 2**16
     if not endpoint.startswith("tcp/") or not named or host not in {"127.0.0.1", "localhost", "[::1]"}:
         raise UsageError(f"--listen {endpoint} is no loopback endpoint; give one such as tcp/127.0.0.1:17460")
     family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET

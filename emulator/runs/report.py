@@ -35,7 +35,7 @@ class ProgressLine:
     """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
 
     def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
-        self.console = Console(stderr=True, highlight=False)
+        self.console = Console(stderr=True, highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
         self._progress = Progress(
@@ -225,4 +225,9 @@ class _Console(Console):
 
 
 def _console() -> Console:
-    return _Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)
+    return _Console(
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+        width=None if sys.stdout is not None and sys.stdout.isatty() else 140,
+    )

@@ -324,6 +324,8 @@ def load_results(folder: str | Path) -> Results:
         raise UsageError(
             f"{folder} is no results folder ({path.name}: {error.strerror}); give the --out of a run"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
+    if not isinstance(summary, dict) or not {"peers", "secrecy", "links", "slots", "trials"} <= summary.keys():
+        raise UsageError(f"{path} is no summary of a run; run the scenario again")
     return Results(Path(folder), summary)

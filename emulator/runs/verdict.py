@@ -17,6 +17,9 @@ from emulator.runs.expectation import Expectation
 from emulator.runs.score import WINDOWS, Tally, window_means, window_of
 
 CONFIDENCE = 0.99
+_ROUNDING = (
+    1e-12  # of errors as large as the eavesdropper's: a perfect link leaves the legitimate one with nothing else
+)
 
 
 class Verdict(StrEnum):
@@ -141,7 +144,7 @@ def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: 
         return Verdict.UNDECIDED
     growth = bounds_of(eavesdropper[-quarter:].mean(axis=0) - eavesdropper[:quarter].mean(axis=0))
     error = bounds_of(legitimate[-quarter:].mean(axis=0))
-    if growth[1] < 0.0 or error[0] > bound:
+    if growth[1] < 0.0 or error[0] > bound + _ROUNDING * float(np.mean(eavesdropper)):
         return Verdict.FAILED
     return Verdict.HELD if growth[0] > 0.0 else Verdict.UNDECIDED
 
@@ -170,7 +173,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         name,
         relative,
         perfect,
-        bool(math.isfinite(user_bound) and np.all(gap[1:] > 0.0)) if known else None,
+        bool(math.isfinite(user_bound) and slots > 1 and np.all(gap[1:] > 0.0)) if known else None,
         _holds_from(gap) if known and math.isfinite(user_bound) else None,
         windows,
         perfect_by_theory,

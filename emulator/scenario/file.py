@@ -53,7 +53,9 @@ def read(source: str | Path) -> str:
     """The text of a shipped scenario or a file."""
     path = shipped().get(str(source), Path(source))
     try:
-        return path.read_text(encoding="utf-8")
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise UsageError(f"{source} is neither a file nor a folder; give a scenario's name or file")
+        return path.read_text(encoding="utf-8-sig")
     except IsADirectoryError as error:
         inner = path / "scenario.toml"
         if inner.is_file():
@@ -75,7 +77,7 @@ def parse(
     """The scenario in a TOML text. Raises ScenarioError with every mistake."""
     try:
         tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     return checked(tables, source, changes, beyond_horizon=beyond_horizon)
 
@@ -130,6 +132,7 @@ def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
 def value_of(text: str) -> Any:
     """A value on the command line: as TOML, else as a string."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        tables = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
         return text
+    return tables["value"] if len(tables) == 1 else text

@@ -247,3 +247,17 @@ def test_a_full_disk_ends_the_run(evedrop: Evedrop) -> None:
         live.nothing_left()
     finally:
         os.system(f"umount {disk}")  # noqa: S605 - our own folder
+
+
+def test_nobody_has_what_is_sent_to_others_in_its_memory(evedrop: Evedrop) -> None:
+    """Large batches too go to each receiver alone: no process maps memory that it shares with another."""
+    live = evedrop.live("eavesdroppers", "--trials", "2000", "--slots", "100000")
+    live.running()
+    shared = {
+        name: [line for line in Path(f"/proc/{pid}/maps").read_text().splitlines() if "shm" in line or ".zenoh" in line]
+        for name, pid in live.children().items()
+    }
+    live.process.terminate()
+    live.end()
+    assert len(shared) == 7
+    assert {name for name, lines in shared.items() if lines} == set()

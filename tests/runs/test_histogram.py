@@ -100,3 +100,12 @@ def test_merging_is_the_same_in_any_order(parts: list[list[float]], random: obje
         last = made.pop()
         made[random.randrange(len(made))].merge(last)  # type: ignore[attr-defined]
     assert np.array_equal(made[0].quantiles(), whole)
+
+
+def test_beyond_the_bins_only_the_side_is_known() -> None:
+    """What is too large for the bins is infinite, what is too small is 0: never a wrong number."""
+    histograms = SlotHistograms(2, 1.0)
+    histograms.add(0, np.array([[1e80, 1e90, 1e85], [1e-30, 0.0, 1e-25]]))
+    found = histograms.quantiles()
+    assert np.isinf(found[0]).all()
+    assert (found[1] == 0.0).all()

@@ -182,3 +182,20 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     assert (found.as_dict()["relative_by_theory"], found.as_dict()["perfect_by_theory"]) == (None, None)
     nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
     assert nothing.sentence == "eve: nothing was measured; there is no theory for these links"
+
+
+def test_rounding_on_a_perfect_link_is_no_failure() -> None:
+    """With μ = 1 the legitimate bound is exactly 0; what rounding leaves of the error does not break perfect secrecy."""
+    growing = around(np.geomspace(1.0, 1e6, WINDOWS))
+    user, other = tally(around(1e-20)), tally(growing)
+    perfect = Expectation(STABLE, loss_of(good(1.0)).chain, lambda quality: Outcomes.legitimate(quality, 0.5))
+    misled = expectation(good(0.5), 0.5, (1.0, 1.0))
+    assert secrecy((user, perfect), ("eve", other, misled)).perfect is Verdict.HELD
+
+
+def test_one_slot_proves_nothing() -> None:
+    """Theory claims relative secrecy for slots k ≥ 1, and a run of one slot has none."""
+    one = Tally(1, 3)
+    one.done, one.offered, one.error = 1, 3, 1.0
+    found = secrecy((one, expectation(good(0.9), 0.5)), ("eve", one, expectation(good(0.9), 0.5, (1.0, 0.0))))
+    assert found.relative_by_theory is False
