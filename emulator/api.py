@@ -97,8 +97,8 @@ def design(
     from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
-    if max_trace is not None and not (math.isfinite(max_trace) and max_trace > 0.0):
-        raise UsageError(f"--max-trace {max_trace:g}: expected a finite number above 0")
+    if max_trace == math.inf:
+        raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
     for name in made.receivers:
         chain = made.link(name).model.chain
         if chain is None or not chain.independent:
