@@ -34,7 +34,10 @@ def _transport() -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
     # Shared memory would put what the router sends to one receiver into the memory of all.
-    return {"link": {"tx": {"queue": {"congestion_control": wait}}}, "shared_memory": {"enabled": False}}
+    return {
+        "link": {"tx": {"queue": {"congestion_control": wait}}, "rx": {"buffer_size": 1 << 20}},
+        "shared_memory": {"enabled": False},
+    }
 
 
 def client_config(brief: Brief) -> dict[str, Any]:
