@@ -186,7 +186,7 @@ def main(quick: bool) -> None:
     rounds = 1 if quick else 3
     start_up(rounds)
     throughput(5_000 if quick else 20_000, 1, rounds)
-    throughput(500 if quick else 3_000, 1000, rounds)
+    throughput(500 if quick else 8_000, 1000, rounds)
     latency(1_000 if quick else 3_000, rounds)
     memory(20_000 if quick else 200_000)
 
