@@ -132,7 +132,7 @@ def attacking(stage: Bench, mode: str) -> Iterator[zenoh.Session]:
 
 
 def assert_heard(stage: Bench, attacker: zenoh.Session) -> None:
-    """What the attacker may put arrives, so the router has dealt with all that it put before."""
+    """What the attacker may put arrives, so the router has dealt with all that it put and asked for before."""
     block = zenoh.CongestionControl.BLOCK
     attacker.put(stage.keys.progress(EVE), b"mine", congestion_control=block)
     attacker.put(stage.keys.telemetry(EVE), b"mine", congestion_control=block)
@@ -148,6 +148,9 @@ def test_wildcard_alone_hears_nothing(key: str, stage: Bench) -> None:
         ear, own = Ear(), Ear()
         attacker.declare_subscriber(key, ear)
         control.declare_subscriber(stage.keys.downlink(EVE), own)
+        for session in (attacker, control):
+            assert_heard(stage, session)
+        ear.all()  # what the attacker itself has just put
         talk(stage)
         own.hear()
         assert ear.all() == []
@@ -185,6 +188,7 @@ def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
         seen = {stage.tokens.hear()[0] for _ in PROCESSES}
         assert seen == set(alive.values())
         attacker.declare_subscriber(stage.keys.downlink(EVE), control)
+        assert_heard(stage, attacker)
         flow(stage)
         control.hear()
         assert ear.all() == []
