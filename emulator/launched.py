@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import threading
 from collections.abc import Callable
 
@@ -17,3 +18,10 @@ def when_launcher_is_gone(then: Callable[[], None]) -> None:
         then()
 
     threading.Thread(target=wait, name="launcher-watch", daemon=True).start()
+
+
+def launcher_is_gone() -> bool:
+    """Whether the other end of standard input, a pipe, is closed: known at once, whichever thread is scheduled."""
+    poll = select.poll()
+    poll.register(0, 0)
+    return bool(poll.poll(0))

@@ -137,9 +137,9 @@ def test_without_permission_nothing_is_started(evedrop: Evedrop) -> None:
 def test_a_folder_that_may_only_be_read_can_be_worked_in(evedrop: Evedrop) -> None:
     """The current folder is written to only where no --out is given, and then the refusal is one line."""
     where = unwritable(evedrop.folder)
-    done = evedrop("run", "eavesdroppers", *QUICK, "--out", str(evedrop.folder / "x"), cwd=where)
+    done = evedrop.process("run", "eavesdroppers", *QUICK, "--out", str(evedrop.folder / "x"), cwd=where)
     assert done.status == 0
-    refused(evedrop("run", "eavesdroppers", *QUICK, cwd=where), "cannot be written (")
+    refused(evedrop.process("run", "eavesdroppers", *QUICK, cwd=where), "cannot be written (")
 
 
 def test_two_runs_at_once_do_not_meet(evedrop: Evedrop) -> None:
@@ -259,7 +259,7 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
 def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:
     """`evedrop list | head -1`: no traceback."""
     with subprocess.Popen(["head", "-c", "1"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as reader:
-        done = evedrop("list", stdout=reader.stdin)
+        done = evedrop.process("list", stdout=reader.stdin)
         assert reader.stdin is not None
         reader.stdin.close()
     assert (done.status, done.err) == (0, "")

@@ -21,7 +21,9 @@ from emulator.errors import RunError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
 
 News = Mapping[str, Any]
-GRACE_SECONDS = 3.0  # for the observer to begin to write what there is, and for the others to leave
+GRACE_SECONDS = 3.0  # for everybody to leave
+_BEGIN_SECONDS = 10.0  # for the observer to begin to write what there is
+_GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
 _FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
@@ -145,7 +147,7 @@ class Children:
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
         ending: News | None = None
-        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else GRACE_SECONDS):
+        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS):
             news = self.news(0.05)
             if isinstance(news, Exit):
                 if news.process == OBSERVER:
@@ -193,7 +195,7 @@ class Children:
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
         """A child that failed, or left too early; never the observer. Who is missed is given a moment to be gone."""
-        deadline = time.monotonic() + (GRACE_SECONDS / 2 if suspects else 0.0)
+        deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
             ended = {name: process.poll() for name, process in self._processes.items() if name != OBSERVER}
             for name, status in ended.items():

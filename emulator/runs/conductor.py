@@ -18,15 +18,17 @@ _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 class Stop:
     """Set by a signal: the run must end now. Final."""
 
-    def __init__(self) -> None:
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
+        """orphaned: whether the launcher is gone, which asks for the end too."""
+        self._orphaned = orphaned
         self.wanted = False
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the end was asked for, or is within so many seconds."""
         deadline = time.monotonic() + patience
-        while not self.wanted and time.monotonic() < deadline:
+        while not (asked := self.wanted or self._orphaned()) and time.monotonic() < deadline:
             time.sleep(0.01)
-        if self.wanted:
+        if asked:
             raise Interrupted("interrupted; what was measured is in the results folder")
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from emulator.brief import Brief
 from emulator.errors import EvedropError, Interrupted, RunError
-from emulator.launched import when_launcher_is_gone
+from emulator.launched import launcher_is_gone, when_launcher_is_gone
 from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
 from emulator.network.session import Session
 from emulator.runs.conductor import Conductor, Stop
@@ -41,7 +41,7 @@ _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 def observe(brief: Brief) -> int:
     """Run the observer of a brief; the exit status of the run."""
-    stop = Stop()
+    stop = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     if brief.ends_with_stdin:

@@ -22,7 +22,7 @@ from emulator.runs.trials import BatchResult, Task, carry_out
 
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
-_REACH_SECONDS = 5
+_REACH_SECONDS = 5.0
 
 Tell = Callable[[int], None]
 Stopped = Callable[[], bool]
@@ -65,9 +65,12 @@ class _Worker:
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
             )
+        except OSError as error:
+            self.pipe.close()
+            raise RunError(f"no worker process can be started ({error}); try fewer --workers") from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        theirs.close()
+            theirs.close()
 
     def give(self, number: int, task: Task) -> None:
         self.number = number
@@ -179,7 +182,7 @@ def connected(scheduler: str | None) -> Iterator[Any]:
         client = Client(scheduler, timeout=_REACH_SECONDS, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS} s; start one with "
+            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS:g} s; start one with "
             "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
         ) from error
     with contextlib.closing(client):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from bench import Ear, connect, until
+from bench import LIMIT_SECONDS, Ear, connect, until
 
 from emulator import montecarlo
 from emulator.brief import Brief, read_brief
@@ -177,7 +177,7 @@ def attack(folder: Path) -> Evidence:
         counts = {key: Ear() for key in meant}
         for key, name in meant.items():
             stack.enter_context(connect(briefs[name])).declare_subscriber(key, counts[key])
-        until(lambda: all(not ear.messages.empty() for ear in counts.values()), "the run to flow", 30)
+        until(lambda: all(not ear.messages.empty() for ear in counts.values()), "the run to flow")
         refused = []
         for name, user, password in (("none", "", ""), ("wrong password", "eve", "guess"), ("no user", "trudy", "x")):
             auth = {"auth": {"usrpwd": {"user": user, "password": password}}} if user else {}
@@ -204,7 +204,7 @@ def attack(folder: Path) -> Evidence:
             for name, pid in found.items()
         }
         run.send_signal(signal.SIGTERM)
-        output, _ = run.communicate(timeout=30)
+        output, _ = run.communicate(timeout=LIMIT_SECONDS)
     for name, trace in traces.items():
         trace["log"] = (out / "logs" / f"{name}.log").read_bytes()
     return Evidence(scenario, out, briefs, traces, overheard, heard, refused, run.returncode, output)

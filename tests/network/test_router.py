@@ -9,7 +9,7 @@ from collections.abc import Callable
 import msgpack
 import numpy as np
 import pytest
-from bench import Bench
+from bench import LIMIT_SECONDS, Bench
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from emulator.network import wire
@@ -60,7 +60,7 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
     stage.put("observer", stage.keys.control("router"), wire.control("end"))
-    assert stage.router.wait(20) == 0
+    assert stage.router.wait(LIMIT_SECONDS) == 0
     assert stage.log.read_text() == ""
 
 
@@ -99,7 +99,7 @@ def test_bad_packet_ends_the_router(name: str, bench: Callable[..., Bench]) -> N
     stage = bench()
     for message in messages:
         stage.put("sensor", stage.keys.uplink, message)
-    assert stage.router.wait(20) == 3
+    assert stage.router.wait(LIMIT_SECONDS) == 3
     text = stage.log.read_text()
     assert re.search(line, text), text
     assert "Traceback" not in text
@@ -111,7 +111,7 @@ def test_nothing_of_a_bad_packet_is_delivered(bench: Callable[..., Bench]) -> No
     stage = bench()
     for message in (GOOD, GOOD):
         stage.put("sensor", stage.keys.uplink, message)
-    assert stage.router.wait(20) == 3
+    assert stage.router.wait(LIMIT_SECONDS) == 3
     assert stage.tokens.hear()[0].startswith("deleted")
     for ear in stage.downlinks.values():
         ear.hear()

@@ -23,6 +23,7 @@ from emulator.runs.ports import free_port
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
 from emulator.streams import Batch
+from tests.conftest import LIMIT
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
 THREE_STATES = {
@@ -116,7 +117,7 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
                 )
             )
             stack.callback(running[name].kill)
-        said = {name: process.communicate(timeout=40)[0] for name, process in running.items()}
+        said = {name: process.communicate(timeout=LIMIT)[0] for name, process in running.items()}
         statuses = {name: process.returncode for name, process in running.items()}
     assert set(statuses.values()) <= {0, 1}, (statuses, said)
     digest = montecarlo(scenario, trials=2, out=tmp_path / "memory").summary["peers"]["legitimate"]["digest"]

@@ -26,6 +26,7 @@ from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
 from peers.legitimate import estimate
 from peers.sensor import Window, sense
+from tests.conftest import LIMIT
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
 
@@ -105,7 +106,7 @@ class FakeSession:
         queue = self._stage.inboxes.setdefault(key, SimpleQueue())
 
         def recv() -> Any:
-            payload = queue.get(timeout=20)
+            payload = queue.get(timeout=LIMIT)
             return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
 
         return SimpleNamespace(recv=recv)
@@ -123,7 +124,7 @@ class FakeSession:
 
     def wait_for(self, command: str) -> None:
         """Until the test commands it."""
-        while self._stage.commands.get(timeout=20) != command:
+        while self._stage.commands.get(timeout=LIMIT) != command:
             pass
 
 
@@ -235,7 +236,7 @@ class Sensing:
 
     def next(self) -> tuple[str, bytes]:
         """What it puts next."""
-        return self.stage.put.get(timeout=20)
+        return self.stage.put.get(timeout=LIMIT)
 
     def packets(self, first: int, end: int) -> None:
         """It sends exactly these packets, with its telemetry at the ends of batches, and nothing more."""
@@ -273,8 +274,8 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     sensing.progress("observer", SLOTS)
     sensing.packets(WINDOW + 20, SLOTS)
     stage.commands.put("end")
-    sensing.thread.join(20)
-    assert stage.put.get(timeout=20) == ("closed", b"")
+    sensing.thread.join(LIMIT)
+    assert stage.put.get(timeout=LIMIT) == ("closed", b"")
     assert stage.put.empty()
 
 
