@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, TypeVar
 
 from emulator import commands
-from emulator.errors import EvedropError, Interrupted, UsageError
+from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 
 Command = Callable[[argparse.Namespace], int]
+T = TypeVar("T")
+
+_OUTPUT = "standard output"
 
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
@@ -22,25 +26,71 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     command: Command = options.command
     try:
-        status = command(options)
-        if sys.stdout is not None:  # a shell may have closed it
-            sys.stdout.flush()
+        with _named_output():
+            status = command(options)
+            if sys.stdout is not None:  # a shell may have closed it
+                sys.stdout.flush()
         return status
     except EvedropError as error:
+        _finish()
         print(f"evedrop: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
+        _finish()
         return Interrupted.exit_status
-    except BrokenPipeError:
-        _silence()
-        return 0
     except OSError as error:
-        _silence()
-        print(
-            f"evedrop: {error.filename or 'standard output'}: {error.strerror}; free some room, or look at its rights",
-            file=sys.stderr,
-        )
+        if error.filename == _OUTPUT:
+            _silence()
+        if isinstance(error, BrokenPipeError) and error.filename == _OUTPUT:
+            return 0
+        if error.filename is None:
+            print(f"evedrop: {error}; free what the system lacks and try again", file=sys.stderr)
+            return RunError.exit_status
+        print(f"evedrop: {error.filename}: {error.strerror}; free some room, or look at its rights", file=sys.stderr)
         return UsageError.exit_status
+
+
+@contextlib.contextmanager
+def _named_output() -> Iterator[None]:
+    """Have errors of standard output say that they are: no other may be taken for one."""
+    if sys.stdout is None:
+        yield
+    else:
+        with contextlib.redirect_stdout(_Named(sys.stdout, _OUTPUT)):
+            yield
+
+
+class _Named:
+    """A stream whose errors have a file name. Final."""
+
+    def __init__(self, stream: TextIO, name: str) -> None:
+        self._stream = stream
+        self._name = name
+
+    def write(self, text: str) -> int:
+        return self._tried(lambda: self._stream.write(text))
+
+    def flush(self) -> None:
+        self._tried(self._stream.flush)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _tried(self, act: Callable[[], T]) -> T:
+        try:
+            return act()
+        except OSError as error:
+            error.filename = self._name
+            raise
+
+
+def _finish() -> None:
+    """Write what is left for standard output; nobody need take it, for something else has gone wrong."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        _silence()
 
 
 def _silence() -> None:

@@ -6,6 +6,7 @@ Every import of weight waits for the command that needs it, so that `evedrop --h
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shlex
 import signal
@@ -75,7 +76,8 @@ def run(options: argparse.Namespace) -> int:
         try:
             ended = launch(scenario, folder, options.view, options.listen, line.tell)
         except (RunError, Interrupted):
-            _print_results(folder, options.json)
+            with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
+                _print_results(folder, options.json)
             raise
     _print_results(folder, options.json)
     if ended.viewer is not None:
@@ -152,7 +154,8 @@ def montecarlo(options: argparse.Namespace) -> int:
         try:
             status = simulate(scenario, folder, line.tell, plan)
         except Interrupted:
-            _print_results(folder, options.json)
+            with contextlib.suppress(OSError):  # as above
+                _print_results(folder, options.json)
             raise
     _print_results(folder, options.json)
     return status

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import socket
@@ -263,6 +264,44 @@ def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:
         assert reader.stdin is not None
         reader.stdin.close()
     assert (done.status, done.err) == (0, "")
+
+
+def test_an_output_that_cannot_be_written_is_named(evedrop: Evedrop) -> None:
+    """A full disk behind standard output: one line that says so, exit 2."""
+    with Path("/dev/full").open("w") as full:
+        done = evedrop.process("list", stdout=full)
+    assert (done.status, done.err.count("\n")) == (2, 1)
+    assert done.err.startswith("evedrop: standard output: No space left on device; ")
+
+
+def test_other_errors_of_the_system_are_not_blamed_on_the_output(
+    evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What fails within a study is said as it is, exit 3."""
+    from emulator.runs import sweep
+
+    def fail(_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(sweep, "new_folder", fail)
+    done = evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", "--trials", "2", "--slots", "5", "--out", "x")
+    assert (done.status, done.out) == (3, "")
+    assert done.err == "evedrop: [Errno 24] Too many open files; free what the system lacks and try again\n"
+
+
+@pytest.mark.parametrize("reader", ["/dev/full", "gone"])
+def test_an_interrupt_stays_one_whoever_reads(evedrop: Evedrop, reader: str) -> None:
+    """Ctrl-C also ends who stands behind the pipe; that our closing table cannot be written changes nothing."""
+    ends = os.pipe()
+    os.close(ends[0])
+    with Path("/dev/full").open("w") if reader == "/dev/full" else os.fdopen(ends[1], "w") as output:
+        study = ("montecarlo", "eavesdroppers", "--slots", "400000", "--trials", "500", "--workers", "1")
+        live = evedrop.started(*study, stdout=output)
+        live.running()
+        live.process.terminate()
+        done = live.end()
+    assert done.status == 130
+    assert done.err == "evedrop: interrupted; what was done is in the results folder\n"
 
 
 def test_a_title_is_text(evedrop: Evedrop) -> None:

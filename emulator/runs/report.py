@@ -220,8 +220,8 @@ def _number(value: float) -> str:
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Whoever reads our output may leave; that is no failure of ours."""
-        raise BrokenPipeError
+        """Whoever reads our output may leave; that is no failure of ours, and cli.py knows what to do."""
+        raise  # noqa: PLE0704 - rich calls this where it has caught the error
 
 
 def _console() -> Console:

@@ -287,17 +287,27 @@ class Results:
     folder: Path
     summary: Mapping[str, Any]
 
-    def _table(self, name: str) -> pa.Table:
+    def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
         path = self.folder / f"{name}.parquet"
         try:
-            return pq.read_table(path)
-        except (OSError, pa.ArrowInvalid) as error:
-            raise UsageError(f"{path} cannot be read ({error}); run the scenario again") from error
+            table = pq.read_table(path)
+        except (OSError, pa.ArrowException) as error:
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+        wanted = _trials_schema(_states_in(table.schema)) if expected is None else expected
+        if not table.schema.equals(wanted):
+            other = [field.name for field in wanted if field not in table.schema] or table.schema.names
+            raise UsageError(
+                f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
+            )
+        empty = [name for name in table.column_names if name not in _NULLABLE and table[name].null_count]
+        if empty:
+            raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
+        return table
 
     @property
     def slots(self) -> pa.Table:
         """A row per slot and peer: statistics over trials."""
-        return self._table("slots")
+        return self._table("slots", SLOTS)
 
     @property
     def trials(self) -> pa.Table:
@@ -307,12 +317,22 @@ class Results:
     @property
     def journal(self) -> pa.Table:
         """A row per slot and link."""
-        return self._table("journal")
+        return self._table("journal", JOURNAL)
 
     @property
     def digests(self) -> pa.Table:
         """A row per peer, trial and block of 256 slots."""
-        return self._table("digests")
+        return self._table("digests", DIGESTS)
+
+
+def _states_in(schema: pa.Schema) -> int:
+    """The number of states in a table of trials, as far as it is one."""
+    x = schema.field("x").type if "x" in schema.names else None
+    return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def load_results(folder: str | Path) -> Results:
@@ -326,6 +346,7 @@ def load_results(folder: str | Path) -> Results:
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
-    if not isinstance(summary, dict) or not {"peers", "secrecy", "links", "slots", "trials"} <= summary.keys():
+    parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
+    if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
         raise UsageError(f"{path} is no summary of a run; run the scenario again")
     return Results(Path(folder), summary)

@@ -69,6 +69,28 @@ def test_missing_driver_is_named(
         picture(rrd, tmp_path / "r.png")
 
 
+BROKEN: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda _: b"",
+    "not a recording": lambda _: b"nonsense" * 100,
+    "cut short": lambda whole: whole[: len(whole) // 2],
+    "damaged": lambda whole: whole[:2000] + bytes(500) + whole[2500:],
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_recording_is_said_before_a_viewer_is_started(
+    what: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line with the file, what is wrong and a remedy; the viewer would wait for ever."""
+    monkeypatch.setattr("emulator.view.picture.spawn", lambda *_, **__: pytest.fail("a viewer was started"))
+    rrd = recorded(simulated(60), tmp_path / "r.rrd")
+    rrd.write_bytes(BROKEN[what](rrd.read_bytes()))
+    with pytest.raises(UsageError, match="is broken") as told:
+        picture(rrd, tmp_path / "r.png")
+    assert str(told.value).startswith(f"{rrd} is broken (")
+    assert "\n" not in str(told.value)
+
+
 def test_missing_recording_is_named(tmp_path: Path) -> None:
     """A recording that is not there is a mistake of the user's, and told so."""
     with pytest.raises(UsageError, match="does not exist"):
