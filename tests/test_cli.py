@@ -50,22 +50,25 @@ def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["run", "montecarlo"])
-def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str) -> None:
-    """Standard output is the summary of summary.json; standard error is silent."""
+@pytest.mark.parametrize(("command", "below", "status"), [("run", "1e-9", 1), ("montecarlo", "0.01", 0)])
+def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str, below: str, status: int) -> None:
+    """Standard output is the summary of summary.json; standard error is silent; the status tells of expectations."""
     view = ("--view", "off") if command == "run" else ()
-    done = evedrop(command, "eavesdroppers", "--slots", "40", "--trials", "2", *view, "--json", "--out", "here")
-    assert (done.status, done.err) == (0, "")
+    expected = ("--set", f"expect.0.below={below}")
+    done = evedrop(
+        command, "eavesdroppers", "--slots", "40", "--trials", "2", *view, *expected, "--json", "--out", "here"
+    )
+    assert (done.status, done.err) == (status, "")
     assert done.out.count("\n") == 1
     assert done.summary == load_results(evedrop.folder / "here").summary
     assert done.summary["trials"] == 2
+    assert done.summary["expectations"][0]["held"] is (status == 0)
 
 
-@pytest.mark.parametrize("command", ["run", "montecarlo"])
-def test_a_failed_expectation_is_exit_1(evedrop: Evedrop, command: str) -> None:
-    """The run is whole, and what did not hold is printed with what was found."""
-    view = ("--view", "off") if command == "run" else ("--trials", "1")
-    done = evedrop(command, "eavesdroppers", "--slots", "40", *view, "--set", "expect.0.below=1e-9", "--out", "here")
+def test_a_failed_expectation_is_exit_1(evedrop: Evedrop) -> None:
+    """The study is whole, and what did not hold is printed with what was found."""
+    changes = ("--slots", "40", "--trials", "1", "--set", "expect.0.below=1e-9")
+    done = evedrop("montecarlo", "eavesdroppers", *changes, "--out", "here")
     assert (done.status, done.err) == (1, "")
     assert "expected legitimate.mean_squared_error below 1e-09: FAILED, found" in done.out
     assert load_results(evedrop.folder / "here").summary["expectations"][0]["held"] is False

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from emulator.view.figures import Size
 from tests.conftest import Evedrop
 
 LOW = 0.534206
@@ -136,21 +135,6 @@ def test_the_least_choice_is_in_the_json_if_asked_for(evedrop: Evedrop) -> None:
 def test_a_run_of_any_length_can_be_designed(evedrop: Evedrop) -> None:
     """More slots than float64 can follow are no obstacle to theory."""
     assert designed(evedrop, "numerical", *changes(slots=20000))["rho"] == pytest.approx(1.387799, abs=1e-6)
-
-
-def test_figures_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """A small set by the command: four pictures, figures.md, and its path on standard output."""
-    from emulator import cli
-    from emulator.view import figures
-
-    small = Size(microgrid_trials=5, microgrid_slots=200, strategy_trials=500, chain_trials=10, chain_slots=100)
-    monkeypatch.setattr(figures, "Size", lambda **_: small)
-    assert cli.main(["figures", str(tmp_path / "out")]) == 0
-    told = capsys.readouterr()
-    assert told.out.strip() == str(tmp_path / "out" / "figures.md")
-    names = {"numerical", "microgrid", "strategies", "chain"}
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {"figures.md", *(f"{name}.{kind}" for name in names for kind in ("png", "pdf"))}
 
 
 def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:

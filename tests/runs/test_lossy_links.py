@@ -65,14 +65,19 @@ def memory(every_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Resul
     return montecarlo(every_model, trials=7, out=tmp_path_factory.mktemp("memory") / "run")
 
 
+@pytest.fixture(scope="module")
+def live(every_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """The same seven trials in processes."""
+    return run(every_model, trials=7, out=tmp_path_factory.mktemp("live") / "run")
+
+
 def test_every_model_is_in_the_scenario() -> None:
     """A new loss model must be added here."""
     assert set(LOSSES) == set(LOSS_MODELS)
 
 
-def test_live_and_memory_are_the_same_bits(every_model: Path, memory: Results, tmp_path: Path) -> None:
+def test_live_and_memory_are_the_same_bits(live: Results, memory: Results) -> None:
     """Every loss model gives one digest, in processes and in memory, and every packet is accounted for."""
-    live = run(every_model, trials=7, out=tmp_path / "live")
     assert {name: peer["digest"] for name, peer in live.summary["peers"].items()} == {
         name: peer["digest"] for name, peer in memory.summary["peers"].items()
     }
@@ -140,14 +145,13 @@ def test_bursts_that_last_too_long_are_a_warning() -> None:
     assert warnings_of(Scenario.model_validate(scenario())) == []
 
 
-def test_the_view_survives_where_there_is_no_theory(every_model: Path, tmp_path: Path) -> None:
-    """A recording and a replayed one of a run in which one receiver's expected trace is nowhere."""
+def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
+    """A replayed recording of a run in which one receiver's expected trace is nowhere."""
     from rerun.chunk import RrdReader
 
     from emulator.view.replay import replay
 
-    live = run(every_model, slots=40, out=tmp_path / "live")
     shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
     assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown
     assert "/theory/pattern" not in shown
-    assert live.slots["expected_trace_covariance"].null_count == 40
+    assert live.slots["expected_trace_covariance"].null_count == 300

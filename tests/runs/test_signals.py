@@ -8,10 +8,15 @@ import pytest
 
 from emulator.errors import Interrupted
 from emulator.runs.conductor import Stop
+from emulator.runs.signals import stop_on_signals
 
 
 def test_what_is_ignored_from_birth_stays_ignored() -> None:
-    """Under nohup a hang-up does not stop a study; Ctrl-C and SIGTERM do."""
+    """Under nohup a hang-up does not stop a study; Ctrl-C, SIGTERM and otherwise a hang-up do."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        with stop_on_signals() as stop:
+            signal.raise_signal(number)
+            assert stop.is_set()
     code = (
         "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "from emulator.runs.signals import stop_on_signals\n"
