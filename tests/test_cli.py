@@ -8,7 +8,9 @@ import os
 import re
 import socket
 import subprocess
+import tomllib
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -180,6 +182,25 @@ def test_a_secret_of_its_own_changes_the_schedule_alone(evedrop: Evedrop) -> Non
     assert "has 31 bytes; expected 32 or more" in done.err
 
 
+def test_a_scenario_names_a_secret_in_its_own_folder(evedrop: Evedrop) -> None:
+    """A relative path is seen from the scenario, in a change from the current folder; results run again from anywhere."""
+    inner, elsewhere = evedrop.folder / "inner", evedrop.folder / "elsewhere"
+    for folder, secret in ((inner, b"1" * 32), (elsewhere, b"2" * 32)):
+        folder.mkdir()
+        (folder / "secret.bin").write_bytes(secret)
+    text = (Path(str(resources.files("scenarios"))) / "eavesdroppers.toml").read_text()
+    (inner / "mine.toml").write_text(f'secret_file = "secret.bin"\n{text}')
+    base = ("montecarlo", "inner/mine.toml", "--slots", "20", "--trials", "1", "--json", "--out")
+    first = evedrop(*base, "a").summary
+    stored = tomllib.loads((evedrop.folder / "a" / "scenario.toml").read_text())
+    assert stored["secret_file"] == str(inner / "secret.bin")
+    again = Evedrop(elsewhere)("montecarlo", "../a", "--trials", "1", "--json", "--out", "again").summary
+    changed = evedrop(*base, "b", "--set", "secret_file=elsewhere/secret.bin").summary
+    found = [{peer["digest"] for peer in one["peers"].values()} for one in (first, again, changed)]
+    assert found[0] == found[1]
+    assert found[0].isdisjoint(found[2])
+
+
 def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:
     """0 for equal runs, 1 for a difference, 2 for what is no run."""
     base = ("montecarlo", "eavesdroppers", "--slots", "30", "--trials", "1", "--out")
@@ -258,6 +279,18 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
     refused(evedrop("sensor", "briefs/nobody.json"), "No such file")
     (evedrop.folder / "briefs" / "smart.json").chmod(0o644)
     refused(evedrop("eavesdropper", "briefs/smart.json"), "readable by others")
+
+
+def test_an_observer_that_cannot_write_says_so(evedrop: Evedrop) -> None:
+    """Started by hand, with a file where its results should go: one line with the place, exit 3."""
+    assert evedrop("brief", "numerical", "--out", "briefs", "--results", "results").status == 0
+    (evedrop.folder / "results").rmdir()
+    (evedrop.folder / "results").touch()
+    done = evedrop.process("observer", "briefs/observer.json")
+    assert done.status == 3
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: the results cannot be written (")
+    assert str(evedrop.folder / "results") in line
 
 
 def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Mapping
@@ -44,6 +45,7 @@ def observe(brief: Brief) -> int:
     stop = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    by_hand = not brief.ends_with_stdin
     if brief.ends_with_stdin:
         when_launcher_is_gone(_end_orphaned)
         brief = replace(brief, ends_with_stdin=False)
@@ -51,6 +53,7 @@ def observe(brief: Brief) -> int:
     observation = Observation(brief, scenario)
     status, how = 0, "complete"
     try:
+        observation.folder.mkdir(parents=True, exist_ok=True)  # on another host than that of the briefs it is not there
         (observation.folder / "scenario.toml").write_text(resolved(scenario))
         with observation.writer():
             try:
@@ -60,11 +63,19 @@ def observe(brief: Brief) -> int:
             finally:
                 tell("finishing")
     except OSError as error:
-        status, how = RunError.exit_status, f"the results cannot be written ({error}); free some room and run again"
+        status, how = RunError.exit_status, _unwritten(error)
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
-    return observation.finish(status, how)
+    status, how = observation.finish(status, how)
+    if by_hand and status not in {0, 1}:
+        print(f"evedrop: {how}", file=sys.stderr)  # noqa: T201 - nobody else says it
+    return status
+
+
+def _unwritten(error: OSError) -> str:
+    """What a summary and a message say of results that could not be written."""
+    return f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again"
 
 
 def _end_orphaned() -> None:
@@ -162,8 +173,8 @@ class Observation:
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
         tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
 
-    def finish(self, status: int, how: str) -> int:
-        """Close the view, write the summary, tell the launcher; the exit status of the run."""
+    def finish(self, status: int, how: str) -> tuple[int, str]:
+        """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
         safe = self._recording.close() if self._recording is not None else True
         digests = {name: digest_of(self._scenario, blocks) for name, blocks in self._joiner.digests.items()}
         summary = summary_of(self._scenario, self._keeper.tallies, digests, Ending(self._ended - self._started, how))
@@ -176,12 +187,12 @@ class Observation:
             write_summary(self.folder, summary)
         except OSError as error:
             status = RunError.exit_status
-            summary["ended"] = f"the results cannot be written ({error}); free some room and run again"
+            summary["ended"] = _unwritten(error)
         view = self._recording.failure if self._recording is not None else None
         tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
         if not safe:
             os._exit(status)
-        return status
+        return status, str(summary["ended"])
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:

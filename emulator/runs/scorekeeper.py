@@ -7,6 +7,7 @@ import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,6 +168,8 @@ def digest_of(scenario: Scenario, blocks: Mapping[int, Digests]) -> str | None:
 def resolved(scenario: Scenario) -> str:
     """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
     tables = scenario.model_dump(mode="json", exclude_none=True)
+    if scenario.secret_file is not None:
+        tables["secret_file"] = str(Path(scenario.secret_file).absolute())
     tables["made_with"] = {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},

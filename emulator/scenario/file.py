@@ -46,7 +46,9 @@ def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond
 
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
-    return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon)
+    path = shipped().get(str(source), Path(source))
+    folder = path if path.is_dir() else path.parent
+    return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def read(source: str | Path) -> str:
@@ -72,13 +74,23 @@ def read(source: str | Path) -> str:
 
 
 def parse(
-    text: str, source: str, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False
+    text: str,
+    source: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    beyond_horizon: bool = False,
+    folder: Path = Path(),
 ) -> Scenario:
-    """The scenario in a TOML text. Raises ScenarioError with every mistake."""
+    """The scenario in a TOML text. Raises ScenarioError with every mistake.
+
+    folder: where the files are that it names; those that a change names are in the current one.
+    """
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
+    if isinstance(tables.get("secret_file"), str):
+        tables["secret_file"] = str((folder / tables["secret_file"]).absolute())
     return checked(tables, source, changes, beyond_horizon=beyond_horizon)
 
 
