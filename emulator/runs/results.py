@@ -28,6 +28,7 @@ from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums
 
 _ROWS = 65_536  # rows of a table held back until they are worth writing
+_BYTES = 16 * 2**20  # the same of wide rows, as a journal's of many trials are; and a row group has no more
 
 SLOTS = pa.schema(
     [
@@ -103,23 +104,27 @@ class _Table:
         self._schema = schema
         self._names = {column: pa.array(words) for column, words in names.items()}
         self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
-        self._rows = 0
+        self._rows = self._bytes = 0
 
     def add(self, columns: Sequence[NDArray[Any]]) -> None:
         """Take rows: an array for each column, codes where it has names, and two dimensions where it holds lists or bytes."""
         for held, column in zip(self._held, columns, strict=True):
             held.append(np.array(column))  # a copy: a view would keep a whole message from being forgotten
+            self._bytes += held[-1].nbytes
         self._rows += len(columns[0])
-        if self._rows >= _ROWS:
+        if self._rows >= _ROWS or self._bytes >= _BYTES:
             self._write()
 
     def _write(self) -> None:
-        if self._rows:
+        whole = [np.concatenate(held) for held in self._held] if self._rows else []
+        at_once = max(1, self._rows * _BYTES // max(1, self._bytes))
+        for first in range(0, self._rows, at_once):
             columns = [
-                self._column(field, np.concatenate(held)) for field, held in zip(self._schema, self._held, strict=True)
+                self._column(field, values[first : first + at_once])
+                for field, values in zip(self._schema, whole, strict=True)
             ]
             self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
-        self._held, self._rows = [[] for _ in self._schema], 0
+        self._held, self._rows, self._bytes = [[] for _ in self._schema], 0, 0
 
     def _column(self, field: pa.Field, values: NDArray[Any]) -> pa.Array:
         if field.name in self._names:
