@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 from emulator.brief import Brief
 from emulator.errors import RunError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
+from emulator.runs.environment import own_environment
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -92,7 +92,12 @@ class Children:
         Raises RunError if the system does not let us.
         """
         conducts = brief.role == "observer"
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        environment = {
+            **own_environment(),
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONUNBUFFERED": "1",
+        }
         if brief.role == "router":
             environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
         try:

@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
 from emulator.errors import RunError, UsageError
+from emulator.runs.environment import own_environment
 from emulator.runs.trials import BatchResult, Task, carry_out
 
 _LOOK_SECONDS = 0.1
@@ -64,6 +65,7 @@ class _Worker:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
+                env=own_environment(),
             )
         except OSError as error:
             self.pipe.close()

@@ -65,6 +65,7 @@ raise SystemExit(main(sys.argv[2:]))
 """  # a run as it is, and a copy of every brief it writes
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
 EVERYBODY = (*PROCESSES, "router", "observer")
+TOKEN = "only-the-launcher-has-this"  # noqa: S105 - an example
 ENOUGH = 20  # messages on each of the keys that are meant to be heard
 
 
@@ -155,7 +156,7 @@ def attack(folder: Path) -> Evidence:
     scenario = load(path)
     options = ["run", str(path), "--view", "off", "--out", str(out)]
     command = [sys.executable, "-c", KEEPING_BRIEFS, str(kept), *options]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST")}
+    environment = {**os.environ, "ACCESS_TOKEN": TOKEN}
     with ExitStack() as stack:
         run = stack.enter_context(
             subprocess.Popen(
@@ -292,6 +293,18 @@ def test_a_process_is_told_neither_seed_nor_others_passwords(name: str, evidence
     others = {other: brief.password for other, brief in evidence.briefs.items() if other not in {name, "router"}}
     known = {other for other, password in others.items() if password.encode() in everything}
     assert known == (set(others) if name == "router" else set())
+
+
+@pytest.mark.parametrize("name", EVERYBODY)
+def test_a_process_is_given_nothing_else_of_the_launchers_environment(name: str, evidence: Evidence) -> None:
+    """A token that the launcher has in its environment reaches nobody; where programs and libraries are does."""
+    traces = evidence.left_behind[name]
+    assert TOKEN.encode() not in b"\n".join(traces.values())
+    given = {entry.partition(b"=")[0] for entry in traces["environment"].split(b"\0") if entry}
+    assert b"PATH" in given
+    named = {b"PATH", b"HOME", b"LANG", b"LANGUAGE", b"TZ", b"TMPDIR", b"VIRTUAL_ENV", b"LD_LIBRARY_PATH"}
+    kinds = (b"LC_", b"PYTHON", b"ZENOH", b"RUST_", b"OMP_", b"OPENBLAS_")
+    assert {entry for entry in given - named if not entry.startswith(kinds)} == set()
 
 
 @pytest.mark.parametrize("name", ["eve", "mallory", "nadia"])

@@ -103,6 +103,17 @@ def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
     no_process_left(live)
 
 
+def test_a_worker_is_given_no_tokens(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the environment of the command it gets what it needs to run, and nothing else."""
+    monkeypatch.setenv("ACCESS_TOKEN", "only the command has this")
+    live, crew = started(evedrop, 2)
+    given = [Path(f"/proc/{pid}/environ").read_bytes() for pid in crew]
+    live.process.terminate()
+    live.end()
+    assert not [one for one in given if b"ACCESS_TOKEN" in one]
+    assert all(b"PATH=" in one for one in given)
+
+
 def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A fault after the first batch: the tables have its trials, the summary says how the study ended."""
     from emulator.api import montecarlo

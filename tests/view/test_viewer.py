@@ -93,6 +93,23 @@ def test_stop_ends_it_and_may_be_repeated(viewer: Viewer) -> None:
 
 
 @LINUX
+def test_a_viewer_is_given_the_screen_and_no_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of our environment it gets what it needs to run and to draw, and nothing else."""
+    for name in ("ACCESS_TOKEN", "VK_EXAMPLE", "LC_EXAMPLE"):
+        monkeypatch.setenv(name, f"of {name}")
+    started = Viewer.start("web", tmp_path)
+    assert started is not None
+    try:
+        given = Path(f"/proc/{started._process.pid}/environ").read_bytes()
+    finally:
+        started.stop()
+    assert {name for name in (b"ACCESS_TOKEN", b"VK_EXAMPLE", b"LC_EXAMPLE") if name in given} == {
+        b"VK_EXAMPLE",
+        b"LC_EXAMPLE",
+    }
+
+
+@LINUX
 def test_hung_viewer_is_stopped(viewer: Viewer) -> None:
     """A viewer that does not react is killed."""
     os.kill(viewer._process.pid, signal.SIGSTOP)
