@@ -247,11 +247,14 @@ def limit_trace(process: Process, outcomes: Outcomes) -> float:
 def tail_index(process: Process, outcomes: Outcomes) -> float:
     """Exponent α of P(tr P_k > t) ~ t^−α for large k: −ln(1 − p_r) / (2 ln ρ). inf where there is no heavy tail.
 
-    inf too for whoever is misled: tr P_k then stays within a factor of its own, growing expectation.
+    inf too for whoever is misled, and for whoever never uses a state: tr P_k then stays within a factor of its own,
+    growing expectation.
 
     Source: docs/mathematics.md, heavy tails.
     """
     rho = radius(process)
+    if outcomes.state == 0.0:
+        return math.inf
     if rho <= 1.0 or outcomes.misled or outcomes.predicted == 0.0 or outcomes.state >= 1.0:
         return math.inf
     return -math.log1p(-outcomes.state) / (2.0 * math.log(rho))
