@@ -69,7 +69,7 @@ def _sentence(detail: ErrorDetails) -> str:
         hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
         return f"is no entry of this table; {hint}"
     if kind == "expected":
-        return f"is {as_toml(found)}; expected {context['expected']}{example}"
+        return f"is {as_toml(found)}; expected {context['expected']}{context['hint'] or example}"
     if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)

@@ -28,15 +28,15 @@ from emulator.model.links.link import LossModel
 from emulator.model.process import Process, mistakes_of
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE, RESERVED
-from emulator.scenario.words import as_toml, listed
+from emulator.scenario.words import as_toml, listed, near
 
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 SECRET_BYTES = 32
 
 
-def _expected(what: str) -> PydanticCustomError:
-    """The error of one value: the line will say what was found and that this was expected."""
-    return PydanticCustomError("expected", "one value", {"expected": what})
+def _expected(what: str, hint: str = "") -> PydanticCustomError:
+    """The error of one value: the line will say what was found, that this was expected, and what may have been meant."""
+    return PydanticCustomError("expected", "one value", {"expected": what, "hint": hint})
 
 
 def _probability(value: float) -> float:
@@ -48,7 +48,7 @@ def _probability(value: float) -> float:
 def _one_of(names: Iterable[str]) -> Callable[[str], str]:
     def check(value: str) -> str:
         if value not in names:
-            raise _expected(listed(sorted(names)))
+            raise _expected(listed(sorted(names)), near(value, names))
         return value
 
     return check
@@ -194,7 +194,9 @@ class LinkTable(_Table):
             return []
         model = LOSS_MODELS.get(str(loss.get("model")))
         if model is None:
-            return [("loss.model", f"is {as_toml(loss.get('model', ''))}; expected {listed(sorted(LOSS_MODELS))}")]
+            name = loss.get("model", "")
+            what = f"is {as_toml(name)}; expected {listed(sorted(LOSS_MODELS))}{near(name, LOSS_MODELS)}"
+            return [("loss.model", what)]
         given = {name: value for name, value in loss.items() if name != "model"}
         found = [
             (f"loss.{name}", f"is missing; expected {name} = {as_toml(example)}")

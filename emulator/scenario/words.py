@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import tomli_w
@@ -24,3 +25,9 @@ def as_toml(value: Any) -> str:
 def listed(names: Sequence[str]) -> str:
     """Names as a choice: a, b or c."""
     return ", ".join(names[:-1]) + (" or " if len(names) > 1 else "") + names[-1]
+
+
+def near(found: Any, names: Iterable[str]) -> str:
+    """ "; did you mean NAME?" where something found is almost one of the names; else nothing."""
+    close = difflib.get_close_matches(str(found), list(names), 1)
+    return f"; did you mean {close[0]}?" if close else ""
