@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,14 @@ class BatchResult:
 
 
 def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
-    """The work, in trial order."""
+    """The work, in trial order, in parts as equal as they can be and as many for each worker, so that all end together."""
     blocks = -(-scenario.trials // BLOCK_TRIALS)
-    length = BLOCK_TRIALS * max(1, min(_SIDE_BY_SIDE, -(-blocks // workers)))
+    rounds = -(-blocks // (workers * _SIDE_BY_SIDE))
+    count = min(blocks, rounds * workers)
     first, end = scenario.first_trial, scenario.first_trial + scenario.trials
+    bounds = [min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1)]
     tables = scenario.model_dump(mode="json")
-    return [Task(tables, mode, start, min(start + length, end)) for start in range(first, end, length)]
+    return [Task(tables, mode, start, stop) for start, stop in pairwise(bounds)]
 
 
 def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:

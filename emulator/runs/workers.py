@@ -5,7 +5,6 @@ A worker process has a pipe of its own and shares no lock with anybody, so that 
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import signal
 import subprocess
@@ -168,6 +167,8 @@ def connected(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         yield None
         return
+    import asyncio  # noqa: PLC0415 - a tenth of what a worker imports, and none needs it
+
     try:
         from distributed import Client  # noqa: PLC0415 - an optional extra
         from distributed.comm.core import connect  # noqa: PLC0415 - the same

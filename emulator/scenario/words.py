@@ -28,6 +28,6 @@ def listed(names: Sequence[str]) -> str:
 
 
 def near(found: Any, names: Iterable[str]) -> str:
-    """ "; did you mean NAME?" where something found is almost one of the names; else nothing."""
+    """A hint, `; did you mean NAME?`, where something found is almost one of the names; else nothing."""
     close = difflib.get_close_matches(str(found), list(names), 1)
     return f"; did you mean {close[0]}?" if close else ""

@@ -9,16 +9,19 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from emulator.errors import RunError
 from emulator.runs.results import load_results
 from emulator.runs.simulation import Mode
-from emulator.runs.trials import tasks_of
+from emulator.runs.trials import BLOCK_TRIALS, tasks_of
 from emulator.runs.workers import in_processes
 from emulator.scenario import load
 from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 
 ENDLESS = ("--slots", "400000", "--trials", "1000")
+SCENARIO = load("eavesdroppers", {"slots": 10})
 
 
 def started(evedrop: Evedrop, workers: int) -> tuple[Live, list[int]]:
@@ -132,6 +135,19 @@ def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch,
     assert results.summary["ended"] == "a worker process died"
     assert set(results.slots["trials"].to_pylist()) == {1000}
     assert results.digests.num_rows == 1000 * 4
+
+
+@given(st.integers(1, 40_000), st.integers(1, 9), st.integers(0, 10**9))
+def test_workers_end_together(trials: int, workers: int, first: int) -> None:
+    """Tasks are whole blocks, all trials once and in order; none is a block longer than another, and all have as many."""
+    tasks = tasks_of(SCENARIO.model_copy(update={"trials": trials, "first_trial": first}), Mode.EXACT, workers)
+    assert [task.start for task in tasks] == [first, *(task.stop for task in tasks[:-1])]
+    assert tasks[-1].stop == first + trials
+    blocks = [-(-(task.stop - task.start) // BLOCK_TRIALS) for task in tasks]
+    assert sum(blocks) == -(-trials // BLOCK_TRIALS)
+    assert max(blocks) - min(blocks) <= 1
+    assert max(blocks) <= 4
+    assert len(tasks) % workers == 0 or set(blocks) == {1}
 
 
 def test_a_failing_worker_says_what_failed(monkeypatch: pytest.MonkeyPatch) -> None:
