@@ -252,9 +252,9 @@ def tail_index(process: Process, outcomes: Outcomes) -> float:
 
     Source: docs/mathematics.md, heavy tails.
     """
-    rho = radius(process)
     if outcomes.state == 0.0:
         return math.inf
+    rho = radius(process)
     if rho <= 1.0 or outcomes.misled or outcomes.predicted == 0.0 or outcomes.state >= 1.0:
         return math.inf
     return -math.log1p(-outcomes.state) / (2.0 * math.log(rho))

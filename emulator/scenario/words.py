@@ -11,6 +11,12 @@ import tomli_w
 _SHOWN = 60  # characters of a value that a message repeats
 
 
+def near(found: Any, names: Iterable[str]) -> str:
+    """A hint, `; did you mean NAME?`, where something found is almost one of the names; else nothing."""
+    close = difflib.get_close_matches(str(found), list(names), 1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
 def as_toml(value: Any) -> str:
     """A value as a scenario writes it, cut where it is long."""
     if isinstance(value, dict):
@@ -25,9 +31,3 @@ def as_toml(value: Any) -> str:
 def listed(names: Sequence[str]) -> str:
     """Names as a choice: a, b or c."""
     return ", ".join(names[:-1]) + (" or " if len(names) > 1 else "") + names[-1]
-
-
-def near(found: Any, names: Iterable[str]) -> str:
-    """A hint, `; did you mean NAME?`, where something found is almost one of the names; else nothing."""
-    close = difflib.get_close_matches(str(found), list(names), 1)
-    return f"; did you mean {close[0]}?" if close else ""
