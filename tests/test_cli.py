@@ -275,10 +275,10 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
         f"{name}.json" for name in sorted({"observer", "router", "sensor", *load("numerical").receivers})
     ]
     assert {path.stat().st_mode & 0o777 for path in briefs} == {0o600}
-    refused(evedrop("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")
-    refused(evedrop("sensor", "briefs/nobody.json"), "No such file")
+    refused(evedrop.process("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")
+    refused(evedrop.process("sensor", "briefs/nobody.json"), "No such file")
     (evedrop.folder / "briefs" / "smart.json").chmod(0o644)
-    refused(evedrop("eavesdropper", "briefs/smart.json"), "readable by others")
+    refused(evedrop.process("eavesdropper", "briefs/smart.json"), "readable by others")
 
 
 def test_an_observer_that_cannot_write_says_so(evedrop: Evedrop) -> None:
