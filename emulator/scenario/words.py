@@ -3,22 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import tomli_w
+from emulator.model.links.checks import as_toml
 
-_SHOWN = 60  # characters of a value that a message repeats
-
-
-def as_toml(value: Any) -> str:
-    """A value as a scenario writes it, cut where it is long."""
-    if isinstance(value, dict):
-        text = "{ " + ", ".join(f"{key} = {as_toml(inner)}" for key, inner in value.items()) + " }" if value else "{}"
-    elif isinstance(value, list):
-        text = f"[{', '.join(as_toml(inner) for inner in value)}]"
-    else:
-        text = tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+__all__ = ["as_toml", "listed"]
 
 
 def listed(names: Sequence[str]) -> str:

@@ -24,6 +24,7 @@ SPECS: dict[str, dict[str, Any]] = {
         "loss": [0.01, 0.4, 1.0],
     },
     "pattern": {"model": "pattern", "outcomes": "1101001"},
+    "trace": {"model": "trace", "outcomes": "110100111", "random_start": True},
 }
 
 

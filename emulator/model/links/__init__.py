@@ -10,6 +10,7 @@ from emulator.model.links.gilbert_elliott import GilbertElliott
 from emulator.model.links.link import Link, LossModel
 from emulator.model.links.markov import Markov
 from emulator.model.links.pattern import Pattern
+from emulator.model.links.trace import Trace
 from emulator.streams import Batch
 
 LOSS_MODELS: Mapping[str, type[LossModel]] = {
@@ -17,6 +18,7 @@ LOSS_MODELS: Mapping[str, type[LossModel]] = {
     "gilbert-elliott": GilbertElliott,
     "markov": Markov,
     "pattern": Pattern,
+    "trace": Trace,
 }
 
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.model.links.counting import count_variance
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
 from emulator.streams import Batch, BlockReader
@@ -73,6 +74,26 @@ class LossModel(ABC):
     @abstractmethod
     def quality(self) -> float:
         """Mean probability that a packet is delivered."""
+
+    def quality_at(self, slots: range) -> Floats:
+        """Probability that the packet of each of these slots is delivered, (slots,): not given the past."""
+        return np.full(len(slots), self.quality)
+
+    def rate_variance(self, slots: range) -> float:
+        """Variance, over trials, of one trial's fraction of delivered packets over these slots.
+
+        From the chain, or from independence; a model with neither has its own.
+        """
+        chain, count = self.chain, len(slots)
+        if chain is not None:
+            return count_variance(chain.transitions, chain.law, chain.quality, count) / count**2
+        quality = self.quality_at(slots)
+        return float((quality * (1.0 - quality)).sum()) / count**2
+
+    @property
+    def memoryless(self) -> bool:
+        """Whether the fates of different slots are independent of each other, be they alike, different, or certain."""
+        return self.chain is not None and self.chain.independent
 
     @property
     def chain(self) -> Chain | None:

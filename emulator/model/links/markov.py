@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from emulator.model.links.checks import is_probability
+from emulator.model.links.checks import as_toml, is_probability
 from emulator.model.links.link import Chain, LossModel, fates_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
@@ -48,7 +48,7 @@ class Markov(LossModel):
             right = isinstance(loss, list) and all(is_probability(value) for value in loss)
             if not right or (_square(rows) and len(loss) != len(rows)):
                 count = f"{len(rows)} numbers" if _square(rows) else "numbers"
-                found.append(("loss", f"is {loss!r}; expected {count} from 0 to 1, one for each state"))
+                found.append(("loss", f"is {as_toml(loss)}; expected {count} from 0 to 1, one for each state"))
         return found
 
     @property
@@ -91,7 +91,7 @@ def _matrix_mistakes(rows: Any) -> list[str]:
     found = []
     for i, row in enumerate(rows):
         if not all(is_probability(value) for value in row):
-            found.append(f"row {i} is {row}; expected numbers from 0 to 1")
+            found.append(f"row {i} is {as_toml(row)}; expected numbers from 0 to 1")
         elif abs(sum(row) - 1.0) > _SUM:
             found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
     if not found and not _common(rows):
