@@ -158,7 +158,7 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
         ({}, "link.quality: is missing; expected quality = 0.9, or a loss model"),
         ({"quality": 0.9, "loss": BURSTS}, "link.quality: is there beside loss, of which it is the short form"),
         ({"loss": 3}, "link.loss: is 3; expected a table, such as"),
-        ({"loss": {}}, 'link.loss.model: is ""; expected bernoulli, gilbert-elliott, markov, pattern or trace'),
+        ({"loss": {}}, 'link.loss.model: is ""; expected bernoulli, distance, gilbert-elliott, markov, pattern or t'),
         ({"loss": {"model": "gilbert"}}, 'link.loss.model: is "gilbert"; expected bernoulli'),
         ({"loss": {"model": ["x"]}}, 'link.loss.model: is ["x"]; expected bernoulli'),
         ({"loss": {"model": "bernoulli", "quality": 1.5}}, "link.loss.quality: is 1.5; expected a number from 0 to 1"),

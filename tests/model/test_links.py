@@ -17,6 +17,17 @@ from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 KEY = stream_key(root_of_seed(8), "link/eve")
 SPECS: dict[str, dict[str, Any]] = {
     "bernoulli": {"model": "bernoulli", "quality": 0.7},
+    "distance": {
+        "model": "distance",
+        "sender": [0, 0],
+        "receiver": [[0, 90.0, 5.0], [40, 10.0, 90.0]],
+        "reference_snr": 70.0,
+        "exponent": 3.0,
+        "threshold": 8.0,
+        "shadowing": 6.0,
+        "shadowing_block": 7,
+        "fading_block": 3,
+    },
     "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.05, "bad": 0.8},
     "markov": {
         "model": "markov",

@@ -20,12 +20,22 @@ from tests.conftest import Evedrop
 
 LOSSES: dict[str, dict[str, Any]] = {
     "bernoulli": {"model": "bernoulli", "quality": 0.8},
+    "distance": {
+        "model": "distance",
+        "sender": [0, 0],
+        "receiver": [[0, 90.0, 5.0], [200, 10.0, 90.0]],
+        "reference_snr": 70.0,
+        "exponent": 3.0,
+        "threshold": 8.0,
+        "shadowing": 6.0,
+        "shadowing_block": 20,
+    },
     "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.05, "bad": 0.9},
     "markov": {"model": "markov", "transitions": [[0.8, 0.2], [0.5, 0.5]], "loss": [0, 1]},
     "pattern": {"model": "pattern", "outcomes": "1101"},
     "trace": {"model": "trace", "outcomes": "110100111", "random_start": True},
 }
-UNKNOWN = ("pattern", "trace")
+UNKNOWN = ("distance", "pattern", "trace")
 """Those for which there is no theory."""
 
 
@@ -85,7 +95,7 @@ def test_live_and_memory_are_the_same_bits(every_model: Path, memory: Results, t
 
 
 def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
-    """A pattern or a trace has no expected trace: null in the summary and in the table, and no verdict of theory."""
+    """What follows no chain has no expected trace: null in the summary and in the table, and no verdict of theory."""
     peers = memory.summary["peers"]
     assert [name for name, peer in peers.items() if peer["expected_trace_covariance"] is None] == [*UNKNOWN]
     assert json.loads((memory.folder / "summary.json").read_text())["peers"]["pattern"]["infinite_variance"] is False
@@ -128,7 +138,7 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     assert "the link of legitimate has others" in line
     assert "--set 'legitimate.link={quality = 0.9}'" in line
     quality = {"quality": 0.9}
-    with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.gilbert-elliott\.link="):
+    with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.distance\.link="):
         design(every_model, changes={"legitimate.link": quality})
     links = {f"eavesdroppers.{name}.link": quality for name in scenario()["eavesdroppers"]}
     design(every_model, changes={"legitimate.link": quality, **links})

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from emulator.model.links.bernoulli import Bernoulli
+from emulator.model.links.distance import Distance
 from emulator.model.links.gilbert_elliott import GilbertElliott
 from emulator.model.links.link import Link, LossModel
 from emulator.model.links.markov import Markov
@@ -15,6 +16,7 @@ from emulator.streams import Batch
 
 LOSS_MODELS: Mapping[str, type[LossModel]] = {
     "bernoulli": Bernoulli,
+    "distance": Distance,
     "gilbert-elliott": GilbertElliott,
     "markov": Markov,
     "pattern": Pattern,
