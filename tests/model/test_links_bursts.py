@@ -50,11 +50,12 @@ def two_states(spec: dict[str, Any], u: Floats) -> list[int]:
 
 
 def any_chain(spec: dict[str, Any], u: Floats) -> list[int]:
-    """A Markov chain's losses in one trial, slot by slot: 1 where lost."""
+    """A Markov chain's losses in one trial, slot by slot: 1 where lost; what rounding leaves over is the last state's."""
     row, fates = stationary(np.array(spec["transitions"], float)).tolist(), []
     for first, second in u.tolist():
         state, bound = 0, row[0]
-        while first >= bound and state < len(row) - 1:
+        last = max(i for i, chance in enumerate(row) if chance > 0.0)
+        while first >= bound and state < last:
             state += 1
             bound += row[state]
         fates.append(int(second < spec["loss"][state]))
@@ -139,6 +140,29 @@ def test_marginal_loss_of_a_million_packets(spec: dict[str, Any]) -> None:
         memory += 2.0 * float((chain.law * q) @ ahead @ q - loss**2) / (loss * (1.0 - loss))
     effective = slots * trials / memory
     assert abs(lost - loss) < 4.9 * np.sqrt(loss * (1.0 - loss) / effective)
+
+
+@pytest.mark.parametrize("zeros", [0, 1, 3])
+def test_rounding_leads_to_no_state_that_cannot_be(zeros: int) -> None:
+    """Ten tenths add up to less than 1: the largest uniform number still leads to the tenth state, not to one behind it."""
+    row = [0.1] * 10 + [0.0] * zeros
+    assert sum(row[1:], row[0]) < 1.0 - 2.0**-54
+    chain = loss_of({"model": "markov", "transitions": [row] * len(row), "loss": [0.0] * 9 + [0.5] + [1.0] * zeros})
+    u = np.full((3, 2, 1), 1.0 - 2.0**-53)
+    u[:, 1] = 0.5
+    assert (
+        chain.fates(0, u) == Fate.DELIVERED
+    ).all()  # 0.5 is not below the tenth state's loss, and is below the others'
+
+
+def test_a_chain_of_many_states_is_searched_as_one_of_few() -> None:
+    """With more bounds than are compared one by one, fates are those of the slot-by-slot reference."""
+    weights = [[1 + (i * j) % 5 for j in range(30)] for i in range(30)]
+    rows = [[weight / sum(row) for weight in row] for row in weights]
+    spec = {"model": "markov", "transitions": rows, "loss": [i / 29 for i in range(30)]}
+    u = drawn(200, range(6), 2)
+    expected = np.array([any_chain(spec, u[:, r]) for r in range(6)]).T
+    assert np.array_equal(link_of(spec, KEY, Batch(200, 6)).fates(range(200)), expected)
 
 
 def run_lengths(lost: np.ndarray[Any, Any]) -> list[int]:

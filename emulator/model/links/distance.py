@@ -19,6 +19,7 @@ from emulator.model.receiver import Codes
 
 _NEPER = 0.23025850929940458  # ln 10 / 10: decibels as a natural logarithm
 _LONGEST_BLOCK = 1_000_000
+_AT_ONCE = 8192  # packets whose fates are decided at once
 _SAMPLE = 4096  # slots from which the mean quality of a moving link is taken
 
 
@@ -146,6 +147,11 @@ class Distance(LossModel):
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """Lost where fading and shadowing together bring less than the slot needs."""
+        step = max(1, _AT_ONCE // uniforms.shape[2])
+        return np.concatenate([self._fates(first + i, uniforms[i : i + step]) for i in range(0, len(uniforms), step)])
+
+    def _fates(self, first: int, uniforms: Floats) -> Codes:
+        """The same, of so few that what is computed on the way stays in the cache."""
         slots = range(first, first + len(uniforms))
         needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
         power, self._fade = _held(slots, self._fading_block, uniforms[:, 0], self._fade, _exponential)
