@@ -55,6 +55,10 @@ class _Commands:
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self._group = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
+    def group(self, name: str, does: str) -> _Commands:
+        """Commands of one kind, under a name of their own."""
+        return _Commands(self._group.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}."))
+
     def add(self, name: str, command: Command, does: str, *options: Callable[[argparse.ArgumentParser], None]) -> None:
         """A command, what it does in some words, and its options."""
         one = self._group.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}.")
@@ -68,7 +72,8 @@ def _parser() -> argparse.ArgumentParser:
         prog="evedrop", description="A network emulator for secrecy in remote state estimation."
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
-    add = _Commands(parser).add
+    top = _Commands(parser)
+    add = top.add
     add("list", commands.list_scenarios, "the shipped scenarios, a line each")
     add("new", commands.new, "write a commented scenario to start from", _argument("file", "FILE"))
     add("demo", commands.demo, "the shipped scenario `vehicle`, live, in real time, with the view", *_LIVE)
@@ -80,6 +85,10 @@ def _parser() -> argparse.ArgumentParser:
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
     add("check", commands.check, "validate scenarios only", _scenarios, _set)
+    links = top.group("links", "what can be found out about links")
+    links.add(
+        "fit", commands.fit_link, "the loss model, and delays, of a recorded link", _argument("trace", "TRACE"), _fits
+    )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
     for role in ("router", "sensor", "legitimate", "eavesdropper", "observer"):
@@ -188,6 +197,14 @@ def _designs(parser: argparse.ArgumentParser) -> None:
 def _figures(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", type=Path, default=Path("figures"), metavar="DIR")
     parser.add_argument("--full", action="store_true", help="the paper's 1000 trials of a day; minutes, not seconds")
+
+
+def _fits(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--column", metavar="C", help="the column of outcomes, in a file of several")
+    parser.add_argument(
+        "--delay-column", metavar="C", help="the column of delays in slots; default delay, if there is one"
+    )
+    parser.add_argument("--json", action="store_true", help="for programs")
 
 
 def _briefs(parser: argparse.ArgumentParser) -> None:

@@ -283,6 +283,18 @@ def selftest(_: argparse.Namespace) -> int:
     return 0
 
 
+def fit_link(options: argparse.Namespace) -> int:
+    """Find the model of a recorded link."""
+    from emulator.fitting.fit import fit, lines
+
+    found = fit(options.trace, options.column, options.delay_column)
+    if options.json:
+        print(json.dumps(found.as_dict(), ensure_ascii=False))
+    else:
+        print("\n".join(lines(found)))
+    return 0
+
+
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from emulator.errors import TraceError
-from emulator.network.access import LEGITIMATE
 from emulator.scenario.words import as_toml
 from emulator.traces import Recording
 
@@ -41,18 +40,14 @@ def read_recordings(tables: Mapping[str, Any]) -> list[str]:
     return mistakes
 
 
-def _traces(tables: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Path and table of every loss model that is a trace, as far as the scenario is one."""
-    receivers = {LEGITIMATE: tables.get(LEGITIMATE)}
-    eavesdroppers = tables.get("eavesdroppers")
-    if isinstance(eavesdroppers, dict):
-        receivers.update({f"eavesdroppers.{name}": table for name, table in eavesdroppers.items()})
-    for path, table in receivers.items():
-        loss = table
-        for name in ("link", "loss"):
-            loss = loss.get(name) if isinstance(loss, dict) else None
-        if isinstance(loss, dict) and loss.get("model") == "trace":
-            yield f"{path}.link.loss", loss
+def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Path and table of every loss model that is a trace, wherever a link may be described."""
+    entries = tables.items() if isinstance(tables, dict) else enumerate(tables) if isinstance(tables, list) else ()
+    for name, inner in entries:
+        if name == "loss" and isinstance(inner, dict) and inner.get("model") == "trace":
+            yield f"{path}{name}", inner
+        else:
+            yield from _traces(inner, f"{path}{name}.")
 
 
 def _replace(loss: dict[str, Any]) -> list[tuple[str, str]]:

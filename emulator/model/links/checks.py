@@ -10,18 +10,20 @@ from typing import Any
 _SHOWN = 60  # characters of a value that a message repeats
 
 
-def as_toml(value: Any) -> str:
-    """A value as a scenario writes it, cut where it is long."""
+def toml_of(value: Any) -> str:
+    """A value as a scenario writes it, in one line."""
     if isinstance(value, dict):
-        text = "{ " + ", ".join(f"{key} = {as_toml(inner)}" for key, inner in value.items()) + " }" if value else "{}"
-    elif isinstance(value, list):
-        text = f"[{', '.join(as_toml(inner) for inner in value)}]"
-    elif isinstance(value, bool):
-        text = "true" if value else "false"
-    elif isinstance(value, str):
-        text = json.dumps(value[: _SHOWN + 1], ensure_ascii=False)
-    else:
-        text = str(value)
+        return "{ " + ", ".join(f"{key} = {toml_of(inner)}" for key, inner in value.items()) + " }" if value else "{}"
+    if isinstance(value, list):
+        return f"[{', '.join(toml_of(inner) for inner in value)}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
+
+
+def as_toml(value: Any) -> str:
+    """The same for a message: cut where it is long."""
+    text = toml_of(value[: _SHOWN + 1] if isinstance(value, (str, list)) else value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
