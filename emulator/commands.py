@@ -112,10 +112,13 @@ def _replay(folder: Path) -> str | None:
     from emulator.scenario import load
 
     try:
-        recorded = load(folder).record_trials
+        scenario = load(folder)
     except UsageError:  # float64 cannot follow the states of so many slots
         return None
-    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{' --record-trials 1' if recorded > 1 else ''}"
+    recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
+    # A quantile over trials can be expected of many alone.
+    expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
+    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"
 
 
 def _keep_open(viewer: Viewer) -> None:

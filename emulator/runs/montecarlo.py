@@ -22,6 +22,7 @@ from emulator.runs.expectation import expected_traces_of
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
+from emulator.runs.judge import replay_of
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.score import SlotSums, Tally, merged, squared_errors
 from emulator.runs.scorekeeper import Ending, resolved, summary_of
@@ -87,7 +88,8 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
                 shutil.rmtree(folder)
                 raise failure or Interrupted("interrupted before anything was done; nothing was kept")
             how = str(failure) if failure else "complete" if merger.complete else "interrupted"
-            summary = merger.summary(Ending(time.monotonic() - started, how))
+            replay = replay_of(folder, scenario, plan.mode.value)
+            summary = merger.summary(Ending(time.monotonic() - started, how, replay))
             write_summary(folder, summary)
     if failure is not None:
         raise failure

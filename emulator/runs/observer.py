@@ -27,6 +27,7 @@ from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
 from emulator.network.session import Session
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.joined import Joiner, Slots
+from emulator.runs.judge import replay_of
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, resolved, summary_of
 from emulator.scenario import Scenario
@@ -166,7 +167,8 @@ class Observation:
         """Close the view, write the summary, tell the launcher; the exit status of the run."""
         safe = self._recording.close() if self._recording is not None else True
         digests = {name: digest_of(self._scenario, blocks) for name, blocks in self._joiner.digests.items()}
-        summary = summary_of(self._scenario, self._keeper.tallies, digests, Ending(self._ended - self._started, how))
+        ending = Ending(self._ended - self._started, how, replay_of(self.folder, self._scenario))
+        summary = summary_of(self._scenario, self._keeper.tallies, digests, ending)
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
             summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"

@@ -21,6 +21,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from emulator.runs.judge import told
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -127,9 +129,9 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
     for expectation in summary["expectations"]:
-        word = {True: "held", False: "FAILED", None: "there is no such figure in this run"}[expectation["held"]]
-        found = "" if expectation["found"] is None else f", found {float(expectation['found']):.4g}"
-        console.print(f"expected {expectation['text']}: {word}{found}")
+        console.print(told(expectation))
+        if "replay" in expectation:
+            console.print(f"    see it again: {expectation['replay']}")
     surprising = summary["surprising"]
     if surprising is not None:
         console.print(

@@ -18,9 +18,11 @@ from emulator.network.access import LEGITIMATE
 from emulator.runs.expectation import expectations_of
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
+from emulator.runs.judge import Evidence
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.verdict import Secrecy, secrecy
-from emulator.scenario import ExpectTable, Scenario
+from emulator.runs.watched import watches_of
+from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
 
@@ -40,7 +42,7 @@ class Scorekeeper:
 
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
-        self.tallies = {name: Tally(scenario.slots, trials) for name in scenario.receivers}
+        self.tallies = {name: Tally(scenario.slots, trials, one) for name, one in watches_of(scenario).items()}
 
     def add(self, slots: Slots) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory."""
@@ -51,6 +53,7 @@ class Scorekeeper:
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
             self.tallies[name].add(slots.first, *one)
+            self.tallies[name].watched.add(slots.first, errors, receiver.action, one.sums.trace)
             self.tallies[name].account(receiver.delivered, receiver.action, receiver.lost)
             scored[name] = one
         return scored
@@ -64,6 +67,8 @@ class Ending:
     """Start command to last row on disk."""
     how: str = "complete"
     """`complete`, `interrupted`, or why it failed."""
+    replay: str | None = None
+    """The command that runs it once more, for whoever sees an expectation fail."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -95,6 +100,9 @@ def summary_of(
         for peer in peers.values():
             peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
     user = tallies[LEGITIMATE]
+    links = {name: tally.link for name, tally in tallies.items()}
+    secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
+    evidence = Evidence(scenario, peers, links, tallies, expected, secret)
     return {
         "scenario": scenario.title,
         "mode": mode,
@@ -106,10 +114,10 @@ def summary_of(
         "slots_per_second": user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
         "ended": ending.how,
         "peers": peers,
-        "links": {name: tally.link for name, tally in tallies.items()},
-        "secrecy": {one.eavesdropper: one.as_dict() for one in verdicts(scenario, tallies)},
+        "links": links,
+        "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "surprising": _surprising(scenario, tallies),
-        "expectations": [_expectation(expect, peers) for expect in scenario.expect],
+        "expectations": evidence.judged(ending.replay),
     }
 
 
@@ -147,12 +155,6 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, A
                 "median": float(np.exp(median)),
             }
     return found
-
-
-def _expectation(expect: ExpectTable, peers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    receiver, figure = expect.figure.split(".")
-    found = peers[receiver][figure]
-    return {"text": expect.text, "held": None if found is None else expect.holds(found), "found": found}
 
 
 def digest_of(scenario: Scenario, blocks: Mapping[int, Digests]) -> str | None:

@@ -16,13 +16,12 @@ from pydantic_core import ErrorDetails
 from emulator.model.horizon import horizon
 from emulator.model.process import Process
 from emulator.network.access import LEGITIMATE
+from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.table import Found
 from emulator.scenario.tables import (
-    FIGURES,
     SECRET_BYTES,
     EavesdropperTable,
     EncodingTable,
-    ExpectTable,
-    Found,
     LegitimateTable,
     LinkTable,
     ProcessTable,
@@ -116,19 +115,15 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
     eavesdroppers, expectations = tables.get("eavesdroppers", {}), tables.get("expect", [])
     if isinstance(eavesdroppers, dict) and isinstance(expectations, list):
-        available = [f"{receiver}.{figure}" for receiver in (LEGITIMATE, *eavesdroppers) for figure in FIGURES]
+        around = Around(
+            (LEGITIMATE, *eavesdroppers),
+            slots if type(slots) is int and slots > 0 else None,
+            trials if type(trials) is int and trials > 0 else None,
+            lambda name: _has_theory(tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name]),
+        )
         for i, expectation in enumerate(expectations):
-            figure = expectation.get("figure") if isinstance(expectation, dict) else None
-            if isinstance(figure, str) and figure not in available:
-                near = difflib.get_close_matches(figure, available, 1)
-                hint = f"; did you mean {near[0]}?" if near else ""
-                names = f"RECEIVER ({', '.join((LEGITIMATE, *eavesdroppers))}).FIGURE ({', '.join(FIGURES)})"
-                found.append(f"expect.{i}.figure: is {as_toml(figure)}; expected {names}{hint}")
-            elif isinstance(figure, str) and figure.endswith(".expected_trace_covariance"):
-                receiver = figure.partition(".")[0]
-                if not _has_theory(tables.get(LEGITIMATE) if receiver == LEGITIMATE else eavesdroppers[receiver]):
-                    why = f"there is no theory for the losses of {receiver}'s link"
-                    found.append(f"expect.{i}.figure: is {as_toml(figure)}, but {why}; expected another figure")
+            if isinstance(expectation, dict):
+                found += [f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation)]
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     return found

@@ -6,21 +6,12 @@ Source: docs/scenario.md.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any, Self
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ModelWrapValidatorHandler,
-    ValidationError,
-    model_validator,
-)
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic import AfterValidator, Field
 
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.links import LOSS_MODELS, loss_of
@@ -28,81 +19,31 @@ from emulator.model.links.link import LossModel
 from emulator.model.process import Process, mistakes_of
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE, RESERVED
+from emulator.scenario.expect import ExpectTable
+from emulator.scenario.table import Found, Table, expected, one_of
 from emulator.scenario.words import as_toml, listed
 
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 SECRET_BYTES = 32
 
 
-def _expected(what: str) -> PydanticCustomError:
-    """The error of one value: the line will say what was found and that this was expected."""
-    return PydanticCustomError("expected", "one value", {"expected": what})
-
-
 def _probability(value: float) -> float:
     if not 0.0 <= value <= 1.0:
-        raise _expected("a number from 0 to 1")
+        raise expected("a number from 0 to 1")
     return value
-
-
-def _one_of(names: Iterable[str]) -> Callable[[str], str]:
-    def check(value: str) -> str:
-        if value not in names:
-            raise _expected(listed(sorted(names)))
-        return value
-
-    return check
 
 
 def _process_name(name: str) -> str:
     if name in RESERVED:
-        raise _expected(f"any name but {listed(RESERVED)}, which are reserved")
+        raise expected(f"any name but {listed(RESERVED)}, which are reserved")
     if not NAME.fullmatch(name):
-        raise _expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
+        raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
     return name
 
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
 Matrix = list[list[Annotated[float, Field(strict=True)]]]
-Found = tuple[str, str]
-"""A mistake in a table: the entry, and what is wrong with it."""
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """What only shows when entries are seen together; entries that are wrong by themselves may be in the table."""
-        del table
-        return []
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _all_at_once(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
-        """Entries by themselves and together, so that one mistake does not hide another."""
-        together = cls.mistakes(found) if isinstance(found, Mapping) else []
-        mistakes = PydanticCustomError("mistakes", "several", {"mistakes": together})
-        try:
-            table = check(found)
-        except ValidationError as error:
-            if not together:
-                raise
-            lines = [_again(detail) for detail in error.errors(include_url=False)]
-            lines.append(InitErrorDetails(type=mistakes, input=found))
-            raise ValidationError.from_exception_data(cls.__name__, lines) from None
-        if together:
-            raise mistakes
-        return table
-
-
-def _again(detail: ErrorDetails) -> InitErrorDetails:
-    """An error that was reported, to be reported once more with others."""
-    kind, context = detail["type"], detail.get("ctx", {})
-    own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
-    return InitErrorDetails(type=own, loc=detail["loc"], input=detail["input"], ctx=context)
 
 
 def _numbers(rows: Any) -> bool:
@@ -114,7 +55,7 @@ def _number(value: Any) -> bool:
     return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)
 
 
-class ProcessTable(_Table):
+class ProcessTable(Table):
     """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance)."""
 
     A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
@@ -152,10 +93,10 @@ class ProcessTable(_Table):
         return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
 
 
-class EncodingTable(_Table):
+class EncodingTable(Table):
     """`[encoding]`: the scheme, and μ_d for those that mix states and innovations."""
 
-    scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(_one_of(SCHEMES))]
+    scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(one_of(SCHEMES))]
     state_probability: Annotated[Probability | None, Field(examples=[0.6])] = None
 
     @classmethod
@@ -176,7 +117,7 @@ class EncodingTable(_Table):
         return 1.0 if self.state_probability is None else self.state_probability
 
 
-class LinkTable(_Table):
+class LinkTable(Table):
     """`link = {…}`: how packets get from the router to one receiver."""
 
     quality: Annotated[Probability | None, Field(examples=[0.9])] = None
@@ -223,16 +164,16 @@ class LinkTable(_Table):
 LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
 
 
-class LegitimateTable(_Table):
+class LegitimateTable(Table):
     """`[legitimate]`."""
 
     link: LinkField
 
 
-class EavesdropperTable(_Table):
+class EavesdropperTable(Table):
     """`[eavesdroppers.NAME]`: a strategy with its parameters, and a link."""
 
-    strategy: Annotated[str, Field(strict=True, examples=["smart"]), AfterValidator(_one_of(STRATEGIES))]
+    strategy: Annotated[str, Field(strict=True, examples=["smart"]), AfterValidator(one_of(STRATEGIES))]
     link: LinkField
     use_state: Annotated[Probability | None, Field(examples=[0.8])] = None
     use_innovation: Annotated[Probability | None, Field(examples=[0.2])] = None
@@ -260,42 +201,7 @@ class EavesdropperTable(_Table):
         return {name: getattr(self, name) for name in STRATEGIES[self.strategy].parameters}
 
 
-class ExpectTable(_Table):
-    """`[[expect]]`: what a figure of the summary must be for the run to pass."""
-
-    figure: Annotated[str, Field(examples=["legitimate.mean_squared_error"])]
-    below: Annotated[Number | None, Field(examples=[0.01])] = None
-    above: Annotated[Number | None, Field(examples=[0.01])] = None
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether it says something."""
-        if table.get("below") is None and table.get("above") is None:
-            return [("below", "and above are both missing; expected at least one, such as below = 0.01")]
-        return []
-
-    @property
-    def text(self) -> str:
-        """As a sentence."""
-        bounds = [f"below {self.below:g}"] if self.below is not None else []
-        bounds += [f"above {self.above:g}"] if self.above is not None else []
-        return f"{self.figure} {' and '.join(bounds)}"
-
-    def holds(self, found: float) -> bool:
-        """Whether the figure is within the bounds."""
-        return (self.below is None or found < self.below) and (self.above is None or found > self.above)
-
-
-FIGURES = (
-    "mean_squared_error",
-    "mean_trace_covariance",
-    "expected_trace_covariance",
-    "received_fraction",
-    "used_fraction",
-)
-
-
-class Scenario(_Table):
+class Scenario(Table):
     """One scenario, checked."""
 
     title: Annotated[str, Field(min_length=1, examples=["Two eavesdroppers beside a planar vehicle"])]
@@ -311,12 +217,17 @@ class Scenario(_Table):
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
     eavesdroppers: Annotated[
         dict[ProcessName, EavesdropperTable],
-        Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
-    ] = {}
+        Field(
+            default_factory=dict,
+            max_length=64,
+            examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}],
+        ),
+    ]
     expect: Annotated[
-        list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
-    ] = []
-    made_with: Annotated[dict[str, str], Field(exclude=True)] = {}
+        list[ExpectTable],
+        Field(default_factory=list, examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]]),
+    ]
+    made_with: Annotated[dict[str, str], Field(default_factory=dict, exclude=True)]
 
     @property
     def receivers(self) -> tuple[str, ...]:
