@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
+    add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
     add("check", commands.check, "validate scenarios only", _scenarios, _set)
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
@@ -105,6 +106,20 @@ def _scenario(parser: argparse.ArgumentParser) -> None:
 
 def _scenarios(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenarios", nargs="+", metavar="SCENARIO")
+
+
+def _places(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "places", nargs="+", metavar="PATH", help="a scenario, or a folder that has some; or a shipped name"
+    )
+
+
+def _tests(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
+    parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where results go, a folder each; default runs/")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many at a time; default 1")
 
 
 def _two_runs(parser: argparse.ArgumentParser) -> None:

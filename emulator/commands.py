@@ -10,6 +10,8 @@ import json
 import shlex
 import signal
 import sys
+import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -250,6 +252,31 @@ def diff(options: argparse.Namespace) -> int:
     found = difference(*(load_results(run) for run in options.runs))
     print(found.text)
     return 0 if found.same else 1
+
+
+def test(options: argparse.Namespace) -> int:
+    """Run scenarios as tests; the worst exit status of theirs."""
+    from emulator.runs.junit import write_junit
+    from emulator.runs.testing import Finding, Manner, scenarios_of
+    from emulator.runs.testing_jobs import results
+
+    if options.jobs < 1:
+        raise UsageError(f"--jobs {options.jobs}: expected 1 or more")
+    scenarios = scenarios_of(options.places)
+    started, tested = time.time(), list[Finding]()
+    try:
+        for one in results(scenarios, Manner(options.in_memory, options.trials, options.out), options.jobs):
+            tested.append(one)
+            print(f"{one.outcome.word:<9}{one.seconds:7.1f} s  {one.scenario}", flush=True)
+            for line in one.lines:
+                print(f"    {line}", flush=True)
+    finally:
+        if options.junit is not None:
+            write_junit(options.junit, tested, started)
+    counts = Counter(one.outcome for one in tested)
+    said = ", ".join(f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value))
+    print(f"{said}, in {time.time() - started:.1f} s")
+    return max(outcome.value for outcome in counts)
 
 
 def check(options: argparse.Namespace) -> int:
