@@ -39,9 +39,7 @@ def told(expectation: Mapping[str, Any]) -> str:
     found, held = expectation["found"], expectation["held"]
     word = {True: "held", False: "FAILED", None: "this run does not tell"}[held]
     if found is None:
-        return f"expected {expectation['text']}: {word}" + (
-            ", found no such slot in some trial" if held is False else ""
-        )
+        return f"expected {expectation['text']}: {word}" + (", found none" if held is False else "")
     if isinstance(found, str) and found not in {"inf", "-inf", "nan"}:
         return f"expected {expectation['text']}: {word}, found {found}"
     number = str(found) if isinstance(found, int) else f"{float(found):.6g}"
@@ -110,7 +108,8 @@ class Evidence:
         theory = {True: "theory promises it", False: "theory denies it", None: "there is no theory for these links"}
         run = {Verdict.HELD: "the run shows it", Verdict.FAILED: "the run shows that it fails"}
         found = f"{theory[promised]}, {run.get(shown, f'the run has {shown.value}')}"
-        return found, promised is True and shown is Verdict.HELD
+        complete = all(tally.done == tally.slots for tally in self.tallies.values())
+        return found, promised is True and shown is Verdict.HELD if complete else None
 
     def _in_step(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         """By the largest slot over trials; a run that was cut short before that slot does not tell."""

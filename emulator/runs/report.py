@@ -90,6 +90,9 @@ def closing_table(summary: News, width: int) -> Table:
     if summary["mode"] != "live":
         rate = f"{summary['slots_per_second'] * summary['trials']:,.0f} trial-slots/s in memory"
     title = f"{summary['scenario']} · {summary['slots']:,} slots · {trials} · {rate}"
+    failed = [one["held"] for one in summary["expectations"]].count(False)
+    if failed:
+        title += f" · {failed} of {len(summary['expectations'])} expectations FAILED"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("receiver", no_wrap=True)
     covariances = summary["mode"] == "covariance-only"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import InitVar, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
-from emulator.runs.watched import Watch, Watched
+from emulator.runs.watched import Watched
 
 WINDOWS = 8
 """The slots k ≥ 1 are judged in so many windows, of equal length up to one slot."""
@@ -87,7 +87,7 @@ class Tally:
     slots: int
     """Of the whole run."""
     trials: int
-    watches: InitVar[Iterable[Watch]] = ()
+    watched: Watched = field(default_factory=lambda: Watched((), 0))
     """What expectations ask of the receiver."""
     done: int = 0
     """Slots that all trials have."""
@@ -104,11 +104,8 @@ class Tally:
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
 
-    watched: Watched = field(init=False)
-
-    def __post_init__(self, watches: Iterable[Watch]) -> None:
+    def __post_init__(self) -> None:
         self.window_errors = np.zeros((WINDOWS + 1, self.trials))
-        self.watched = Watched(watches, self.trials)
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
         """Take c slots: their errors (c, R), sums, and expected trace (c,)."""
@@ -175,6 +172,7 @@ def merged(tallies: Mapping[int, Tally]) -> Tally:
     """One tally of several disjoint sets of trials, in the order of their keys."""
     parts = [tallies[key] for key in sorted(tallies)]
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
+    total.watched = Watched.of([part.watched for part in parts])
     total.done = min(part.done for part in parts)
     for part in parts:
         for name in ("offered", "error", "trace", "expected_trace", "received", "used", "unexplained"):
@@ -182,5 +180,4 @@ def merged(tallies: Mapping[int, Tally]) -> Tally:
         for reason, count in part.lost.items():
             total.lost[reason] = total.lost.get(reason, 0) + count
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
-    total.watched = Watched.of([part.watched for part in parts])
     return total

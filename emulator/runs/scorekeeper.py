@@ -21,7 +21,7 @@ from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.verdict import Secrecy, secrecy
-from emulator.runs.watched import watches_of
+from emulator.runs.watched import Watched, watches_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
@@ -42,7 +42,9 @@ class Scorekeeper:
 
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
-        self.tallies = {name: Tally(scenario.slots, trials, one) for name, one in watches_of(scenario).items()}
+        self.tallies = {
+            name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches_of(scenario).items()
+        }
 
     def add(self, slots: Slots) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory."""
@@ -52,8 +54,8 @@ class Scorekeeper:
             one = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
-            self.tallies[name].add(slots.first, *one)
             self.tallies[name].watched.add(slots.first, errors, receiver.action, one.sums.trace)
+            self.tallies[name].add(slots.first, *one)
             self.tallies[name].account(receiver.delivered, receiver.action, receiver.lost)
             scored[name] = one
         return scored

@@ -20,7 +20,7 @@ from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums, Tally, slot_sums
 from emulator.runs.simulation import Chunk, Measured, Mode, Simulation
-from emulator.runs.watched import Watch, watches_of
+from emulator.runs.watched import Watched, watches_of
 from emulator.scenario import Scenario
 
 BLOCK_TRIALS = 500
@@ -80,10 +80,13 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     scale = float(np.trace(scenario.process.process.Q))
     result = BatchResult(
         task.start,
-        [_empty_block(watches_of(scenario), slots, start, task.stop) for start in trials[::BLOCK_TRIALS]],
+        [_empty_block(names, slots, start, task.stop) for start in trials[::BLOCK_TRIALS]],
         {name: SlotHistograms(slots, scale) for name in names},
         {name: SlotHistograms(slots, scale) for name in names},
     )
+    for name, watches in watches_of(scenario).items():
+        for block in result.blocks:
+            block.tallies[name].watched = Watched(watches, block.trials)
     expected = expected_traces_of(scenario)
     for chunk in simulation.chunks():
         _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
@@ -99,13 +102,13 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     return result
 
 
-def _empty_block(watches: dict[str, tuple[Watch, ...]], slots: int, start: int, stop: int) -> Block:
+def _empty_block(names: tuple[str, ...], slots: int, start: int, stop: int) -> Block:
     trials = min(BLOCK_TRIALS, stop - start)
     return Block(
         start,
         trials,
-        {name: SlotSums.zero(slots) for name in watches},
-        {name: Tally(slots, trials, of_one) for name, of_one in watches.items()},
+        {name: SlotSums.zero(slots) for name in names},
+        {name: Tally(slots, trials) for name in names},
         {},
     )
 
@@ -121,8 +124,8 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
                 trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
                 sums = slot_sums(part.error, part.action, trace)
             block.sums[name].add(chunk.first, sums)
-            block.tallies[name].add(chunk.first, part.error, sums, expected[name])
             block.tallies[name].watched.add(chunk.first, part.error, part.action, sums.trace)
+            block.tallies[name].add(chunk.first, part.error, sums, expected[name])
             block.tallies[name].account(part.fates == Fate.DELIVERED, part.action, losses(part.fates))
         result.errors[name].add(chunk.first, measured.error)
         result.traces[name].add(chunk.first, measured.trace)

@@ -27,7 +27,7 @@ FIGURES = (
 """Of a receiver."""
 TRIAL_FIGURES = ("mean_squared_error", "received_fraction", "used_fraction")
 """Those that a run knows of every trial, and so has quantiles of."""
-LINK_FIGURES = ("offered", "delivered", "lost", "unexplained", "rate")
+LINK_FIGURES = ("offered", "delivered", "late", "lost", "unexplained", "rate")
 SECRECY = ("relative", "perfect")
 
 LINKS = "links"

@@ -1,18 +1,26 @@
-"""What every table of a scenario has: strict entries, and all of its mistakes at once, those between entries too."""
+"""What all tables of a scenario file share: entries checked by themselves and together, all mistakes at once."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from emulator.network.access import RESERVED
 from emulator.scenario.words import listed
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Found = tuple[str, str]
-"""A mistake in a table: the entry, and what is wrong with it."""
+NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
 def expected(what: str) -> PydanticCustomError:
@@ -20,8 +28,14 @@ def expected(what: str) -> PydanticCustomError:
     return PydanticCustomError("expected", "one value", {"expected": what})
 
 
+def _probability(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise expected("a number from 0 to 1")
+    return value
+
+
 def one_of(names: Iterable[str]) -> Callable[[str], str]:
-    """A check that a value is one of some names."""
+    """A check that a value is one of the names."""
 
     def check(value: str) -> str:
         if value not in names:
@@ -31,8 +45,24 @@ def one_of(names: Iterable[str]) -> Callable[[str], str]:
     return check
 
 
+def _process_name(name: str) -> str:
+    if name in RESERVED:
+        raise expected(f"any name but {listed(RESERVED)}, which are reserved")
+    if not NAME.fullmatch(name):
+        raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
+    return name
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
+ProcessName = Annotated[str, AfterValidator(_process_name)]
+Matrix = list[list[Annotated[float, Field(strict=True)]]]
+Found = tuple[str, str]
+"""A mistake in a table: the entry, and what is wrong with it."""
+
+
 class Table(BaseModel):
-    """A table of a scenario. Abstract."""
+    """A table of a scenario file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -66,3 +96,12 @@ def _again(detail: ErrorDetails) -> InitErrorDetails:
     kind, context = detail["type"], detail.get("ctx", {})
     own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
     return InitErrorDetails(type=own, loc=detail["loc"], input=detail["input"], ctx=context)
+
+
+def numbers(rows: Any) -> bool:
+    """Whether these are rows of numbers, of any lengths."""
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_number, row)) for row in rows)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)

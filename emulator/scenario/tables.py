@@ -5,7 +5,6 @@ Source: docs/scenario.md.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -18,41 +17,20 @@ from emulator.model.links import LOSS_MODELS, loss_of
 from emulator.model.links.link import LossModel
 from emulator.model.process import Process, mistakes_of
 from emulator.model.schemes import SCHEMES
-from emulator.network.access import LEGITIMATE, RESERVED
+from emulator.network.access import LEGITIMATE
 from emulator.scenario.expect import ExpectTable
-from emulator.scenario.table import Found, Table, expected, one_of
+from emulator.scenario.table import (
+    Found,
+    Matrix,
+    Probability,
+    ProcessName,
+    Table,
+    numbers,
+    one_of,
+)
 from emulator.scenario.words import as_toml, listed
 
-NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 SECRET_BYTES = 32
-
-
-def _probability(value: float) -> float:
-    if not 0.0 <= value <= 1.0:
-        raise expected("a number from 0 to 1")
-    return value
-
-
-def _process_name(name: str) -> str:
-    if name in RESERVED:
-        raise expected(f"any name but {listed(RESERVED)}, which are reserved")
-    if not NAME.fullmatch(name):
-        raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
-    return name
-
-
-Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
-ProcessName = Annotated[str, AfterValidator(_process_name)]
-Matrix = list[list[Annotated[float, Field(strict=True)]]]
-
-
-def _numbers(rows: Any) -> bool:
-    """Whether these are rows of numbers, of any lengths."""
-    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_number, row)) for row in rows)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)
 
 
 class ProcessTable(Table):
@@ -69,7 +47,7 @@ class ProcessTable(Table):
         matrices: dict[str, NDArray[np.float64]] = {}
         for name, field in cls.model_fields.items():
             rows = table.get(name)
-            if not _numbers(rows) or rows is None:
+            if not numbers(rows) or rows is None:
                 continue
             lengths = {len(row) for row in rows}
             if lengths == {len(rows)} and rows:
@@ -217,17 +195,12 @@ class Scenario(Table):
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
     eavesdroppers: Annotated[
         dict[ProcessName, EavesdropperTable],
-        Field(
-            default_factory=dict,
-            max_length=64,
-            examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}],
-        ),
-    ]
+        Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
+    ] = Field(default_factory=dict)
     expect: Annotated[
-        list[ExpectTable],
-        Field(default_factory=list, examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]]),
-    ]
-    made_with: Annotated[dict[str, str], Field(default_factory=dict, exclude=True)]
+        list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
+    ] = Field(default_factory=list)
+    made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
 
     @property
     def receivers(self) -> tuple[str, ...]:

@@ -170,13 +170,17 @@ def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> No
     )
     (one,) = results.summary["expectations"]
     assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
-    assert told(one) == "expected legitimate in step by slot 3: FAILED, found no such slot in some trial"
+    assert told(one) == "expected legitimate in step by slot 3: FAILED, found none"
     ranged = {"figure": "smart.used_fraction", "slots": [3, 9], "below": 1}
-    scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged]})
+    secret = {"secrecy": "relative", "against": "smart"}
+    scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
     short = {name: Tally(9, 1) for name in scenario.receivers}
+    open_ = Secrecy("smart", Verdict.UNDECIDED, Verdict.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
     figures = dict.fromkeys(scenario.receivers, short["smart"].figures)
-    judged = Evidence(scenario, figures, {}, short, {}, {}).judged("evedrop run x")
-    assert [(one["held"], one["found"], "replay" in one) for one in judged] == [(None, None, False)] * 2
+    judged = Evidence(scenario, figures, {}, short, {}, {"smart": open_}).judged("evedrop run x")
+    assert [one["held"] for one in judged] == [None] * 3
+    assert [one["found"] for one in judged[:2]] == [None] * 2
+    assert not any("replay" in one for one in judged)
 
 
 @pytest.mark.parametrize(
@@ -230,6 +234,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     assert (done.status, done.err) == (1, "")
     first = load_results(evedrop.folder / "a run").summary["expectations"]
     assert [one["held"] for one in first] == [False, False]
+    assert "2 of 2 expectations FAILED" in done.out
     said = [line.strip() for line in done.out.splitlines()]
     for one in first:
         assert said[said.index(told(one)) + 1] == f"see it again: {one['replay']}"
