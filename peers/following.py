@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from emulator.brief import Brief
-from emulator.model.receiver import Receiver
+from emulator.model.receiver import Heard, Receiver
 from emulator.network.reporting import BeliefReporter
 from emulator.network.session import Session
 from emulator.network.wire import read_delivery
@@ -21,6 +21,6 @@ def follow(brief: Brief, receiver: Receiver) -> None:
         belief = receiver.prior()
         for k in range(brief.slots):
             gamma, z = read_delivery(downlink, deliveries.recv().payload.to_bytes(), k, shape)
-            belief = receiver.step(k, belief, gamma, z)
+            belief = receiver.step(k, belief, Heard(gamma, z))
             reporter.add(k, belief)
         session.wait_for("end")

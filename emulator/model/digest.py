@@ -52,7 +52,7 @@ class BeliefLog:
     def add(self, k: int, belief: Belief) -> Digests | None:
         """Take slot k; at the end of a block, its digest for every trial, (R, 32)."""
         row = k % BLOCK_SLOTS
-        self._x_hat[row], self._P[row], self._action[row] = belief
+        self._x_hat[row], self._P[row], self._action[row] = belief.x_hat, belief.P, belief.action
         if row == BLOCK_SLOTS - 1 or k == self._slots - 1:
             return self._digest(row + 1)
         return None

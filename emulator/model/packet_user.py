@@ -7,8 +7,7 @@ from abc import abstractmethod
 import numpy as np
 
 from emulator.model import update
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Codes, Flags, Receiver
+from emulator.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver
 
 _ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)
 
@@ -29,11 +28,11 @@ class PacketUser(Receiver):
         used = gamma if uses is None else gamma & uses
         return _ACTIONS[gamma.view(np.uint8) + used.view(np.uint8)]
 
-    def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is used."""
-        action = self.act(k, gamma)
+        action = self.act(k, heard.gamma)
         return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, z),
+            update.estimate(self.process, k, belief.x_hat, action, heard.z),
             update.believed_covariance(self.process, k, belief.P, action),
             action,
         )

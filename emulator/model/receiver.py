@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,19 @@ class Action(IntEnum):
     """The packet was received and not used."""
 
 
+class Heard(NamedTuple):
+    """What a receiver got in a slot, for R trials."""
+
+    gamma: Flags
+    """γ_k: received or not, (R,)."""
+    z: Floats
+    """The packets, (n, R); of any value where nothing was received."""
+    header: NDArray[np.int64] | None = None
+    """What the scheme sends in clear beside each packet, (h, R); None for a scheme that has no header."""
+
+
 class Belief(NamedTuple):
-    """A receiver's knowledge after a slot, for R trials."""
+    """A receiver's knowledge after a slot, for R trials. Never changed: a slot makes a new one."""
 
     x_hat: Floats
     """Estimate, (n, R)."""
@@ -38,6 +49,8 @@ class Belief(NamedTuple):
     """Error covariance the receiver believes, (n, n, R)."""
     action: Codes
     """`Action` of the slot, (R,)."""
+    memory: tuple[NDArray[Any], ...] = ()
+    """What a receiver knows besides: arrays whose last axis is the trials."""
 
 
 def select(flags: Flags, yes: Callable[[], Floats], no: Callable[[], Floats]) -> Floats:
@@ -84,8 +97,5 @@ class Receiver(ABC):
         """`Action` of slot k in every trial, (R,), from γ (R,) alone: no scheme of this kind looks at the packet first."""
 
     @abstractmethod
-    def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
-        """Belief after slot k, from the one before it and the delivery.
-
-        gamma (R,): received or not; z (n, R): the packets, of any value where gamma is false.
-        """
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """Belief after slot k, from the one before it and what was heard in it. Any slot may be asked for again."""

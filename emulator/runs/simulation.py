@@ -22,7 +22,7 @@ from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.links import link_of
 from emulator.model.links.link import Fate
 from emulator.model.process import Floats, ProcessNoise, Trajectory
-from emulator.model.receiver import Codes, Flags, Receiver, trace_of
+from emulator.model.receiver import Codes, Flags, Heard, Receiver, trace_of
 from emulator.model.schemes import SCHEMES
 from emulator.model.theory import misled_covariances
 from emulator.network.access import LEGITIMATE
@@ -124,7 +124,7 @@ class Simulation:
                 packet = encoder.encode(k, x[row], trajectory.predicted)
                 nu[row] = packet.nu
                 for name, receiver in self._receivers.items():
-                    beliefs[name] = receiver.step(k, beliefs[name], delivered[name][row], packet.z)
+                    beliefs[name] = receiver.step(k, beliefs[name], Heard(delivered[name][row], packet.z))
                     digests = logs[name].add(k, beliefs[name])
                     if digests is not None:
                         self.digests[name][k // BLOCK_SLOTS] = digests

@@ -16,7 +16,7 @@ from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.links.bernoulli import Bernoulli
 from emulator.model.links.link import Link
 from emulator.model.process import Floats, Process, Trajectory
-from emulator.model.receiver import Receiver
+from emulator.model.receiver import Heard, Receiver
 from emulator.model.schemes.innovation import Innovation
 from emulator.model.theory import Outcomes, expected_traces
 from emulator.streams import Batch, root_of_seed, stream_key
@@ -116,7 +116,7 @@ def _simulate_batch(batch: Batch, sums: dict[str, Floats]) -> None:
         x = trajectory.advance()
         z = encoder.encode(k, x, trajectory.predicted).z
         for name, receiver in receivers.items():
-            beliefs[name] = receiver.step(k, beliefs[name], gammas[name != "legitimate"], z)
+            beliefs[name] = receiver.step(k, beliefs[name], Heard(gammas[name != "legitimate"], z))
             squared_error = np.sum((x - beliefs[name].x_hat) ** 2, axis=0)
             trace = np.trace(beliefs[name].P)
             for row, value in enumerate((squared_error, squared_error**2, trace, trace**2)):

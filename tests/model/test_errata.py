@@ -162,7 +162,7 @@ def test_item_6_successive_packets_tell_types_apart() -> None:
     for k in range(batch.slots):
         x = trajectory.advance()
         packets.append(encoder.encode(k, x, trajectory.predicted))
-    (before, nu_before), (now, nu) = packets[-2:]
+    (before, nu_before), (now, nu) = ((packet.z, packet.nu) for packet in packets[-2:])
     sigma = state_covariances(process, 4)
     for innovation, cross in ((False, process.A @ sigma[2]), (True, np.zeros((2, 2)))):
         chosen = ~nu_before & (nu == innovation)

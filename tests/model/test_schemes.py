@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Action, Belief
+from emulator.model.receiver import Action, Belief, Heard
 from emulator.model.schemes import SCHEMES
 from emulator.model.theory import state_covariances
 from emulator.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
@@ -33,7 +33,7 @@ def packets(scheme: str, process: Process, batch: Batch) -> Iterator[tuple[np.nd
     encoder = SCHEMES[scheme](process, MU_D).encoder(KEYS, batch)
     for k in range(batch.slots):
         x = trajectory.advance()
-        z, nu = encoder.encode(k, x, trajectory.predicted)
+        z, nu, *_ = encoder.encode(k, x, trajectory.predicted)
         yield x.copy(), z.copy(), nu.copy()
 
 
@@ -42,8 +42,8 @@ def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> l
     estimator = SCHEMES[scheme](process, MU_D).estimator(KEYS, batch)
     belief, found = estimator.prior(), []
     for k, (_, z, _) in enumerate(packets(scheme, process, batch)):
-        belief = estimator.step(k, belief, gamma[k], z)
-        found.append(Belief(*(part.copy() for part in belief)))
+        belief = estimator.step(k, belief, Heard(gamma[k], z))
+        found.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
     return found
 
 

@@ -16,6 +16,7 @@ from independent_legitimate import Estimator
 from emulator import montecarlo
 from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.process import Trajectory
+from emulator.model.receiver import Heard
 from emulator.model.schemes import SCHEMES
 from emulator.network import wire
 from emulator.runs.briefs import Observation, StreamKeys, briefs_of
@@ -71,7 +72,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     beliefs, blocks = [], {}
     for k, gamma in enumerate(gammas):
         z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
-        belief = estimator.step(k, belief, gamma, z)
+        belief = estimator.step(k, belief, Heard(gamma, z))
         beliefs.append(belief)
         digests = log.add(k, belief)
         if digests is not None:

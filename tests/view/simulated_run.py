@@ -10,7 +10,7 @@ import numpy as np
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.process import Floats, Process, Trajectory
-from emulator.model.receiver import Receiver
+from emulator.model.receiver import Heard, Receiver
 from emulator.model.schemes import SCHEMES
 from emulator.streams import Batch, root_of_seed, stream_key
 from emulator.view.recording import PeerSlots, Scene, Shown, Slots
@@ -78,12 +78,12 @@ def simulate(
     seen: dict[str, list[tuple[Floats, ...]]] = {name: [] for name in receivers}
     for k in range(slots):
         x = trajectory.advance()
-        z, nu = encoder.encode(k, x, trajectory.predicted)
+        z, nu, *_ = encoder.encode(k, x, trajectory.predicted)
         truth.append(x[:, 0])
         nus.append(nu[0])
         for name, (_, receiver) in receivers.items():
             gamma = arrivals.random(trials) < qualities[name]
-            beliefs[name] = b = receiver.step(k, beliefs[name], gamma, z)
+            beliefs[name] = b = receiver.step(k, beliefs[name], Heard(gamma, z))
             error = np.sum((x - b.x_hat) ** 2, axis=0).mean()
             trace = np.trace(b.P).mean()
             seen[name].append((b.x_hat[:, 0], b.P[:, :, 0], b.action[0], error, trace))

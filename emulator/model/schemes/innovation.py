@@ -8,7 +8,7 @@ import numpy as np
 
 from emulator.model import update
 from emulator.model.process import Floats, Process, StateFactors, product
-from emulator.model.receiver import Belief, Codes, Flags, Receiver, select
+from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
 from emulator.model.schedule import Schedule
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme, Shared
 from emulator.streams import Batch, BlockReader
@@ -85,9 +85,9 @@ class InnovationEstimator(Receiver):
         # The codes 0, 1, 2 of `Action` are these sums: LOST, STATE where γ, INNOVATION where γ and ν.
         return gamma.view(np.uint8) + (gamma & self._secret.nu(k)).view(np.uint8)
 
-    def step(self, k: int, belief: Belief, gamma: Flags, z: Floats) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
-        action = self.act(k, gamma)
+        action, z = self.act(k, heard.gamma), heard.z
         return Belief(
             update.estimate(self.process, k, belief.x_hat, action, z, lambda: z - self._secret.chi(k)),
             update.believed_covariance(self.process, k, belief.P, action),

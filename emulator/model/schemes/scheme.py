@@ -6,6 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator.model.process import Floats, Process
 from emulator.model.receiver import Flags, Receiver
 from emulator.streams import Batch
@@ -18,6 +21,10 @@ class Packet(NamedTuple):
     """Payload, (n, R)."""
     nu: Flags
     """ν_k, (R,): true for an innovation. Never sent; the sensor's own record."""
+    header: NDArray[np.int64] | None = None
+    """What is sent in clear beside z, (h, R); None for a scheme that has no header."""
+    sent: Flags | None = None
+    """Whether anything is sent, (R,); None for a scheme that sends in every slot."""
 
 
 class Encoder(ABC):
@@ -26,6 +33,9 @@ class Encoder(ABC):
     @abstractmethod
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The packet of slot k, from x_k and A x_{k−1}, both (n, R)."""
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:  # noqa: B027 - most schemes need none
+        """Take the acknowledgements (R,) of the packets of slot k, as they reached the sensor; before slot k + 1 is sent."""
 
 
 class Shared(ABC):
