@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,12 +107,15 @@ def design(
                 f"the design of μ_d is for independent losses, and the link of {name} has others; give it a quality, "
                 f"such as --set '{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}'"
             )
-    adversaries = [
-        Adversary(name, made.quality[name], *STRATEGIES[table.strategy].use_probabilities(table.parameters))
-        for name, table in made.eavesdroppers.items()
-    ]
+    adversaries, left_out = [], {}
+    for name, table in made.eavesdroppers.items():
+        outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, 0.5)
+        if outcomes_at is None:
+            left_out[name] = table.strategy
+        else:
+            adversaries.append(Adversary.who(name, made.quality[name], outcomes_at(1.0)))
     process, mu, mu_d = made.process.process, made.quality[LEGITIMATE], made.encoding.mu_d
-    return design_of(process, mu, mu_d, adversaries, made.slots, max_trace)
+    return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
 
 
 def _prepared(

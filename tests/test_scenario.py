@@ -78,7 +78,10 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
         ("legitimate.link.quality", -0.5, "legitimate.link.quality: is -0.5; expected a number from 0 to 1, such as 0.9"),
         ("legitimate.link.quality", "0.5", 'legitimate.link.quality: is "0.5"; expected a number, such as 0.9'),
         ("legitimate.link", 0.5, "legitimate.link: is 0.5; expected a table, such as { quality = 0.9 }"),
-        ("eavesdroppers.smart.strategy", "clever", "expected naive, smart or suspicious"),
+        ("eavesdroppers.smart.strategy", "clever", "expected bayesian, colluding, constant, genie, likelihood, naive, rep"),
+        ("eavesdroppers.smart.links", [{"quality": 0.5}, {"quality": 0.6}], "links: is set, but the strategy smart has no s"),
+        ("eavesdroppers.smart.reads_as", "genie", "reads_as: is set, but the strategy smart has no such parameter; rem"),
+        ("eavesdroppers.smart.learns_at", 3, "learns_at: is set, but the strategy smart has no such parameter"),
         ("eavesdroppers.smart.use_state", 0.5, "is set, but the strategy smart has no such parameter"),
         ("eavesdroppers.smart.strategy", "suspicious", "eavesdroppers.smart.use_innovation: is missing; the strategy"),
         ("eavesdroppers.Eve", GOOD["eavesdroppers"]["smart"], 'eavesdroppers.Eve: is "Eve"; expected a name of a lower'),
@@ -146,6 +149,66 @@ def test_all_mistakes_are_named_at_once() -> None:
     ):
         assert len([line for line in found if line.startswith(path)]) == 1, path
     assert len(found) == 13
+
+
+POOL = {"strategy": "colluding", "links": [{"quality": 0.6}, {"quality": 0.5}], "reads_as": "smart"}
+SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "link": {"quality": 0.5}}
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({**POOL, "links": None}, ["links: is missing; the strategy colluding needs it; expected links = [{ quality"]),
+        ({**POOL, "links": []}, ["links: has fewer than 2 entries; expected at least so many"]),
+        ({**POOL, "links": [{"quality": 2.0}] * 17}, ["links: has more than 16 entries; expected at most so many"]),
+        ({**POOL, "links": [{"quality": 2.0}, {}]}, ["links.0.quality: is 2.0; expected a number from 0 to 1, such as",
+                                                     "links.1.quality: is missing; expected quality = 0.9, or a loss"]),
+        ({**POOL, "link": {"quality": 0.5}}, ["link: is set, but the strategy colluding has no such parameter; its ent"]),
+        ({**POOL, "reads_as": None}, ['reads_as: is missing; the strategy colluding needs it; expected reads_as = "sm']),
+        ({**POOL, "reads_as": "colluding"}, ['reads_as: is "colluding"; expected bayesian, constant, genie, likelihood']),
+        ({**POOL, "reads_as": "suspicious", "use_state": 0.5}, ["use_innovation: is missing; the strategy colluding ne"]),
+        ({**SPY, "learns_at": None}, ["learns_at: is missing; the strategy replay-informed needs it; expected learns_at"]),
+        ({**SPY, "learns_at": -1}, ["learns_at: is -1; expected a number at least 0, such as 40"]),
+        ({**SPY, "learns_at": 50}, ["learns_at: is 50; expected a slot of the run, 0 to 49"]),
+        ({"strategy": "clever"}, ['strategy: is "clever"; expected', "link: is missing; expected link = { quality = 0.9"]),
+    ],
+)  # fmt: skip
+def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], said: list[str]) -> None:
+    """What a strategy lacks, what it has too much of, and what is wrong with it: a line each."""
+    given = {name: value for name, value in table.items() if value is not None}
+    found = mistakes({"eavesdroppers.eve": given})
+    assert len(found) == len(said), found
+    for line, start in zip(sorted(found), sorted(said), strict=True):
+        assert line.startswith(f"eavesdroppers.eve.{start}")
+
+
+def test_eavesdroppers_that_are_right_are_taken() -> None:
+    """With exactly what each strategy needs; the parameters are those that its process is told."""
+    suspicious = {"reads_as": "suspicious", "use_state": 0.5, "use_innovation": 0.1}
+    tables = {"pool": POOL, "spy": SPY, "careful": {**POOL, **suspicious}}
+    link = {"link": {"quality": 0.9}}
+    tables |= {name: {"strategy": name, **link} for name in ("constant", "genie", "bayesian", "likelihood")}
+    scenario = parse(tomli_w.dumps(GOOD), "scenario", {"eavesdroppers": tables})
+    assert {name: table.parameters for name, table in scenario.eavesdroppers.items()} == {
+        **{name: {} for name in tables},
+        "pool": {"reads_as": "smart"},
+        "spy": {"reads_as": "bayesian", "learns_at": 5},
+        "careful": suspicious,
+    }
+    assert scenario.quality["pool"] == pytest.approx(1 - 0.4 * 0.5)
+    assert Scenario.model_validate(scenario.model_dump(mode="json")) == scenario
+    assert parse(resolved(scenario), "resolved").eavesdroppers == scenario.eavesdroppers
+
+
+@pytest.mark.parametrize(("strategy", "entry"), [("smart", "strategy"), ("genie", "strategy"), ("smart", "reads_as")])
+def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entry: str) -> None:
+    """Told with the strategies that can do without."""
+    table = {"strategy": strategy, "link": {"quality": 0.8}} if entry == "strategy" else {**POOL, "reads_as": strategy}
+    (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
+    assert line == (
+        f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by what it knows of the schedule, and the scheme '
+        "plain has none; expected bayesian, constant, likelihood or naive"
+    )
 
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.05, "r": 0.5}
@@ -222,6 +285,8 @@ def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
     ]
     (line,) = mistakes({**pattern, "expect": expect})
     assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but there is no theory for')
+    (line,) = mistakes({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
+    assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another figure")
 
 
 def test_more_slots_than_the_horizon_are_refused() -> None:

@@ -2,7 +2,7 @@
 
 For each link state s, E_k(s) = E[P_k; state s in slot k], and with q(s) its quality and T the transitions
 
-    E_k(s) = kept(q(s)) A (Σ_r T(r, s) E_{k−1}(r)) Aᵀ + π(s) (p_d(q(s)) Q + p_i(q(s)) f_k),
+    E_k(s) = kept(q(s)) A (Σ_r T(r, s) E_{k−1}(r)) Aᵀ + π(s) (p_d(q(s)) Q + p_i(q(s)) f_k + p_l(q(s)) M_k),
 
 because the state of slot k alone decides what becomes of its packet. The sum over s is E P_k.
 
@@ -11,16 +11,12 @@ Source: docs/mathematics.md, losses in bursts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
+from emulator.model.leak import RemainingCovariances, remaining_limit
 from emulator.model.links.link import Chain
 from emulator.model.process import Floats, Process
-from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, lyapunov, radius
-
-OutcomesAt = Callable[[float], Outcomes]
-"""From the quality of a link to what its receiver does with a slot."""
+from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, OutcomesAt, lyapunov, radius
 
 
 class ModulatedCovariance:
@@ -35,6 +31,8 @@ class ModulatedCovariance:
             np.array([one.predicted for one in outcomes])[:, None, None] * chain.law[:, None, None] * process.Q
         )
         self._misled = 2.0 * np.array([one.misled for one in outcomes])[:, None, None] * chain.law[:, None, None]
+        self._leaked = np.array([one.leaked for one in outcomes])[:, None, None] * chain.law[:, None, None]
+        self._remaining = RemainingCovariances(process) if self._leaked.any() else None
         start = np.array([one.initial for one in outcomes])[:, None, None] * chain.law[:, None, None]
         self._states: Floats = start * process.initial_covariance
         self._sigma = ExpectedCovariance(process, NOBODY)
@@ -53,6 +51,8 @@ class ModulatedCovariance:
                     grown = A @ self._before @ A.T
                     misled = np.where(self._misled > 0.0, self._misled * grown, 0.0)
                     self._states = self._kept * (A @ mixed @ A.T) + self._diffused + misled
+                    if self._remaining is not None:
+                        self._states = self._states + self._leaked * self._remaining.next()
                 self._before = sigma[row]
                 total = float(np.trace(self._states.sum(axis=0)))
                 traces[row] = total if np.isfinite(total) else np.inf
@@ -65,7 +65,7 @@ def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> floa
     misled = any(one.misled > 0.0 for one in outcomes)
     if misled and radius(process) >= 1.0:
         return float("inf")
-    if not misled and all(one.predicted == 0.0 and one.initial == 0.0 for one in outcomes):
+    if not misled and all(one.predicted + one.leaked + one.initial == 0.0 for one in outcomes):
         return 0.0
     n, states = process.n, len(chain.law)
     kept = np.repeat([one.kept for one in outcomes], n * n)
@@ -73,9 +73,10 @@ def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> floa
     if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
         return float("inf")
     f = 2.0 * (process.A @ lyapunov(process, 1.0) @ process.A.T) if misled else np.zeros_like(process.Q)
+    M = remaining_limit(process) if any(one.leaked for one in outcomes) else np.zeros_like(process.Q)
     source = np.concatenate(
         [
-            law * (one.predicted * process.Q + one.misled * f).reshape(-1)
+            law * (one.predicted * process.Q + one.misled * f + one.leaked * M).reshape(-1)
             for law, one in zip(chain.law, outcomes, strict=True)
         ]
     )
@@ -89,7 +90,7 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     Source: docs/mathematics.md, losses in bursts.
     """
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-    if all(one.predicted == 0.0 for one in outcomes):
+    if all(one.predicted + one.leaked == 0.0 for one in outcomes):
         return outcomes[0]
     keeps = np.array([one.kept for one in outcomes])[:, None] * chain.transitions.T
     rate = min(1.0, float(np.max(np.abs(np.linalg.eigvals(keeps)))))

@@ -19,6 +19,8 @@ from emulator.streams import Batch, BlockReader
 
 Floats = NDArray[np.float64]
 
+MARGINAL = 1e-7
+"""An eigenvalue of A this close to the unit circle is on it, computed: a double one has errors of 1e-8."""
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding does not explain
 
 

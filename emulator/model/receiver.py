@@ -24,7 +24,7 @@ class Action(IntEnum):
     STATE = 1
     """The packet was used as the state."""
     INNOVATION = 2
-    """The packet was decoded as an innovation, with the secret."""
+    """The packet was read as an innovation: decoded with the secret, or without it for the little that it leaks."""
     DISCARDED = 3
     """The packet was received and not used."""
 
@@ -38,6 +38,8 @@ class Heard(NamedTuple):
     """The packets, (n, R); of any value where nothing was received."""
     header: NDArray[np.int64] | None = None
     """What the scheme sends in clear beside each packet, (h, R); None for a scheme that has no header."""
+    truth: Floats | None = None
+    """x_k itself, (n, R), in the one slot whose state is betrayed to this receiver, received or not; else None."""
 
 
 class Belief(NamedTuple):
@@ -86,11 +88,18 @@ class Receiver(ABC):
         self.process = process
         self.trials = trials
 
-    def prior(self) -> Belief:
-        """Belief before slot 0: x̂ = 0, P = Σ0 (docs/mathematics.md, legitimate estimator)."""
+    def prior(self, first: int = 0) -> Belief:
+        """Belief before slot `first` of who has heard nothing yet: x̂ = 0, P = Σ_{first−1}, and Σ0 before slot 0.
+
+        Source: docs/mathematics.md, legitimate estimator.
+        """
         n = self.process.n
-        P = np.repeat(self.process.initial_covariance[:, :, None], self.trials, axis=2)
-        return Belief(np.zeros((n, self.trials)), P, np.zeros(self.trials, np.uint8))
+        sigma = self.process.initial_covariance[:, :, None]
+        for _ in range(first - 1):
+            sigma = self.process.diffuse(self.process.carry(sigma))
+        return Belief(
+            np.zeros((n, self.trials)), np.repeat(sigma, self.trials, axis=2), np.zeros(self.trials, np.uint8)
+        )
 
     @abstractmethod
     def act(self, k: int, gamma: Flags) -> Codes:

@@ -60,10 +60,10 @@ class StreamKeys:
         """Of a receiver's link."""
         return stream_key(self.seed_root, f"link/{receiver}")
 
-    def eavesdropper(self, name: str, strategy: str) -> dict[str, bytes]:
+    def eavesdropper(self, name: str, strategy: str, parameters: Mapping[str, Any]) -> dict[str, bytes]:
         """What an eavesdropper's strategy must be given: the schedule's key, its own coin's, or nothing."""
         keys = {}
-        for stream in STRATEGIES[strategy].streams:
+        for stream in STRATEGIES[strategy].streams(parameters):
             own = stream_key(self.seed_root, f"coin/{name}")
             keys[stream] = own if stream == "coin" else stream_key(self.secret_root, stream)
         return keys
@@ -144,7 +144,7 @@ def briefs_of(
     ]
     for name, table in scenario.eavesdroppers.items():
         part = {"strategy": table.strategy, "parameters": table.parameters}
-        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy), part))
+        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
     return {one.process: one for one in made}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +12,7 @@ from emulator.model import modulated, theory
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.links.link import Chain
 from emulator.model.process import Floats, Process
-from emulator.model.theory import ExpectedCovariance, Outcomes
+from emulator.model.theory import ExpectedCovariance, Outcomes, OutcomesAt
 from emulator.network.access import LEGITIMATE
 from emulator.scenario import Scenario
 
@@ -26,7 +25,7 @@ class Stream(Protocol):
 
 
 class _Unknown:
-    """Of a link that no theory is for. Final."""
+    """Of a receiver that no theory is for. Final."""
 
     def next_traces(self, slots: int) -> Floats:
         """Nothing, (slots,)."""
@@ -40,13 +39,17 @@ class Expectation:
     process: Process
     chain: Chain | None
     """None: the losses follow none."""
-    outcomes_at: Callable[[float], Outcomes]
-    """From the quality of a link to what the receiver does with a slot."""
+    outcomes_at: OutcomesAt | None
+    """From the quality of a link to what the receiver does with a slot; None: nobody knows how often it does what."""
 
     @property
     def known(self) -> bool:
-        """Whether there is a theory for the link."""
-        return self.chain is not None
+        """Whether there is a theory for the link and for what the receiver does."""
+        return self._known is not None
+
+    @property
+    def _known(self) -> tuple[Chain, OutcomesAt] | None:
+        return None if self.chain is None or self.outcomes_at is None else (self.chain, self.outcomes_at)
 
     @property
     def independent(self) -> bool:
@@ -56,19 +59,16 @@ class Expectation:
     @property
     def _outcomes(self) -> Outcomes | None:
         """Of a link whose losses are independent, as in the paper."""
-        if self.chain is None or not self.chain.independent:
+        if self._known is None or not self._known[0].independent:
             return None
-        return self.outcomes_at(float(self.chain.quality[0]))
+        chain, outcomes_at = self._known
+        return outcomes_at(float(chain.quality[0]))
 
     def stream(self) -> Stream:
         """The expected traces from slot 0 on; NaN where there is no theory."""
         if self._outcomes is not None:
             return ExpectedCovariance(self.process, self._outcomes)
-        return (
-            _Unknown()
-            if self.chain is None
-            else modulated.ModulatedCovariance(self.process, self.chain, self.outcomes_at)
-        )
+        return _Unknown() if self._known is None else modulated.ModulatedCovariance(self.process, *self._known)
 
     def traces(self, slots: int) -> Floats:
         """The expected traces of slots 0 … slots−1, (slots,); NaN where there is no theory."""
@@ -79,28 +79,24 @@ class Expectation:
         """Trace of the limit; inf if unbounded, NaN where there is no theory."""
         if self._outcomes is not None:
             return theory.limit_trace(self.process, self._outcomes)
-        return math.nan if self.chain is None else modulated.limit_trace(self.process, self.chain, self.outcomes_at)
+        return math.nan if self._known is None else modulated.limit_trace(self.process, *self._known)
 
     @property
     def infinite_variance(self) -> bool:
         """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
-        if self.chain is None:
+        if self._known is None:
             return False
         if self._outcomes is not None:
             return theory.has_infinite_variance(self.process, self._outcomes)
-        return theory.has_infinite_variance(self.process, modulated.tail_outcomes(self.chain, self.outcomes_at))
+        return theory.has_infinite_variance(self.process, modulated.tail_outcomes(*self._known))
 
 
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     """Receiver → what theory expects of it."""
     process, mu_d = scenario.process.process, scenario.encoding.mu_d
-
-    def eavesdropper(use_state: float, use_innovation: float) -> Callable[[float], Outcomes]:
-        return lambda quality: Outcomes.eavesdropper(quality, mu_d, use_state, use_innovation)
-
-    outcomes_at = {LEGITIMATE: lambda quality: Outcomes.legitimate(quality, mu_d)}
+    outcomes_at: dict[str, OutcomesAt | None] = {LEGITIMATE: lambda quality: Outcomes.legitimate(quality, mu_d)}
     for name, table in scenario.eavesdroppers.items():
-        outcomes_at[name] = eavesdropper(*STRATEGIES[table.strategy].use_probabilities(table.parameters))
+        outcomes_at[name] = STRATEGIES[table.strategy].outcomes(table.parameters, mu_d)
     return {name: Expectation(process, scenario.link(name).model.chain, at) for name, at in outcomes_at.items()}
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from emulator.errors import Interrupted, RunError, UsageError
 from emulator.model.digest import BLOCK_SLOTS, RunDigest
+from emulator.model.eavesdroppers import STRATEGIES
 from emulator.runs.expectation import expected_traces_of
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
@@ -108,9 +109,15 @@ def said_of(folder: Path) -> Iterator[None]:
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
-    """Raise UsageError where a mode cannot follow the scenario: numbers that leave double precision altogether."""
+    """Raise UsageError where a mode cannot follow the scenario: who reads packets, numbers that leave double precision."""
     if mode is Mode.EXACT:
         return
+    for name, table in scenario.eavesdroppers.items():
+        if not STRATEGIES[table.strategy].follows_gamma(table.parameters):
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and what {name} does (strategy {table.strategy}) "
+                f"depends on more; give --mode exact, or take {name} out of the scenario"
+            )
     for name, expected in expected_traces_of(scenario).items():
         beyond = np.flatnonzero(np.isinf(expected))
         if beyond.size:

@@ -207,6 +207,8 @@ def print_design(design: Design) -> None:
             "–" if against.relative_from is None else str(against.relative_from),
         )
     console.print(table)
+    if design.omission is not None:
+        console.print(design.omission)
 
 
 def _figure(value: float | str | None, how: str = ".4g") -> str:

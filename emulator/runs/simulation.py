@@ -81,12 +81,16 @@ class Simulation:
         self._shared = scheme.shared(self._keys.secret(scheme.secret_streams), self._batch)
         self._receivers: dict[str, Receiver] = {LEGITIMATE: self._shared.estimator()}
         self._receivers.update({name: self._eavesdropper(name) for name in scenario.eavesdroppers})
+        self._betrayed = {
+            name: STRATEGIES[table.strategy].betrayed(table.parameters)
+            for name, table in scenario.eavesdroppers.items()
+        }
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.receivers}
         """Receiver → block number → digests, (R, 32); filled by the exact mode alone."""
 
     def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
-        keys = self._keys.eavesdropper(name, table.strategy)
+        keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
         return STRATEGIES[table.strategy](knowledge, self._batch)
 
@@ -124,7 +128,9 @@ class Simulation:
                 packet = encoder.encode(k, x[row], trajectory.predicted)
                 nu[row] = packet.nu
                 for name, receiver in self._receivers.items():
-                    beliefs[name] = receiver.step(k, beliefs[name], Heard(delivered[name][row], packet.z))
+                    truth = x[row] if self._betrayed.get(name) == k else None
+                    heard = Heard(delivered[name][row], packet.z, packet.header, truth)
+                    beliefs[name] = receiver.step(k, beliefs[name], heard)
                     digests = logs[name].add(k, beliefs[name])
                     if digests is not None:
                         self.digests[name][k // BLOCK_SLOTS] = digests
@@ -220,13 +226,12 @@ class Simulation:
 
     def _misled(self) -> set[str]:
         """Receivers that may take an innovation for the state."""
-        mixes = self._scenario.encoding.mu_d < 1.0
-        tables = self._scenario.eavesdroppers.items()
-        return {
-            name
-            for name, table in tables
-            if mixes and STRATEGIES[table.strategy].use_probabilities(table.parameters)[1] > 0.0
-        }
+        mu_d, found = self._scenario.encoding.mu_d, set()
+        for name, table in self._scenario.eavesdroppers.items():
+            outcomes = STRATEGIES[table.strategy].outcomes(table.parameters, mu_d)
+            if outcomes is not None and outcomes(1.0).misled > 0.0:
+                found.add(name)
+        return found
 
     def _blank(self, chunk: range, fates: Mapping[str, Codes]) -> dict[str, Measured]:
         shape = (len(chunk), self._batch.trials)

@@ -13,8 +13,10 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.horizon import horizon
 from emulator.model.process import Process
+from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.tables import (
     FIGURES,
@@ -25,10 +27,11 @@ from emulator.scenario.tables import (
     Found,
     LegitimateTable,
     LinkTable,
+    PooledLinks,
     ProcessTable,
     Scenario,
 )
-from emulator.scenario.words import as_toml
+from emulator.scenario.words import as_toml, listed
 
 _EXPECTED: Mapping[str, str] = {
     "float_type": "a number",
@@ -74,8 +77,9 @@ def _sentence(detail: ErrorDetails) -> str:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {as_toml(found)}; expected a number {bound}{example}"
-    if kind == "too_long":
-        return f"has more than {context['max_length']} entries; expected at most so many"
+    if kind in {"too_long", "too_short"}:
+        limit = f"more than {context['max_length']}" if kind == "too_long" else f"fewer than {context['min_length']}"
+        return f"has {limit} entries; expected {'at most' if kind == 'too_long' else 'at least'} so many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(found)}; expected {expected}{example}"
 
@@ -89,6 +93,7 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "encoding": EncodingTable,
         "legitimate": LegitimateTable,
         "link": LinkTable,
+        "links": LinkTable,
         "eavesdroppers": EavesdropperTable,
         "expect": ExpectTable,
     }
@@ -114,6 +119,8 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials > 0:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
+    if isinstance(tables.get("eavesdroppers", {}), dict):
+        found += _strategy_mistakes(tables.get("eavesdroppers", {}), tables.get("encoding"), slots)
     eavesdroppers, expectations = tables.get("eavesdroppers", {}), tables.get("expect", [])
     if isinstance(eavesdroppers, dict) and isinstance(expectations, list):
         available = [f"{receiver}.{figure}" for receiver in (LEGITIMATE, *eavesdroppers) for figure in FIGURES]
@@ -126,20 +133,54 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
                 found.append(f"expect.{i}.figure: is {as_toml(figure)}; expected {names}{hint}")
             elif isinstance(figure, str) and figure.endswith(".expected_trace_covariance"):
                 receiver = figure.partition(".")[0]
-                if not _has_theory(tables.get(LEGITIMATE) if receiver == LEGITIMATE else eavesdroppers[receiver]):
-                    why = f"there is no theory for the losses of {receiver}'s link"
+                why = _no_theory(
+                    receiver, tables.get(LEGITIMATE) if receiver == LEGITIMATE else eavesdroppers[receiver]
+                )
+                if why is not None:
                     found.append(f"expect.{i}.figure: is {as_toml(figure)}, but {why}; expected another figure")
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     return found
 
 
-def _has_theory(receiver: Any) -> bool:
-    """Whether there is a theory for a receiver's link, as far as it is one."""
+def _no_theory(name: str, receiver: Any) -> str | None:
+    """Why there is no theory for a receiver, as far as it is one; None if there is."""
     try:
-        return LinkTable.model_validate(receiver["link"]).model.chain is not None
+        if name == LEGITIMATE:
+            link: LinkTable | PooledLinks = LinkTable.model_validate(receiver["link"])
+        else:
+            table = EavesdropperTable.model_validate(receiver)
+            link = table.pool
+            if STRATEGIES[table.strategy].outcomes(table.parameters, 0.5) is None:
+                return f"no closed form is known for the strategy {table.strategy} of {name}"
+        return None if link.model.chain is not None else f"there is no theory for the losses of {name}'s link"
     except (TypeError, KeyError, ValidationError):
-        return True
+        return None
+
+
+def _strategy_mistakes(eavesdroppers: Mapping[str, Any], encoding: Any, slots: Any) -> list[str]:
+    """Strategies that need what the scheme does not have, or what comes after the run."""
+    found = []
+    scheme = SCHEMES.get(str(encoding.get("scheme"))) if isinstance(encoding, dict) else None
+    for name, entries in eavesdroppers.items():
+        try:
+            table = EavesdropperTable.model_validate(entries)
+        except ValidationError:
+            continue
+        strategy = STRATEGIES[table.strategy]
+        needed = [stream for stream in strategy.streams(table.parameters) if stream != "coin"]
+        lacking = [stream for stream in needed if scheme is not None and stream not in scheme.secret_streams]
+        if lacking:
+            entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
+            able = [one for one in READERS if not READERS[one].streams({})]
+            found.append(
+                f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by what it knows of the "
+                f"{listed(lacking)}, and the scheme {encoding['scheme']} has none; expected {listed(sorted(able))}"
+            )
+        betrayed = strategy.betrayed(table.parameters)
+        if betrayed is not None and type(slots) is int and betrayed >= slots > 0:
+            found.append(f"eavesdroppers.{name}.learns_at: is {betrayed}; expected a slot of the run, 0 to {slots - 1}")
+    return found
 
 
 def _secret_mistakes(file: str) -> list[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -22,7 +23,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.links import LOSS_MODELS, loss_of
 from emulator.model.links.link import LossModel
 from emulator.model.process import Process, mistakes_of
@@ -220,6 +221,23 @@ class LinkTable(_Table):
         return loss_of(self.spec)
 
 
+@dataclass(frozen=True)
+class PooledLinks:
+    """Several links that end at one receiver."""
+
+    links: list[LinkTable]
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """What the router is told."""
+        return {"model": "pooled", "links": [link.spec for link in self.links]}
+
+    @property
+    def model(self) -> LossModel:
+        """The loss model, fresh."""
+        return loss_of(self.spec)
+
+
 LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
 
 
@@ -230,34 +248,55 @@ class LegitimateTable(_Table):
 
 
 class EavesdropperTable(_Table):
-    """`[eavesdroppers.NAME]`: a strategy with its parameters, and a link."""
+    """`[eavesdroppers.NAME]`: a strategy with its parameters, and a link, or several."""
 
     strategy: Annotated[str, Field(strict=True, examples=["smart"]), AfterValidator(_one_of(STRATEGIES))]
-    link: LinkField
+    link: Annotated[LinkTable | None, Field(examples=[{"quality": 0.9}])] = None
+    links: Annotated[
+        list[LinkTable] | None, Field(min_length=2, max_length=16, examples=[[{"quality": 0.6}, {"quality": 0.5}]])
+    ] = None
+    reads_as: Annotated[
+        Annotated[str, Field(strict=True), AfterValidator(_one_of(READERS))] | None, Field(examples=["smart"])
+    ] = None
+    learns_at: Annotated[int | None, Field(ge=0, strict=True, examples=[40])] = None
     use_state: Annotated[Probability | None, Field(examples=[0.8])] = None
     use_innovation: Annotated[Probability | None, Field(examples=[0.2])] = None
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether the strategy has all its parameters and no others."""
+        """Whether the strategy has all its entries and no others."""
         strategy = STRATEGIES.get(str(table.get("strategy")))
+        example = as_toml((cls.model_fields["link"].examples or [0])[0])
         if strategy is None:
-            return []
+            lost = table.get("link") is None and table.get("links") is None
+            return [("link", f"is missing; expected link = {example}")] if lost else []
+        wanted = {"links" if strategy.pools_links else "link", *strategy.parameters}
+        reader = READERS.get(str(table.get("reads_as"))) if "reads_as" in wanted else None
+        wanted |= set(reader.parameters if reader is not None else ())
         found = []
-        for name in ("use_state", "use_innovation"):
-            wanted, given = name in strategy.parameters, table.get(name) is not None
-            if wanted and not given:
-                what = f"is missing; the strategy {table['strategy']} needs a number from 0 to 1, such as 0.5"
-                found.append((name, what))
-            if given and not wanted:
-                what = f"is set, but the strategy {table['strategy']} has no such parameter; remove the line"
+        for name, field in cls.model_fields.items():
+            given = table.get(name) is not None
+            if name in wanted and not given:
+                of = "" if name == "link" else f"the strategy {table['strategy']} needs it; "
+                found.append((name, f"is missing; {of}expected {name} = {as_toml((field.examples or [0])[0])}"))
+            if given and name not in {"strategy", *wanted}:
+                instead = "; its entry is links" if name == "link" else ""
+                what = f"is set, but the strategy {table['strategy']} has no such parameter{instead}; remove the line"
                 found.append((name, what))
         return found
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """The strategy's parameters."""
-        return {name: getattr(self, name) for name in STRATEGIES[self.strategy].parameters}
+    def parameters(self) -> dict[str, Any]:
+        """The strategy's parameters, and those of the one it reads as."""
+        names = STRATEGIES[self.strategy].parameters
+        if self.reads_as is not None:
+            names += READERS[self.reads_as].parameters
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def pool(self) -> LinkTable | PooledLinks:
+        """Its link, or its links as one."""
+        return PooledLinks(self.links or []) if self.link is None else self.link
 
 
 class ExpectTable(_Table):
@@ -328,6 +367,6 @@ class Scenario(_Table):
         """Receiver → mean probability that a packet reaches it: μ, μ_e."""
         return {name: self.link(name).model.quality for name in self.receivers}
 
-    def link(self, receiver: str) -> LinkTable:
-        """A receiver's link."""
-        return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].link
+    def link(self, receiver: str) -> LinkTable | PooledLinks:
+        """A receiver's link, or its links as one."""
+        return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].pool

@@ -44,7 +44,9 @@ def outcomes() -> dict[str, Outcomes]:
     """What each receiver does with a slot, by receiver."""
     found = {"legitimate": Outcomes.legitimate(MU, MU_D)}
     for name in ("smart", "suspicious", "naive"):
-        found[name] = Outcomes.eavesdropper(MU, MU_D, *STRATEGIES[name].use_probabilities(_SUSPICIOUS))
+        outcomes_at = STRATEGIES[name].outcomes(_SUSPICIOUS, MU_D)
+        if outcomes_at is not None:
+            found[name] = outcomes_at(MU)
     return found
 
 

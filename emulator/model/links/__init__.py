@@ -10,6 +10,7 @@ from emulator.model.links.gilbert_elliott import GilbertElliott
 from emulator.model.links.link import Link, LossModel
 from emulator.model.links.markov import Markov
 from emulator.model.links.pattern import Pattern
+from emulator.model.links.pooled import Pooled
 from emulator.streams import Batch
 
 LOSS_MODELS: Mapping[str, type[LossModel]] = {
@@ -21,7 +22,9 @@ LOSS_MODELS: Mapping[str, type[LossModel]] = {
 
 
 def loss_of(spec: Mapping[str, Any]) -> LossModel:
-    """The loss model that a scenario describes: `{"model": …, …parameters}`."""
+    """The loss model that a scenario describes: `{"model": …, …parameters}`, or `{"model": "pooled", "links": […]}`."""
+    if spec["model"] == "pooled":
+        return Pooled([loss_of(one) for one in spec["links"]])
     parameters = {name: value for name, value in spec.items() if name != "model"}
     return LOSS_MODELS[spec["model"]](**parameters)
 

@@ -62,7 +62,7 @@ class LossModel(ABC):
 
     parameters: ClassVar[Mapping[str, Any]]
     optional: ClassVar[frozenset[str]] = frozenset()
-    uniforms_per_slot: ClassVar[int] = 1
+    uniforms_per_slot: int = 1
 
     @classmethod
     @abstractmethod
