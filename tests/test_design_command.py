@@ -138,6 +138,27 @@ def test_a_run_of_any_length_can_be_designed(evedrop: Evedrop) -> None:
     assert designed(evedrop, "numerical", *changes(slots=20000))["rho"] == pytest.approx(1.387799, abs=1e-6)
 
 
+def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
+    """One line for people, an entry in the JSON; a genie, a pool of links and a constant one are designed against."""
+    extra = changes(
+        eavesdroppers__clever='{strategy = "bayesian", link = {quality = 0.9}}',
+        eavesdroppers__genie='{strategy = "genie", link = {quality = 0.9}}',
+        eavesdroppers__deaf='{strategy = "constant", link = {quality = 0.9}}',
+        eavesdroppers__pool='{strategy = "colluding", links = [{quality = 0.5}, {quality = 0.8}], reads_as = "smart"}',
+    )
+    found = designed(evedrop, "numerical", *extra)
+    assert found["left_out"] == {"clever": "bayesian"}
+    equal, genie, pool = (found["eavesdroppers"][name] for name in ("equal", "genie", "pool"))
+    assert pool == {key: pytest.approx(value) if key != "relative" else pool[key] for key, value in equal.items()}
+    assert genie["bound"] == equal["bound"]
+    assert found["legitimate"]["trace"] < genie["trace"] < equal["trace"]
+    assert found["eavesdroppers"]["deaf"]["bound"] is None
+    (line,) = [line for line in evedrop("design", "numerical", *extra).out.splitlines() if "left out" in line]
+    assert line == (
+        "left out: clever (bayesian): no closed form of its error is known; what holds against a genie holds against all"
+    )
+
+
 def test_figures_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """A small set by the command: four pictures, figures.md, and its path on standard output."""
     from emulator import cli

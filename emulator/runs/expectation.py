@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -41,6 +42,8 @@ class Expectation:
     """None: the losses follow none."""
     outcomes_at: OutcomesAt | None
     """From the quality of a link to what the receiver does with a slot; None: nobody knows how often it does what."""
+    bound_at: OutcomesAt | None = None
+    """Of a receiver without the secret that has no theory of its own: the genie, which nobody outdoes."""
 
     @property
     def known(self) -> bool:
@@ -64,6 +67,13 @@ class Expectation:
         chain, outcomes_at = self._known
         return outcomes_at(float(chain.quality[0]))
 
+    @property
+    def bound(self) -> Expectation | None:
+        """What the receiver's error cannot fall below, if that is all that theory knows of it."""
+        if self.known or self.chain is None or self.bound_at is None:
+            return None
+        return Expectation(self.process, self.chain, self.bound_at)
+
     def stream(self) -> Stream:
         """The expected traces from slot 0 on; NaN where there is no theory."""
         if self._outcomes is not None:
@@ -84,6 +94,8 @@ class Expectation:
     @property
     def infinite_variance(self) -> bool:
         """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+        if self.bound is not None:
+            return self.bound.infinite_variance
         if self._known is None:
             return False
         if self._outcomes is not None:
@@ -94,10 +106,20 @@ class Expectation:
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     """Receiver → what theory expects of it."""
     process, mu_d = scenario.process.process, scenario.encoding.mu_d
-    outcomes_at: dict[str, OutcomesAt | None] = {LEGITIMATE: lambda quality: Outcomes.legitimate(quality, mu_d)}
+    found = {
+        LEGITIMATE: Expectation(
+            process, scenario.link(LEGITIMATE).model.chain, lambda quality: Outcomes.legitimate(quality, mu_d)
+        )
+    }
     for name, table in scenario.eavesdroppers.items():
-        outcomes_at[name] = STRATEGIES[table.strategy].outcomes(table.parameters, mu_d)
-    return {name: Expectation(process, scenario.link(name).model.chain, at) for name, at in outcomes_at.items()}
+        chain, strategy = scenario.link(name).model.chain, STRATEGIES[table.strategy]
+        bound_at = None if strategy.betrayed(table.parameters) is not None else partial(_genie, mu_d)
+        found[name] = Expectation(process, chain, strategy.outcomes(table.parameters, mu_d), bound_at)
+    return found
+
+
+def _genie(mu_d: float, quality: float) -> Outcomes:
+    return Outcomes.genie(quality, mu_d)
 
 
 def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
