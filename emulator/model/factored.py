@@ -108,8 +108,9 @@ def orthogonalised(
 
 def _times(a: Entry, b: Entry) -> Entry:
     """Their product; what is 0 or 1 in all matrices costs nothing."""
-    if isinstance(b, float) and b in {0.0, 1.0}:
-        return a if b else 0.0
+    for one, other in ((a, b), (b, a)):
+        if isinstance(one, float) and one in {0.0, 1.0}:
+            return other if one else 0.0
     return a * b
 
 
@@ -117,8 +118,11 @@ def _dot(left: Sequence[Entry], right: Sequence[Entry]) -> Entry:
     """Sum of products, without those that are 0 in all matrices."""
     total: Entry = 0.0
     for a, b in zip(left, right, strict=True):
-        if not (isinstance(a, float) and a == 0.0) and not (isinstance(b, float) and b == 0.0):
-            total = total + _times(a, b)
+        term = _times(a, b)
+        if isinstance(total, float) and total == 0.0:
+            total = term
+        elif not (isinstance(term, float) and term == 0.0):
+            total = total + term
     return total
 
 

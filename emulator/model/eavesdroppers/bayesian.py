@@ -81,7 +81,7 @@ class Bayesian(PacketReader):
         mixture = Mixture(*belief.memory)
         if k == 0:
             state = gamma.astype(np.float64)
-            mixture = mixture._replace(weight=np.where(gamma, 0.0, mixture.weight))
+            mixture = Mixture(np.where(gamma, 0.0, mixture.weight), *(part.copy() for part in mixture[1:]))
         else:
             leak = self._leaks.at(k)
             mixture, state = self._weighed(mixture, gamma, z, leak)
@@ -132,14 +132,15 @@ def _weighed_ratios(
     alone = white[0] * white[0]
     for row in white[1:]:
         alone += row * row
-    exponent = np.minimum(0.5 * (alone - squared), _CERTAIN)
+    exponent = 0.5 * (alone - squared)
     # Most are told apart by far, and need no exponential.
     some = np.flatnonzero((weight > 0.0) & (exponent > _IMPOSSIBLE) & gamma)
     determinant = np.ones(len(some))
     for D, state in zip(diagonal, leak.state_diagonal, strict=True):
         determinant *= D.reshape(-1)[some] / state
+    likely = exp(np.minimum(exponent.reshape(-1)[some], _CERTAIN))
     ratios = np.zeros(weight.shape)
-    ratios.reshape(-1)[some] = weight.reshape(-1)[some] * exp(exponent.reshape(-1)[some]) / np.sqrt(determinant)
+    ratios.reshape(-1)[some] = weight.reshape(-1)[some] * likely / np.sqrt(determinant)
     return ratios
 
 
@@ -160,24 +161,25 @@ def pruned(of: Mixture) -> Mixture:
 
 
 def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
-    """With a component of each packet z (n, R) in its trial's first empty place, by its probability `state` (R,)."""
+    """With a component of each packet z (n, R) in its trial's first empty place, by its probability `state` (R,).
+
+    Takes the arrays of `of` over: they are not to be used any more.
+    """
     new = np.flatnonzero(state > NEGLIGIBLE)
     free = of.weight[:, new] == 0.0
-    full = new[~free.any(axis=0)] if len(of.weight) else new
-    if len(of.weight) < capacity and full.size:
-        of = Mixture(*(_with_a_place(part, part.ndim - 2) for part in of))
+    full = new[~free.any(axis=0)]
+    if full.size:
+        if len(of.weight) < capacity:
+            of = Mixture(*(_with_a_place(part, part.ndim - 2) for part in of))
+        else:
+            merge(of, full)
         free = of.weight[:, new] == 0.0
-    elif full.size:
-        of = Mixture(*(part.copy() for part in of))
-        merge(of, full)
-        free = of.weight[:, new] == 0.0
-    else:
-        of = Mixture(*(part.copy() for part in of))
-    place = np.argmax(free, axis=0)
-    of.weight[place, new] = state[new]
-    of.mean[:, place, new] = z[:, new]
-    of.lower[:, place, new] = 0.0
-    of.diagonal[:, place, new] = 0.0
+    if new.size:
+        place = np.argmax(free, axis=0)
+        of.weight[place, new] = state[new]
+        of.mean[:, place, new] = z[:, new]
+        of.lower[:, place, new] = 0.0
+        of.diagonal[:, place, new] = 0.0
     return of._replace(weight=of.weight / summed(of.weight))
 
 
