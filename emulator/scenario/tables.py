@@ -153,27 +153,44 @@ class ProcessTable(_Table):
 
 
 class EncodingTable(_Table):
-    """`[encoding]`: the scheme, and μ_d for those that mix states and innovations."""
+    """`[encoding]`: the scheme, and beside it the parameters that this scheme has."""
+
+    model_config = ConfigDict(extra="allow")
 
     scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(_one_of(SCHEMES))]
-    state_probability: Annotated[Probability | None, Field(examples=[0.6])] = None
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether μ_d is there for a scheme that has it, and for no other."""
+        """Whether the scheme has all its parameters, no others, and each as it must be."""
         scheme = SCHEMES.get(str(table.get("scheme")))
-        given = table.get("state_probability") is not None
-        if scheme is not None and scheme.mixes and not given:
-            return [("state_probability", "is missing; expected a number from 0 to 1, such as 0.6")]
-        if scheme is not None and not scheme.mixes and given:
-            what = f"is set, but the scheme {table['scheme']} sends the state always; remove the line"
-            return [("state_probability", what)]
-        return []
+        given = {name: value for name, value in table.items() if name != "scheme"}
+        if scheme is None:
+            anywhere = {name for one in SCHEMES.values() for name in one.parameters}
+            return [(name, "is no parameter of any scheme; remove the line") for name in given if name not in anywhere]
+        found = [
+            (name, f"is missing; the scheme {table['scheme']} needs it, such as {name} = {as_toml(example)}")
+            for name, example in scheme.parameters.items()
+            if name not in given
+        ]
+        known = f"expected {listed(sorted(scheme.parameters))}" if scheme.parameters else "remove the line"
+        what = f"is set, but the scheme {table['scheme']} has no such parameter; {known}"
+        found += [(name, what) for name in given if name not in scheme.parameters]
+        return found + scheme.mistakes({name: value for name, value in given.items() if name in scheme.parameters})
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The scheme's parameters."""
+        return dict(self.model_extra or {})
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """What sensor and legitimate estimator are told."""
+        return {"scheme": self.scheme, **self.parameters}
 
     @property
     def mu_d(self) -> float:
-        """μ_d; 1 for a scheme that always sends the state."""
-        return 1.0 if self.state_probability is None else self.state_probability
+        """μ_d; 1 for a scheme that sends nothing but the state."""
+        return float(self.parameters.get("state_probability", 1.0))
 
 
 class LinkTable(_Table):

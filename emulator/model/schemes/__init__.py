@@ -3,9 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
+from emulator.model.process import Process
 from emulator.model.schemes.innovation import Innovation
 from emulator.model.schemes.plain import Plain
 from emulator.model.schemes.scheme import Scheme
+from emulator.model.schemes.withholding import Withholding
 
-SCHEMES: Mapping[str, type[Scheme]] = {"innovation": Innovation, "plain": Plain}
+SCHEMES: Mapping[str, type[Scheme]] = {
+    "innovation": Innovation,
+    "plain": Plain,
+    "withholding": Withholding,
+}
+
+
+def scheme_of(process: Process, spec: Mapping[str, Any]) -> Scheme:
+    """The scheme that a scenario describes: `{"scheme": …, …parameters}`."""
+    parameters = {name: value for name, value in spec.items() if name != "scheme"}
+    return SCHEMES[spec["scheme"]](process, **parameters)
