@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from emulator.model.process import Process
+from emulator.model.schemes.cipher import Cipher
 from emulator.model.schemes.innovation import Innovation
 from emulator.model.schemes.plain import Plain
 from emulator.model.schemes.scheme import Scheme
 from emulator.model.schemes.withholding import Withholding
 
 SCHEMES: Mapping[str, type[Scheme]] = {
+    "cipher": Cipher,
     "innovation": Innovation,
     "plain": Plain,
     "withholding": Withholding,
