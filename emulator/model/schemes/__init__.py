@@ -10,12 +10,14 @@ from emulator.model.schemes.cipher import Cipher
 from emulator.model.schemes.innovation import Innovation
 from emulator.model.schemes.plain import Plain
 from emulator.model.schemes.scheme import Scheme
+from emulator.model.schemes.twin_track import TwinTrack
 from emulator.model.schemes.withholding import Withholding
 
 SCHEMES: Mapping[str, type[Scheme]] = {
     "cipher": Cipher,
     "innovation": Innovation,
     "plain": Plain,
+    "twin-track": TwinTrack,
     "withholding": Withholding,
 }
 
