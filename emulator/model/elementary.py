@@ -154,3 +154,24 @@ def triangular_factor(rows: Rows) -> Rows:
             for row in work[i:]:
                 row[i] = -row[i]
     return [row[:n] for row in work]
+
+
+def inverse(M: Floats) -> Floats:
+    """Inverse of a regular matrix (n, n), by elimination with row pivots.
+
+    Raises ValueError where a pivot is 0.
+    """
+    n = M.shape[0]
+    rows: Rows = [[*map(float, M[i]), *(1.0 if j == i else 0.0 for j in range(n))] for i in range(n)]
+    for c in range(n):
+        pivot = max(range(c, n), key=lambda i: abs(rows[i][c]))
+        if rows[pivot][c] == 0.0:
+            raise ValueError("singular")
+        rows[c], rows[pivot] = rows[pivot], rows[c]
+        divisor = rows[c][c]
+        rows[c] = [value / divisor for value in rows[c]]
+        for i in range(n):
+            if i != c:
+                factor = rows[i][c]
+                rows[i] = [value - factor * other for value, other in zip(rows[i], rows[c], strict=True)]
+    return np.array([row[n:] for row in rows])

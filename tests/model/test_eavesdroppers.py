@@ -61,7 +61,7 @@ def uses(name: str, k: int, r: int) -> bool:
     return uniform("coin", k, r) < (USE_INNOVATION if nu else USE_STATE)
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 @settings(deadline=None)
 @given(seed=st.integers(0, 2**31), first=st.integers(0, 10_000))
 def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, first: int) -> None:
@@ -84,7 +84,7 @@ def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, f
             assert np.allclose(found[k].P[:, :, r], P, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_a_trial_alone_is_the_same_trial(name: str) -> None:
     """Beliefs of a trial are the same bits alone, among 6 and among 400."""
     gamma, z = events(300, 400)
@@ -98,7 +98,7 @@ def test_a_trial_alone_is_the_same_trial(name: str) -> None:
             assert np.array_equal(one.action, other.action[part])
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_what_is_lost_does_not_matter(name: str) -> None:
     """Of a packet that was lost not a bit enters the belief, not even NaN."""
     gamma, z = events(40, 30)
@@ -109,7 +109,7 @@ def test_what_is_lost_does_not_matter(name: str) -> None:
         assert all(left.tobytes() == right.tobytes() for left, right in zip(one[:3], other[:3], strict=True))
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_it_needs_what_it_names_and_no_more(name: str) -> None:
     """Without one of its keys or parameters an eavesdropper cannot be built; the naive one is given nothing."""
     strategy = STRATEGIES[name]
@@ -126,7 +126,7 @@ def test_it_needs_what_it_names_and_no_more(name: str) -> None:
             )
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_use_probabilities_are_what_it_does(name: str) -> None:
     """P(b = 1 given ν) of theory is how often it uses states and innovations: binomial, at 1e-6 confidence."""
     slots, trials = 60, 2000

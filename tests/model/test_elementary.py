@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtri
 
-from emulator.model.elementary import cholesky, log, normal_quantile, polynomial, triangular_factor
+from emulator.model.elementary import cholesky, inverse, log, normal_quantile, polynomial, triangular_factor
 
 POSITIVE = st.floats(min_value=2.3e-308, max_value=1.7e308, allow_subnormal=False)
 PROBABILITIES = st.integers(1, 2**53 - 1).map(lambda i: i * 2.0**-53)
@@ -128,3 +128,14 @@ def test_cholesky_refuses_what_is_not_positive_definite(M: list[list[float]]) ->
     """Indefinite, singular and undefined matrices are errors, not NaN."""
     with pytest.raises(ValueError, match="not positive definite"):
         cholesky(np.array(M))
+
+
+@settings(deadline=None)
+@given(st.integers(1, 4), st.integers(0, 2**31))
+def test_inverse_is_the_inverse(n: int, seed: int) -> None:
+    """It is LAPACK's to the condition of the matrix, zero pivots on the way included; singular matrices are refused."""
+    M = np.random.default_rng(seed).integers(-2, 3, (n, n)).astype(float)
+    if abs(np.linalg.det(M)) > 0.5:
+        assert np.allclose(inverse(M), np.linalg.inv(M), rtol=1e-12, atol=1e-12)
+    with pytest.raises(ValueError, match="singular"):
+        inverse(np.zeros((n, n)))

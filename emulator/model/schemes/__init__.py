@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from emulator.model.process import Process
+from emulator.model.schemes.acknowledged import Acknowledged
 from emulator.model.schemes.cipher import Cipher
 from emulator.model.schemes.innovation import Innovation
 from emulator.model.schemes.plain import Plain
@@ -14,6 +15,7 @@ from emulator.model.schemes.twin_track import TwinTrack
 from emulator.model.schemes.withholding import Withholding
 
 SCHEMES: Mapping[str, type[Scheme]] = {
+    "acknowledged": Acknowledged,
     "cipher": Cipher,
     "innovation": Innovation,
     "plain": Plain,
