@@ -15,7 +15,6 @@ from pydantic_core import ErrorDetails
 
 from emulator.model.horizon import horizon
 from emulator.model.process import Process
-from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.tables import (
     FIGURES,
@@ -111,8 +110,6 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
         process = ProcessTable.model_validate(tables.get("process")).process
     except ValidationError:
         process = None
-    if process is not None:
-        found += _unfit_schemes(process, tables.get("encoding"))
     if process is not None and not beyond_horizon and type(slots) is int and 1 <= slots <= 100_000_000:
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials > 0:
@@ -135,16 +132,6 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     return found
-
-
-def _unfit_schemes(process: Process, encoding: Any) -> list[str]:
-    """Why the scheme cannot send this process, if it is one without mistakes of its own."""
-    try:
-        table = EncodingTable.model_validate(encoding)
-    except ValidationError:
-        return []
-    unfit = SCHEMES[table.scheme].unfit(process, table.parameters)
-    return [f"encoding.{name}: {what}" for name, what in unfit]
 
 
 def _has_theory(receiver: Any) -> bool:

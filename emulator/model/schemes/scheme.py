@@ -125,12 +125,6 @@ class Scheme(ABC):
         del given
         return []
 
-    @classmethod
-    def unfit(cls, process: Process, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Why a process cannot be sent so: (parameter, what was found and expected), for parameters without mistakes."""
-        del process, given
-        return []
-
     @abstractmethod
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """What the two sides share; keys holds those of `secret_streams`."""
