@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/evedrop demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -m "not long"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long"
 
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.link_law import law_of
 from emulator.network.access import LEGITIMATE
 from emulator.runs.results import Results, load_results
 from emulator.scenario import Scenario, checked, load
@@ -99,19 +101,26 @@ def design(
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
+    quality = {}
     for name in made.receivers:
-        chain = made.link(name).model.chain
-        if chain is None or not chain.independent:
+        law = law_of(made.course(name))
+        alike = None if law is None else law.alike
+        if alike is None:
             raise UsageError(
-                f"the design of μ_d is for independent losses, and the link of {name} has others; give it a quality, "
-                f"such as --set '{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}'"
+                "the design of μ_d is for independent losses that stay the same, without late packets and outages, and "
+                f"the link of {name} has others; give it a quality alone, such as "
+                f"--set '{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}'"
             )
-    adversaries = [
-        Adversary(name, made.quality[name], *STRATEGIES[table.strategy].use_probabilities(table.parameters))
-        for name, table in made.eavesdroppers.items()
-    ]
-    process, mu, mu_d = made.process.process, made.quality[LEGITIMATE], made.encoding.mu_d
-    return design_of(process, mu, mu_d, adversaries, made.slots, max_trace)
+        quality[name] = float(alike.quality[0])
+    adversaries, left_out = [], {}
+    for name, table in made.eavesdroppers.items():
+        outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, 0.5)
+        if outcomes_at is None:
+            left_out[name] = table.strategy
+        else:
+            adversaries.append(Adversary.who(name, quality[name], outcomes_at(1.0)))
+    process, mu, mu_d = made.process.process, quality[LEGITIMATE], made.encoding.mu_d
+    return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
 
 
 def _prepared(

@@ -26,11 +26,11 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "users"),
-    "sensor": ("scheme", "pace", "receivers"),
-    "legitimate": ("scheme",),
-    "eavesdropper": ("strategy", "parameters"),
-    "observer": ("scenario", "results", "recording", "live"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements"),
+    "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart"),
+    "legitimate": ("scheme", "window", "outages"),
+    "eavesdropper": ("strategy", "parameters", "window", "outages"),
+    "observer": ("scenario", "results", "recording", "live", "operator"),
 }
 ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
 
@@ -54,6 +54,8 @@ class Model:
     initial_covariance: list[list[float]]
     state_probability: float
     """μ_d."""
+    header: int = 0
+    """Numbers that a packet has in clear beside its payload."""
 
     @property
     def process(self) -> Process:
@@ -83,6 +85,8 @@ class Brief:
     """Stream name → key, hexadecimal: the streams this process owns."""
     part: Mapping[str, Any] = field(default_factory=dict)
     """The role's part of the scenario."""
+    first: int = 0
+    """The first slot that this process sees: of one that is started again, where it goes on."""
     ends_with_stdin: bool = False
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, TypeVar
 
-from emulator import commands
-from emulator.errors import EvedropError, Interrupted, UsageError
+from emulator import commands, operate
+from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 
 Command = Callable[[argparse.Namespace], int]
+T = TypeVar("T")
+
+_OUTPUT = "standard output"
 
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
@@ -22,25 +26,71 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     command: Command = options.command
     try:
-        status = command(options)
-        if sys.stdout is not None:  # a shell may have closed it
-            sys.stdout.flush()
+        with _named_output():
+            status = command(options)
+            if sys.stdout is not None:  # a shell may have closed it
+                sys.stdout.flush()
         return status
     except EvedropError as error:
+        _finish()
         print(f"evedrop: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
+        _finish()
         return Interrupted.exit_status
-    except BrokenPipeError:
-        _silence()
-        return 0
     except OSError as error:
-        _silence()
-        print(
-            f"evedrop: {error.filename or 'standard output'}: {error.strerror}; free some room, or look at its rights",
-            file=sys.stderr,
-        )
+        if error.filename == _OUTPUT:
+            _silence()
+        if isinstance(error, BrokenPipeError) and error.filename == _OUTPUT:
+            return 0
+        if error.filename is None:
+            print(f"evedrop: {error}; free what the system lacks and try again", file=sys.stderr)
+            return RunError.exit_status
+        print(f"evedrop: {error.filename}: {error.strerror}; free some room, or look at its rights", file=sys.stderr)
         return UsageError.exit_status
+
+
+@contextlib.contextmanager
+def _named_output() -> Iterator[None]:
+    """Have errors of standard output say that they are: no other may be taken for one."""
+    if sys.stdout is None:
+        yield
+    else:
+        with contextlib.redirect_stdout(_Named(sys.stdout, _OUTPUT)):
+            yield
+
+
+class _Named:
+    """A stream whose errors have a file name. Final."""
+
+    def __init__(self, stream: TextIO, name: str) -> None:
+        self._stream = stream
+        self._name = name
+
+    def write(self, text: str) -> int:
+        return self._tried(lambda: self._stream.write(text))
+
+    def flush(self) -> None:
+        self._tried(self._stream.flush)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _tried(self, act: Callable[[], T]) -> T:
+        try:
+            return act()
+        except OSError as error:
+            error.filename = self._name
+            raise
+
+
+def _finish() -> None:
+    """Write what is left for standard output; nobody need take it, for something else has gone wrong."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        _silence()
 
 
 def _silence() -> None:
@@ -55,6 +105,10 @@ class _Commands:
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self._group = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
+    def group(self, name: str, does: str) -> _Commands:
+        """Commands of one kind, under a name of their own."""
+        return _Commands(self._group.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}."))
+
     def add(self, name: str, command: Command, does: str, *options: Callable[[argparse.ArgumentParser], None]) -> None:
         """A command, what it does in some words, and its options."""
         one = self._group.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}.")
@@ -68,18 +122,29 @@ def _parser() -> argparse.ArgumentParser:
         prog="evedrop", description="A network emulator for secrecy in remote state estimation."
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
-    add = _Commands(parser).add
+    top = _Commands(parser)
+    add = top.add
     add("list", commands.list_scenarios, "the shipped scenarios, a line each")
     add("new", commands.new, "write a commented scenario to start from", _argument("file", "FILE"))
     add("demo", commands.demo, "the shipped scenario `vehicle`, live, in real time, with the view", *_LIVE)
     add("run", commands.run, "a live run: processes, network, view, results", _scenario, *_LIVE)
     add("montecarlo", commands.montecarlo, "the same trials in memory (default 1000)", _scenario, *_MEMORY)
+    add("link", operate.link, "change, cut or heal a link of a run that goes on", _going_on, _changed_link)
+    add("pause", operate.pause, "hold a run that goes on between two slots", _going_on)
+    add("resume", operate.resume, "let a run that is held go on", _going_on)
+    add("step", operate.step, "let some slots of a run pass, and hold it again", _going_on, _slots)
+    add("status", operate.status, "how a run that goes on is doing", _going_on, _as_json)
     add("sweep", commands.sweep, "Monte Carlo over a grid of values of any entries", _scenario, _over, *_MEMORY)
     add("design", commands.design, "admissible μ_d, secrecy, optimum, per eavesdropper", _scenario, _set, _designs)
     add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
+    add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
     add("check", commands.check, "validate scenarios only", _scenarios, _set)
+    links = top.group("links", "what can be found out about links")
+    links.add(
+        "fit", commands.fit_link, "the loss model, and delays, of a recorded link", _argument("trace", "TRACE"), _fits
+    )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
     for role in ("router", "sensor", "legitimate", "eavesdropper", "observer"):
@@ -105,6 +170,42 @@ def _scenario(parser: argparse.ArgumentParser) -> None:
 
 def _scenarios(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenarios", nargs="+", metavar="SCENARIO")
+
+
+def _places(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "places", nargs="+", metavar="PATH", help="a scenario, or a folder that has some; or a shipped name"
+    )
+
+
+def _tests(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
+    parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where results go, a folder each; default runs/")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many at a time; default 1")
+
+
+def _going_on(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run that goes on")
+
+
+def _changed_link(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is")
+    parser.add_argument(
+        "changes",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="an entry of the link, such as quality=0.2, dotted for those of a table; or the word cut or heal",
+    )
+
+
+def _slots(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("slots", type=int, metavar="N", help="how many slots")
+
+
+def _as_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="for programs")
 
 
 def _two_runs(parser: argparse.ArgumentParser) -> None:
@@ -188,6 +289,14 @@ def _designs(parser: argparse.ArgumentParser) -> None:
 def _figures(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", type=Path, default=Path("figures"), metavar="DIR")
     parser.add_argument("--full", action="store_true", help="the paper's 1000 trials of a day; minutes, not seconds")
+
+
+def _fits(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--column", metavar="C", help="the column of outcomes, in a file of several")
+    parser.add_argument(
+        "--delay-column", metavar="C", help="the column of delays in slots; default delay, if there is one"
+    )
+    parser.add_argument("--json", action="store_true", help="for programs")
 
 
 def _briefs(parser: argparse.ArgumentParser) -> None:

@@ -6,10 +6,13 @@ Every import of weight waits for the command that needs it, so that `evedrop --h
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shlex
 import signal
 import sys
+import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,7 +78,8 @@ def run(options: argparse.Namespace) -> int:
         try:
             ended = launch(scenario, folder, options.view, options.listen, line.tell)
         except (RunError, Interrupted):
-            _print_results(folder, options.json)
+            with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
+                _print_results(folder, options.json)
             raise
     _print_results(folder, options.json)
     if ended.viewer is not None:
@@ -112,10 +116,13 @@ def _replay(folder: Path) -> str | None:
     from emulator.scenario import load
 
     try:
-        recorded = load(folder).record_trials
+        scenario = load(folder)
     except UsageError:  # float64 cannot follow the states of so many slots
         return None
-    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{' --record-trials 1' if recorded > 1 else ''}"
+    recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
+    # A quantile over trials can be expected of many alone.
+    expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
+    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"
 
 
 def _keep_open(viewer: Viewer) -> None:
@@ -152,7 +159,8 @@ def montecarlo(options: argparse.Namespace) -> int:
         try:
             status = simulate(scenario, folder, line.tell, plan)
         except Interrupted:
-            _print_results(folder, options.json)
+            with contextlib.suppress(OSError):  # as above
+                _print_results(folder, options.json)
             raise
     _print_results(folder, options.json)
     return status
@@ -249,6 +257,31 @@ def diff(options: argparse.Namespace) -> int:
     return 0 if found.same else 1
 
 
+def test(options: argparse.Namespace) -> int:
+    """Run scenarios as tests; the worst exit status of theirs."""
+    from emulator.runs.junit import write_junit
+    from emulator.runs.testing import Finding, Manner, scenarios_of
+    from emulator.runs.testing_jobs import results
+
+    if options.jobs < 1:
+        raise UsageError(f"--jobs {options.jobs}: expected 1 or more")
+    scenarios = scenarios_of(options.places)
+    started, tested = time.time(), list[Finding]()
+    try:
+        for one in results(scenarios, Manner(options.in_memory, options.trials, options.out), options.jobs):
+            tested.append(one)
+            print(f"{one.outcome.word:<9}{one.seconds:7.1f} s  {one.scenario}", flush=True)
+            for line in one.lines:
+                print(f"    {line}", flush=True)
+    finally:
+        if options.junit is not None:
+            write_junit(options.junit, tested, started)
+    counts = Counter(one.outcome for one in tested)
+    said = ", ".join(f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value))
+    print(f"{said}, in {time.time() - started:.1f} s")
+    return max(outcome.value for outcome in counts)
+
+
 def check(options: argparse.Namespace) -> int:
     """Validate scenarios."""
     from emulator.runs.estimates import warnings_of
@@ -280,6 +313,18 @@ def selftest(_: argparse.Namespace) -> int:
     if not check.passed:
         raise RunError("this machine does not compute the golden digests; please report the lines above")
     print("passed: this machine computes what every machine must")
+    return 0
+
+
+def fit_link(options: argparse.Namespace) -> int:
+    """Find the model of a recorded link."""
+    from emulator.fitting.fit import fit, lines
+
+    found = fit(options.trace, options.column, options.delay_column)
+    if options.json:
+        print(json.dumps(found.as_dict(), ensure_ascii=False))
+    else:
+        print("\n".join(lines(found)))
     return 0
 
 

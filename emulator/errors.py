@@ -2,7 +2,8 @@
 
 EvedropError                    exit status
 ├── UsageError                  2   the command line or a file it names cannot be used
-│   └── ScenarioError           2   the scenario has mistakes: all of them, listed
+│   ├── ScenarioError           2   the scenario has mistakes: all of them, listed
+│   └── TraceError              2   a recording cannot be read as one
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
@@ -33,6 +34,15 @@ class ScenarioError(UsageError):
         self.mistakes = mistakes
         count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
         super().__init__("\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in mistakes)]))
+
+
+class TraceError(UsageError):
+    """A recording of a link that is none: `entry` says what must change, the `file` or the `column`; `what` says why."""
+
+    def __init__(self, path: str, entry: str, what: str) -> None:
+        self.entry = entry
+        self.what = what
+        super().__init__(f"{path}: {what}")
 
 
 class BriefError(EvedropError):

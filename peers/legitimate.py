@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from emulator.brief import Brief
-from emulator.model.schemes import SCHEMES
+from emulator.model.schemes import scheme_of
 from peers.following import follow
 
 
 def estimate(brief: Brief) -> None:
     """Run the legitimate estimator of a brief."""
-    scheme = SCHEMES[brief.part["scheme"]](brief.model.process, brief.model.state_probability)
-    follow(brief, scheme.estimator(brief.stream_keys, brief.batch))
+    scheme = scheme_of(brief.model.process, brief.part["scheme"])
+    follow(brief, scheme.estimator(brief.stream_keys, brief.batch), scheme.needs_acknowledgements)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from queue import SimpleQueue
 
 from emulator.brief import Brief
+from emulator.model.detection import Chart, Watch
 from emulator.model.process import Trajectory
-from emulator.model.schemes import SCHEMES
+from emulator.model.receiver import Flags
+from emulator.model.schemes import scheme_of
+from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.network.access import OBSERVER, SENSOR
 from emulator.network.reporting import TruthReporter
 from emulator.network.session import Session
-from emulator.network.wire import read_progress, uplink
+from emulator.network.wire import Beside, Reader, held, hold, read_acknowledgement, read_progress, uplink
+
+_LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
 
 class Window:
@@ -20,6 +26,7 @@ class Window:
     def __init__(self, session: Session, followers: tuple[str, ...], window: int) -> None:
         self._window = window
         self._done = dict.fromkeys(followers, 0)
+        self._absent: Collection[str] = ()
         self._limit = window
         self._news: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
         self._keys = {name: session.keys.progress(name) for name in followers}
@@ -31,29 +38,96 @@ class Window:
         while k >= self._limit:
             name, payload = self._news.get()
             self._done[name] = max(self._done[name], read_progress(self._keys[name], payload))
-            self._limit = min(self._done.values()) + self._window
+            self._measure()
+
+    def go_on(self, k: int, absent: Collection[str]) -> None:
+        """All slots below k are done by everybody; who is absent from now on is not waited for."""
+        self._done = {name: max(done, k) for name, done in self._done.items()}
+        self._absent = absent
+        self._measure()
+
+    def _measure(self) -> None:
+        self._limit = min(done for name, done in self._done.items() if name not in self._absent) + self._window
+
+
+class Holds:
+    """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
+
+    def __init__(self, brief: Brief, session: Session, window: Window, scheme: Scheme) -> None:
+        self._session, self._window = session, window
+        self._holds = set(brief.part["holds"])
+        self._telemetry = session.outlet(session.keys.telemetry(SENSOR))
+        watches = brief.part["chart"] is not None
+        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches)
+
+    def wanted(self, k: int) -> bool:
+        """Whether to stop before slot k."""
+        while (command := self._session.commanded()) is not None:
+            if command.text("do") == "hold":
+                self._holds.add(k)
+        return k in self._holds
+
+    def hold(self, k: int) -> None:
+        """Report all slots below k, and wait until the conductor says go."""
+        self.reporter.flush(k)
+        self._telemetry(held(k))
+        while (command := self._session.command()).text("do") != "go":
+            pass
+        self._window.go_on(k, command.names("absent"))
+        self._holds = {slot for slot in self._holds if slot > k}
+        if command.has("until"):
+            self._holds.add(command.integer("until"))
+
+
+class Acknowledgements:
+    """What comes back of each slot before the next is sent, and the watch over whether it is attacked. Final."""
+
+    def __init__(self, brief: Brief, session: Session, encoder: Encoder) -> None:
+        self._encoder, self._trials = encoder, brief.trials
+        self._key = session.keys.acknowledgements
+        self._inbox = session.inbox(self._key)
+        chart = brief.part["chart"]
+        self._watch = Watch(Chart(**chart), brief.trials) if chart is not None else None
+
+    def wait(self, k: int, packet: Packet) -> Flags | None:
+        """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
+        message = Reader(self._key, self._inbox.recv().payload.to_bytes())
+        acknowledged = read_acknowledgement(message, k, self._trials)
+        self._encoder.acknowledged(k, acknowledged)
+        return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
 
 
 def sense(brief: Brief) -> None:
     """Run the sensor of a brief."""
     process, keys = brief.model.process, brief.stream_keys
-    scheme = SCHEMES[brief.part["scheme"]](process, brief.model.state_probability)
+    scheme = scheme_of(process, brief.part["scheme"])
     encoder = scheme.encoder(keys, brief.batch)
-    trajectory = Trajectory(process, keys["process"], brief.batch)
+    trajectory = Trajectory(process, keys["process"], brief.batch, scheme.initial_state(keys, brief.batch))
+    betrayed = set(brief.part["leaks"].values())
     pace = float(brief.part["pace"])
     with Session(brief) as session:
         window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window)
         send = session.outlet(session.keys.uplink)
-        reporter = TruthReporter(brief, session.outlet(session.keys.telemetry(SENSOR)))
+        back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
+        holds = Holds(brief, session, window, scheme)
         session.ready()
         session.wait_for("start")
         start = time.monotonic()
         for k in range(brief.slots):
             window.wait(k)
-            if pace:
-                time.sleep(max(0.0, start + k * pace - time.monotonic()))
+            # In real time a hold may be asked for at any moment before the slot is due; of one slot there is one at most.
+            while not (wanted := holds.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:
+                time.sleep(min(left, _LOOK_SECONDS))
+            if wanted:
+                send(hold(k))
+                began = time.monotonic()
+                holds.hold(k)
+                start += time.monotonic() - began
+                time.sleep(max(0.0, start + k * pace - time.monotonic()) if pace else 0.0)
             x = trajectory.advance()
             packet = encoder.encode(k, x, trajectory.predicted)
-            send(uplink(k, packet.z))
-            reporter.add(k, x, packet.nu)
+            beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
+            send(uplink(k, packet.z, **beside.given))
+            alarms = back.wait(k, packet) if back is not None else None
+            holds.reporter.add(k, x, packet.nu, packet.sent, alarms)
         session.wait_for("end")

@@ -1,25 +1,37 @@
-"""Evedrop as its users start it: real processes, found and counted, each test in a temporary folder of its own."""
+"""Evedrop as its users type it: in this process or in one of its own, each test in a temporary folder of its own.
+
+Nothing here or in the tests is decided by time: they wait for what they need, and a limit only bounds a failure.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
+from hypothesis import HealthCheck, settings
 
+from emulator import cli
 from emulator.brief import Brief, read_brief
 from emulator.runs.results import Results, load_results
 
-LIMIT = 40.0
+LIMIT = 120.0
 """Seconds after which a condition that a test waits for counts as never met: far above what a busy machine needs."""
+
+# Neither how long an example takes nor how long it takes to think of one says anything on a machine that others use.
+settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("unhurried")
 
 
 def wait_until(condition: Callable[[], Any], what: str, limit: float = LIMIT) -> Any:
@@ -46,12 +58,6 @@ def with_mark(mark: str) -> dict[int, str]:
     return found
 
 
-def processor_seconds(pid: int) -> float:
-    """How long a process has computed."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 @dataclass(frozen=True)
 class Done:
     """A command that ended."""
@@ -70,10 +76,11 @@ class Done:
 class Live:
     """A command that runs, its children, and what it leaves behind."""
 
-    def __init__(self, process: subprocess.Popen[str], temporary: Path, folder: Path) -> None:
+    def __init__(self, process: subprocess.Popen[str], temporary: Path, folder: Path, news: Path | None = None) -> None:
         self.process = process
         self.temporary = temporary
         self.folder = folder
+        self._news = news
 
     def briefs(self) -> dict[str, Path]:
         """Process name → the brief it was given, as far as they are written."""
@@ -97,13 +104,17 @@ class Live:
         pid: int = wait_until(lambda: self.children().get(name), f"a process {name}")
         return pid
 
-    def running(self) -> None:
-        """Wait until slots go through the run: it was started, for the briefs are gone, and the sensor has worked since."""
-        sensor = self.child("sensor")
-        wait_until(lambda: not self.briefs(), "a run under way")
-        before = processor_seconds(sensor)
-        # So much work is several windows of slots: the observer must have scored one, or the sensor would be waiting.
-        wait_until(lambda: processor_seconds(sensor) > before + 0.3, "a sensor at work")
+    def done(self) -> int:
+        """How much it says it has done, in the unit of its progress line: slots of a run, trial-slots of a study."""
+        if self._news is None or not self._news.exists():
+            return 0
+        whole = self._news.read_text().rpartition("\n")[0]  # the last line may be half written
+        return max(map(int, whole.split()), default=0)
+
+    def running(self, more_than: int = 0) -> None:
+        """Wait until it says that more than so much is done: what it measured is more than nothing."""
+        wait_until(lambda: self.done() > more_than or self.process.poll() is not None, "a run under way")
+        assert self.process.poll() is None, "the run must not end before it is disturbed"
 
     def kill(self, name: str, number: signal.Signals = signal.SIGKILL) -> None:
         """Send one process a signal."""
@@ -123,7 +134,7 @@ class Live:
 
     def nothing_left(self) -> None:
         """No process and no brief, key or password is left behind."""
-        wait_until(lambda: not self.left(), "no process left of the run", 10.0)
+        wait_until(lambda: not self.left(), "no process left of the run")
         assert list(self.temporary.iterdir()) == []
 
     @property
@@ -132,9 +143,30 @@ class Live:
         return load_results(self.folder)
 
 
+TELLING = """
+import resource, sys
+from pathlib import Path
+from emulator.cli import main
+from emulator.runs.report import ProgressLine
+
+show, news, largest = ProgressLine.tell, Path(sys.argv[1]), int(sys.argv[2])
+if largest:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+
+def tell(line, told):
+    with news.open("a") as file:
+        file.write(f"{told.get('done', 0)}\\n")
+    show(line, told)
+
+ProgressLine.tell = tell
+raise SystemExit(main(sys.argv[3:]))
+"""
+"""The command as it is, which besides writes what its progress line would show; and whose files may be limited in size."""
+
+
 @dataclass(frozen=True)
 class Evedrop:
-    """Starts the command in a folder of its own."""
+    """The command, typed in a folder of its own."""
 
     folder: Path
 
@@ -150,9 +182,11 @@ class Evedrop:
         """What the command is started with."""
         return {**os.environ, "TMPDIR": str(self.temporary), "COLUMNS": "160"}
 
-    def _start(self, arguments: tuple[str, ...], options: Mapping[str, Any]) -> subprocess.Popen[str]:
+    def _start(
+        self, command: list[str], arguments: tuple[str, ...], options: Mapping[str, Any]
+    ) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-m", "emulator", *arguments],
+            [sys.executable, *command, *arguments],
             **{
                 "cwd": self.folder,
                 "stdin": subprocess.DEVNULL,
@@ -164,14 +198,43 @@ class Evedrop:
             },
         )
 
-    def __call__(self, *arguments: str, **options: Any) -> Done:
-        """Run a command to its end."""
-        return Live(self._start(arguments, options), self.temporary, self.folder).end()
+    def __call__(self, *arguments: str) -> Done:
+        """Type a command and wait for its end. It runs in this process: most of a short one's time goes into imports."""
+        with (
+            contextlib.chdir(self.folder),
+            patch.dict(os.environ, self.environment),
+            patch.object(tempfile, "tempdir", None),
+            open(os.devnull) as nothing,
+            patch.object(sys, "stdin", nothing),
+            tempfile.TemporaryFile("w+", encoding="utf-8", dir=self.folder) as out,
+            tempfile.TemporaryFile("w+", encoding="utf-8", dir=self.folder) as err,
+        ):
+            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                try:
+                    status = cli.main(arguments)
+                except SystemExit as left:  # argparse has said what it expected
+                    status = int(left.code or 0)
+            texts = []
+            for file in (out, err):
+                file.seek(0)
+                texts.append(file.read())
+        return Done(status, *texts)
 
-    def live(self, scenario: str, *arguments: str, out: str = "run", **options: Any) -> Live:
+    def process(self, *arguments: str, **options: Any) -> Done:
+        """The same in a process of its own; options are those of Popen."""
+        process = self._start(["-m", "emulator"], arguments, options)
+        return Live(process, self.temporary, self.folder).end()
+
+    def started(self, *arguments: str, out: str = "run", largest_file: int = 0, **options: Any) -> Live:
+        """Start a command in a process of its own, to be followed and disturbed."""
+        news = self.folder / f"{out.replace('/', '-')}.news"
+        telling = ["-c", TELLING, str(news), str(largest_file)]
+        process = self._start(telling, (*arguments, "--out", out), options)
+        return Live(process, self.temporary, self.folder / out, news)
+
+    def live(self, scenario: str, *arguments: str, **options: Any) -> Live:
         """Start a live run without a view."""
-        every = ("run", scenario, "--view", "off", "--out", out, *arguments)
-        return Live(self._start(every, options), self.temporary, self.folder / out)
+        return self.started("run", scenario, "--view", "off", *arguments, **options)
 
 
 @pytest.fixture

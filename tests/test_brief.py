@@ -30,7 +30,7 @@ BRIEF = Brief(
     flow=Flow(8, 2),
     model=Model([[1.0, 0.1], [0.0, 1.0]], [[1e-3, 0.0], [0.0, 1e-3]], [[1.0, 0.0], [0.0, 1.0]], 0.5),
     keys={"schedule": "ab" * 32},
-    part={"strategy": "smart", "parameters": {}},
+    part={"strategy": "smart", "parameters": {}, "window": 0, "outages": []},
 )
 
 
@@ -129,7 +129,7 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
             "doubtful": suspicious,
         },
     }
-    del table["process"]["state_probability"]
+    del table["process"]["state_probability"], table["process"]["header"]
     return Scenario.model_validate({**table, **changes})
 
 
@@ -142,7 +142,11 @@ def test_who_is_given_which_keys() -> None:
     """Each process has the keys of the streams it owns by definition, and no others."""
     found = {name: set(brief.keys) for name, brief in made(scenario_of()).items()}
     assert found == {
-        "router": {"link/legitimate", "link/naive", "link/smart", "link/doubtful"},
+        "router": {
+            f"{what}/{name}"
+            for what in ("link", "delay", "fate")
+            for name in ("legitimate", "naive", "smart", "doubtful")
+        },
         "sensor": {"process", "schedule", "noise"},
         "legitimate": {"schedule", "noise"},
         "naive": set(),
@@ -186,7 +190,9 @@ def test_passwords_and_run_are_made_afresh() -> None:
     assert len(set(passwords)) == len(passwords) == 12
     assert min(map(len, passwords)) >= 32
     assert first["router"].run != second["router"].run
-    assert first["router"].part["users"] == {n: b.password for n, b in first.items() if n != "router"}
+    users = {n: b.password for n, b in first.items() if n != "router"}
+    assert first["router"].part["users"] == {**users, "operator": first["observer"].part["operator"]}
+    assert first["observer"].part["operator"] not in passwords
 
 
 def test_an_added_eavesdropper_changes_nobody_elses_keys() -> None:
@@ -207,4 +213,6 @@ def test_model_is_the_only_thing_all_share() -> None:
     assert briefs["doubtful"].part == {
         "strategy": "suspicious",
         "parameters": {"use_state": 0.9, "use_innovation": 0.1},
+        "window": 0,
+        "outages": [],
     }

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import socket
 import subprocess
+import tomllib
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -49,22 +52,25 @@ def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["run", "montecarlo"])
-def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str) -> None:
-    """Standard output is the summary of summary.json; standard error is silent."""
+@pytest.mark.parametrize(("command", "below", "status"), [("run", "1e-9", 1), ("montecarlo", "0.01", 0)])
+def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str, below: str, status: int) -> None:
+    """Standard output is the summary of summary.json; standard error is silent; the status tells of expectations."""
     view = ("--view", "off") if command == "run" else ()
-    done = evedrop(command, "eavesdroppers", "--slots", "40", "--trials", "2", *view, "--json", "--out", "here")
-    assert (done.status, done.err) == (0, "")
+    expected = ("--set", f"expect.0.below={below}")
+    done = evedrop(
+        command, "eavesdroppers", "--slots", "40", "--trials", "2", *view, *expected, "--json", "--out", "here"
+    )
+    assert (done.status, done.err) == (status, "")
     assert done.out.count("\n") == 1
     assert done.summary == load_results(evedrop.folder / "here").summary
     assert done.summary["trials"] == 2
+    assert done.summary["expectations"][0]["held"] is (status == 0)
 
 
-@pytest.mark.parametrize("command", ["run", "montecarlo"])
-def test_a_failed_expectation_is_exit_1(evedrop: Evedrop, command: str) -> None:
-    """The run is whole, and what did not hold is printed with what was found."""
-    view = ("--view", "off") if command == "run" else ("--trials", "1")
-    done = evedrop(command, "eavesdroppers", "--slots", "40", *view, "--set", "expect.0.below=1e-9", "--out", "here")
+def test_a_failed_expectation_is_exit_1(evedrop: Evedrop) -> None:
+    """The study is whole, and what did not hold is printed with what was found."""
+    changes = ("--slots", "40", "--trials", "1", "--set", "expect.0.below=1e-9")
+    done = evedrop("montecarlo", "eavesdroppers", *changes, "--out", "here")
     assert (done.status, done.err) == (1, "")
     assert "expected legitimate.mean_squared_error below 1e-09: FAILED, found" in done.out
     assert load_results(evedrop.folder / "here").summary["expectations"][0]["held"] is False
@@ -137,9 +143,9 @@ def test_without_permission_nothing_is_started(evedrop: Evedrop) -> None:
 def test_a_folder_that_may_only_be_read_can_be_worked_in(evedrop: Evedrop) -> None:
     """The current folder is written to only where no --out is given, and then the refusal is one line."""
     where = unwritable(evedrop.folder)
-    done = evedrop("run", "eavesdroppers", *QUICK, "--out", str(evedrop.folder / "x"), cwd=where)
+    done = evedrop.process("run", "eavesdroppers", *QUICK, "--out", str(evedrop.folder / "x"), cwd=where)
     assert done.status == 0
-    refused(evedrop("run", "eavesdroppers", *QUICK, cwd=where), "cannot be written (")
+    refused(evedrop.process("run", "eavesdroppers", *QUICK, cwd=where), "cannot be written (")
 
 
 def test_two_runs_at_once_do_not_meet(evedrop: Evedrop) -> None:
@@ -174,6 +180,25 @@ def test_a_secret_of_its_own_changes_the_schedule_alone(evedrop: Evedrop) -> Non
     done = evedrop(*base, "e", "--secret", "short")
     assert done.status == 2
     assert "has 31 bytes; expected 32 or more" in done.err
+
+
+def test_a_scenario_names_a_secret_in_its_own_folder(evedrop: Evedrop) -> None:
+    """A relative path is seen from the scenario, in a change from the current folder; results run again from anywhere."""
+    inner, elsewhere = evedrop.folder / "inner", evedrop.folder / "elsewhere"
+    for folder, secret in ((inner, b"1" * 32), (elsewhere, b"2" * 32)):
+        folder.mkdir()
+        (folder / "secret.bin").write_bytes(secret)
+    text = (Path(str(resources.files("scenarios"))) / "eavesdroppers.toml").read_text()
+    (inner / "mine.toml").write_text(f'secret_file = "secret.bin"\n{text}')
+    base = ("montecarlo", "inner/mine.toml", "--slots", "20", "--trials", "1", "--json", "--out")
+    first = evedrop(*base, "a").summary
+    stored = tomllib.loads((evedrop.folder / "a" / "scenario.toml").read_text())
+    assert stored["secret_file"] == str(inner / "secret.bin")
+    again = Evedrop(elsewhere)("montecarlo", "../a", "--trials", "1", "--json", "--out", "again").summary
+    changed = evedrop(*base, "b", "--set", "secret_file=elsewhere/secret.bin").summary
+    found = [{peer["digest"] for peer in one["peers"].values()} for one in (first, again, changed)]
+    assert found[0] == found[1]
+    assert found[0].isdisjoint(found[2])
 
 
 def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:
@@ -250,19 +275,69 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
         f"{name}.json" for name in sorted({"observer", "router", "sensor", *load("numerical").receivers})
     ]
     assert {path.stat().st_mode & 0o777 for path in briefs} == {0o600}
-    refused(evedrop("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")
-    refused(evedrop("sensor", "briefs/nobody.json"), "No such file")
+    refused(evedrop.process("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")
+    refused(evedrop.process("sensor", "briefs/nobody.json"), "No such file")
     (evedrop.folder / "briefs" / "smart.json").chmod(0o644)
-    refused(evedrop("eavesdropper", "briefs/smart.json"), "readable by others")
+    refused(evedrop.process("eavesdropper", "briefs/smart.json"), "readable by others")
+
+
+def test_an_observer_that_cannot_write_says_so(evedrop: Evedrop) -> None:
+    """Started by hand, with a file where its results should go: one line with the place, exit 3."""
+    assert evedrop("brief", "numerical", "--out", "briefs", "--results", "results").status == 0
+    (evedrop.folder / "results").rmdir()
+    (evedrop.folder / "results").touch()
+    done = evedrop.process("observer", "briefs/observer.json")
+    assert done.status == 3
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: the results cannot be written (")
+    assert str(evedrop.folder / "results") in line
 
 
 def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:
     """`evedrop list | head -1`: no traceback."""
     with subprocess.Popen(["head", "-c", "1"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as reader:
-        done = evedrop("list", stdout=reader.stdin)
+        done = evedrop.process("list", stdout=reader.stdin)
         assert reader.stdin is not None
         reader.stdin.close()
     assert (done.status, done.err) == (0, "")
+
+
+def test_an_output_that_cannot_be_written_is_named(evedrop: Evedrop) -> None:
+    """A full disk behind standard output: one line that says so, exit 2."""
+    with Path("/dev/full").open("w") as full:
+        done = evedrop.process("list", stdout=full)
+    assert (done.status, done.err.count("\n")) == (2, 1)
+    assert done.err.startswith("evedrop: standard output: No space left on device; ")
+
+
+def test_other_errors_of_the_system_are_not_blamed_on_the_output(
+    evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What fails within a study is said as it is, exit 3."""
+    from emulator.runs import sweep
+
+    def fail(_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(sweep, "new_folder", fail)
+    done = evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", "--trials", "2", "--slots", "5", "--out", "x")
+    assert (done.status, done.out) == (3, "")
+    assert done.err == "evedrop: [Errno 24] Too many open files; free what the system lacks and try again\n"
+
+
+@pytest.mark.parametrize("reader", ["/dev/full", "gone"])
+def test_an_interrupt_stays_one_whoever_reads(evedrop: Evedrop, reader: str) -> None:
+    """Ctrl-C also ends who stands behind the pipe; that our closing table cannot be written changes nothing."""
+    ends = os.pipe()
+    os.close(ends[0])
+    with Path("/dev/full").open("w") if reader == "/dev/full" else os.fdopen(ends[1], "w") as output:
+        study = ("montecarlo", "eavesdroppers", "--slots", "400000", "--trials", "500", "--workers", "1")
+        live = evedrop.started(*study, stdout=output)
+        live.running()
+        live.process.terminate()
+        done = live.end()
+    assert done.status == 130
+    assert done.err == "evedrop: interrupted; what was done is in the results folder\n"
 
 
 def test_a_title_is_text(evedrop: Evedrop) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from emulator.view.figures import Size
 from tests.conftest import Evedrop
 
 LOW = 0.534206
@@ -138,19 +137,25 @@ def test_a_run_of_any_length_can_be_designed(evedrop: Evedrop) -> None:
     assert designed(evedrop, "numerical", *changes(slots=20000))["rho"] == pytest.approx(1.387799, abs=1e-6)
 
 
-def test_figures_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """A small set by the command: four pictures, figures.md, and its path on standard output."""
-    from emulator import cli
-    from emulator.view import figures
-
-    small = Size(microgrid_trials=5, microgrid_slots=200, strategy_trials=500, chain_trials=10, chain_slots=100)
-    monkeypatch.setattr(figures, "Size", lambda **_: small)
-    assert cli.main(["figures", str(tmp_path / "out")]) == 0
-    told = capsys.readouterr()
-    assert told.out.strip() == str(tmp_path / "out" / "figures.md")
-    names = {"numerical", "microgrid", "strategies", "chain"}
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {"figures.md", *(f"{name}.{kind}" for name in names for kind in ("png", "pdf"))}
+def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
+    """One line for people, an entry in the JSON; a genie, a pool of links and a constant one are designed against."""
+    extra = changes(
+        eavesdroppers__clever='{strategy = "bayesian", link = {quality = 0.9}}',
+        eavesdroppers__genie='{strategy = "genie", link = {quality = 0.9}}',
+        eavesdroppers__deaf='{strategy = "constant", link = {quality = 0.9}}',
+        eavesdroppers__pool='{strategy = "colluding", links = [{quality = 0.5}, {quality = 0.8}], reads_as = "smart"}',
+    )
+    found = designed(evedrop, "numerical", *extra)
+    assert found["left_out"] == {"clever": "bayesian"}
+    equal, genie, pool = (found["eavesdroppers"][name] for name in ("equal", "genie", "pool"))
+    assert pool == {key: pytest.approx(value) if key != "relative" else pool[key] for key, value in equal.items()}
+    assert genie["bound"] == equal["bound"]
+    assert found["legitimate"]["trace"] < genie["trace"] < equal["trace"]
+    assert found["eavesdroppers"]["deaf"]["bound"] is None
+    (line,) = [line for line in evedrop("design", "numerical", *extra).out.splitlines() if "left out" in line]
+    assert line == (
+        "left out: clever (bayesian): no closed form of its error is known; what holds against a genie holds against all"
+    )
 
 
 def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:

@@ -87,6 +87,14 @@ def test_the_command_line_loads_nothing_to_say_help() -> None:
     assert packages(loaded_by("emulator.cli")["emulator.cli"]) == set()
 
 
+def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
+    """It is loaded in every project of an environment that has Evedrop in it."""
+    found = loaded_by("pytest", "emulator.pytest_plugin")
+    more = found["emulator.pytest_plugin"] - found["pytest"]
+    assert packages(more) == set()
+    assert ours(more) == {"emulator.pytest_plugin", "emulator.collect"}
+
+
 def test_only_the_view_loads_rerun_and_matplotlib() -> None:
     """No module outside the view loads either when it is imported."""
     outside = [

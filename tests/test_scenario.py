@@ -72,13 +72,26 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
         ("process.Q.0.1", 1e-4, "process.Q: entry [0][1] is 0.0001 but [1][0] is 0.0; expected a symmetric matrix"),
         ("process.Q.1.1", -1.0, "process.Q: has the eigenvalue -1; expected a positive definite matrix"),
         ("process.initial_covariance.1.1", 0.0, "process.initial_covariance: has the eigenvalue 0; expected a positive"),
-        ("encoding.scheme", "inovation", 'encoding.scheme: is "inovation"; expected innovation or plain'),
+        (
+            "encoding.scheme",
+            "inovation",
+            "twin-track or withholding; did you mean innovation?",
+        ),
+        ("encoding.scheme", "rot13", 'encoding.scheme: is "rot13"; expected acknowledged, cipher, encrypted-schedule, '),
+        ("eavesdroppers.smart.strategy", "suspicous", "smart or suspicious; did you mean suspicious?"),
+        ("legitimate.link", {"loss": {"model": "gilbert-eliott"}}, "did you mean gilbert-elliott?"),
+        ("legitimate.link", {"loss": {"model": 7}}, "legitimate.link.loss.model: is 7; expected bernoulli"),
         ("encoding.scheme", "plain", "encoding.state_probability: is set, but the scheme plain"),
+        ("encoding.sceme", "plain", "encoding.sceme: is set, but the scheme innovation has no such parameter; expected s"),
+        ("encoding.state_probability", "x", "encoding.state_probability: is \"x\"; expected a number from 0 to 1"),
         ("encoding.state_probability", 1.5, "encoding.state_probability: is 1.5; expected a number from 0 to 1"),
         ("legitimate.link.quality", -0.5, "legitimate.link.quality: is -0.5; expected a number from 0 to 1, such as 0.9"),
         ("legitimate.link.quality", "0.5", 'legitimate.link.quality: is "0.5"; expected a number, such as 0.9'),
         ("legitimate.link", 0.5, "legitimate.link: is 0.5; expected a table, such as { quality = 0.9 }"),
-        ("eavesdroppers.smart.strategy", "clever", "expected naive, smart or suspicious"),
+        ("eavesdroppers.smart.strategy", "clever", "expected bayesian, colluding, constant, genie, likelihood, naive, ref"),
+        ("eavesdroppers.smart.links", [{"quality": 0.5}, {"quality": 0.6}], "links: is set, but the strategy smart has no s"),
+        ("eavesdroppers.smart.reads_as", "genie", "reads_as: is set, but the strategy smart has no such parameter; rem"),
+        ("eavesdroppers.smart.learns_at", 3, "learns_at: is set, but the strategy smart has no such parameter"),
         ("eavesdroppers.smart.use_state", 0.5, "is set, but the strategy smart has no such parameter"),
         ("eavesdroppers.smart.strategy", "suspicious", "eavesdroppers.smart.use_innovation: is missing; the strategy"),
         ("eavesdroppers.Eve", GOOD["eavesdroppers"]["smart"], 'eavesdroppers.Eve: is "Eve"; expected a name of a lower'),
@@ -148,6 +161,66 @@ def test_all_mistakes_are_named_at_once() -> None:
     assert len(found) == 13
 
 
+POOL = {"strategy": "colluding", "links": [{"quality": 0.6}, {"quality": 0.5}], "reads_as": "smart"}
+SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "link": {"quality": 0.5}}
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({**POOL, "links": None}, ["links: is missing; the strategy colluding needs it; expected links = [{ quality"]),
+        ({**POOL, "links": []}, ["links: has fewer than 2 entries; expected at least so many"]),
+        ({**POOL, "links": [{"quality": 2.0}] * 17}, ["links: has more than 16 entries; expected at most so many"]),
+        ({**POOL, "links": [{"quality": 2.0}, {}]}, ["links.0.quality: is 2.0; expected a number from 0 to 1, such as",
+                                                     "links.1.quality: is missing; expected quality = 0.9, or a loss"]),
+        ({**POOL, "link": {"quality": 0.5}}, ["link: is set, but the strategy colluding has no such parameter; its ent"]),
+        ({**POOL, "reads_as": None}, ['reads_as: is missing; the strategy colluding needs it; expected reads_as = "sm']),
+        ({**POOL, "reads_as": "colluding"}, ['reads_as: is "colluding"; expected bayesian, constant, genie, likelihood']),
+        ({**POOL, "reads_as": "suspicious", "use_state": 0.5}, ["use_innovation: is missing; the strategy colluding ne"]),
+        ({**SPY, "learns_at": None}, ["learns_at: is missing; the strategy replay-informed needs it; expected learns_at"]),
+        ({**SPY, "learns_at": -1}, ["learns_at: is -1; expected a number at least 0, such as 40"]),
+        ({**SPY, "learns_at": 50}, ["learns_at: is 50; expected a slot of the run, 0 to 49"]),
+        ({"strategy": "clever"}, ['strategy: is "clever"; expected', "link: is missing; expected link = { quality = 0.9"]),
+    ],
+)  # fmt: skip
+def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], said: list[str]) -> None:
+    """What a strategy lacks, what it has too much of, and what is wrong with it: a line each."""
+    given = {name: value for name, value in table.items() if value is not None}
+    found = mistakes({"eavesdroppers.eve": given})
+    assert len(found) == len(said), found
+    for line, start in zip(sorted(found), sorted(said), strict=True):
+        assert line.startswith(f"eavesdroppers.eve.{start}")
+
+
+def test_eavesdroppers_that_are_right_are_taken() -> None:
+    """With exactly what each strategy needs; the parameters are those that its process is told."""
+    suspicious = {"reads_as": "suspicious", "use_state": 0.5, "use_innovation": 0.1}
+    tables = {"pool": POOL, "spy": SPY, "careful": {**POOL, **suspicious}}
+    link = {"link": {"quality": 0.9}}
+    tables |= {name: {"strategy": name, **link} for name in ("constant", "genie", "bayesian", "likelihood")}
+    scenario = parse(tomli_w.dumps(GOOD), "scenario", {"eavesdroppers": tables})
+    assert {name: table.parameters for name, table in scenario.eavesdroppers.items()} == {
+        **{name: {} for name in tables},
+        "pool": {"reads_as": "smart"},
+        "spy": {"reads_as": "bayesian", "learns_at": 5},
+        "careful": suspicious,
+    }
+    assert scenario.quality["pool"] == pytest.approx(1 - 0.4 * 0.5)
+    assert Scenario.model_validate(scenario.model_dump(mode="json")) == scenario
+    assert parse(resolved(scenario), "resolved").eavesdroppers == scenario.eavesdroppers
+
+
+@pytest.mark.parametrize(("strategy", "entry"), [("smart", "strategy"), ("genie", "strategy"), ("smart", "reads_as")])
+def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entry: str) -> None:
+    """Told with the strategies that can do without."""
+    table = {"strategy": strategy, "link": {"quality": 0.8}} if entry == "strategy" else {**POOL, "reads_as": strategy}
+    (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
+    assert line == (
+        f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by what it knows of the schedule, and the scheme '
+        "plain has none; expected bayesian, constant, likelihood, naive, reference or selective"
+    )
+
+
 BURSTS = {"model": "gilbert-elliott", "p": 0.05, "r": 0.5}
 CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.0, 1.0]}
 
@@ -158,14 +231,14 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
         ({}, "link.quality: is missing; expected quality = 0.9, or a loss model"),
         ({"quality": 0.9, "loss": BURSTS}, "link.quality: is there beside loss, of which it is the short form"),
         ({"loss": 3}, "link.loss: is 3; expected a table, such as"),
-        ({"loss": {}}, 'link.loss.model: is ""; expected bernoulli, gilbert-elliott, markov or pattern'),
+        ({"loss": {}}, 'link.loss.model: is ""; expected bernoulli, distance, gilbert-elliott, markov, pattern or t'),
         ({"loss": {"model": "gilbert"}}, 'link.loss.model: is "gilbert"; expected bernoulli'),
         ({"loss": {"model": ["x"]}}, 'link.loss.model: is ["x"]; expected bernoulli'),
         ({"loss": {"model": "bernoulli", "quality": 1.5}}, "link.loss.quality: is 1.5; expected a number from 0 to 1"),
         ({"loss": {"model": "gilbert-elliott", "p": 0.1}}, "link.loss.r: is missing; expected r = 0.5"),
         ({"loss": {**BURSTS, "q": 0.1}}, "link.loss.q: is no parameter of gilbert-elliott; expected bad, good, p or r"),
-        ({"loss": {**BURSTS, "p": "often"}}, "link.loss.p: is 'often'; expected a number from 0 to 1"),
-        ({"loss": {**BURSTS, "good": True}}, "link.loss.good: is True; expected a number from 0 to 1"),
+        ({"loss": {**BURSTS, "p": "often"}}, 'link.loss.p: is "often"; expected a number from 0 to 1'),
+        ({"loss": {**BURSTS, "good": True}}, "link.loss.good: is true; expected a number from 0 to 1"),
         ({"loss": {**BURSTS, "bad": float("nan")}}, "link.loss.bad: is nan; expected a number from 0 to 1"),
         ({"loss": {**BURSTS, "p": 0, "r": 0.0}}, "link.loss.p: and r are both 0"),
         ({"loss": {**CHAIN, "transitions": 0.5}}, "link.loss.transitions: is no matrix"),
@@ -176,8 +249,8 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
         ({"loss": {**CHAIN, "transitions": [[1, 0], [0, 1]]}}, "link.loss.transitions: falls apart into states"),
         ({"loss": {**CHAIN, "loss": [0.0]}}, "link.loss.loss: is [0.0]; expected 2 numbers from 0 to 1, one for each"),
         ({"loss": {**CHAIN, "loss": [0.0, 2.0]}}, "link.loss.loss: is [0.0, 2.0]; expected 2 numbers"),
-        ({"loss": {"model": "pattern", "outcomes": "11x1"}}, "link.loss.outcomes: is '11x1'; expected a word of 0"),
-        ({"loss": {"model": "pattern", "outcomes": ""}}, "link.loss.outcomes: is ''; expected a word of 0 (lost)"),
+        ({"loss": {"model": "pattern", "outcomes": "11x1"}}, 'link.loss.outcomes: is "11x1"; expected a word of 0'),
+        ({"loss": {"model": "pattern", "outcomes": ""}}, 'link.loss.outcomes: is ""; expected a word of 0 (lost)'),
         ({"loss": {"model": "pattern", "outcomes": 11}}, "link.loss.outcomes: is 11; expected a word of 0 (lost)"),
     ],
 )  # fmt: skip
@@ -215,13 +288,15 @@ def test_all_mistakes_of_links_are_named_at_once() -> None:
 
 
 def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
-    """A pattern has no expected trace, so nothing can be asked of it; of its other figures something can."""
-    pattern = {"eavesdroppers.smart.link": {"loss": {"model": "pattern", "outcomes": "10"}}}
+    """Behind a queue nobody knows the expected trace, so nothing can be asked of it; of its other figures something can."""
+    queue = {"eavesdroppers.smart.link": {"quality": 0.9, "rate": 0.5}}
     expect = [
         {"figure": f"smart.{figure}", "below": 1.0} for figure in ("received_fraction", "expected_trace_covariance")
     ]
-    (line,) = mistakes({**pattern, "expect": expect})
+    (line,) = mistakes({**queue, "expect": expect})
     assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but there is no theory for')
+    (line,) = mistakes({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
+    assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another figure")
 
 
 def test_more_slots_than_the_horizon_are_refused() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -37,9 +37,18 @@ class Adversary:
     """P(b = 1 given ν = 0)."""
     use_innovation: float
     """P(b = 1 given ν = 1)."""
+    reads_leak: bool = False
+    """Whether it uses what innovations leak: the genie, with the probabilities of smart."""
+
+    @classmethod
+    def who(cls, name: str, mu_e: float, half: Outcomes) -> Adversary:
+        """From what it would do with a slot behind a link that loses nothing, at μ_d = 1/2."""
+        return cls(name, mu_e, 2.0 * half.state, 2.0 * half.misled, half.leaked > 0.0)
 
     def outcomes(self, mu_d: float) -> Outcomes:
         """What it does with a slot."""
+        if self.reads_leak:
+            return Outcomes.genie(self.mu_e, mu_d)
         return Outcomes.eavesdropper(self.mu_e, mu_d, self.use_state, self.use_innovation)
 
 
@@ -100,6 +109,8 @@ class Design:
     plain_trace: float
     """J(1): what the same link gives when every packet is the state."""
     eavesdroppers: dict[str, Against]
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Eavesdropper → strategy, of those whose error has no closed form: nothing can be designed by it."""
 
     @property
     def cost(self) -> float:
@@ -117,16 +128,25 @@ class Design:
             "a better link is needed"
         )
 
+    @property
+    def omission(self) -> str | None:
+        """A sentence if eavesdroppers were left out."""
+        if not self.left_out:
+            return None
+        who = ", ".join(f"{name} ({strategy})" for name, strategy in self.left_out.items())
+        return f"left out: {who}: no closed form of its error is known; what holds against a genie holds against all"
+
     def as_dict(self) -> dict[str, Any]:
-        """The JSON of `evedrop design`; inf is null, and `minimum` is there only if it was asked for."""
+        """The JSON of `evedrop design`; inf is null, and `minimum` and `left_out` are there only if there are any."""
         legitimate: dict[str, Any] = {"bound": _finite(self.bound), "trace": _finite(self.trace)}
         if self.minimum is not None:
             legitimate["minimum"] = self.minimum
-        return {
+        found = {
             "rho": self.rho,
             "legitimate": legitimate,
             "eavesdroppers": {name: against.as_dict() for name, against in self.eavesdroppers.items()},
         }
+        return {**found, "left_out": self.left_out} if self.left_out else found
 
 
 def design(

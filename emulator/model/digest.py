@@ -1,14 +1,15 @@
 """What makes two runs comparable to the last bit: SHA-256 over all that a receiver received and believed.
 
 For each trial and each aligned block of 256 slots: over, slot by slot, γ (1 byte), x̂ (n) and P (n × n, row by row) as
-little-endian float64. A receiver's digest is that of its block digests, ordered by trial, then block.
+little-endian float64. Where an outage of the receiver begins or ends a block ends too, since another process may go on. A
+receiver's digest is that of its block digests, ordered by trial, then block. A block is named by its first slot.
 
 Source: docs/results.md, digests.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -36,31 +37,36 @@ class Rows(NamedTuple):
     """(c, R)."""
 
 
+def block_starts(slots: int, cuts: Iterable[int] = ()) -> list[int]:
+    """The first slots of a run's blocks; cuts: where an outage of the receiver begins or ends."""
+    return sorted({*range(0, slots, BLOCK_SLOTS), *(cut for cut in cuts if 0 < cut < slots)})
+
+
 class BeliefLog:
     """A receiver's beliefs of the block at hand, and the digests of the blocks that are over.
 
-    Final; slots must be added in order from 0.
+    Final; slots must be added in order from the first, with which a block begins.
     """
 
-    def __init__(self, n: int, trials: int, slots: int) -> None:
+    def __init__(self, n: int, trials: int, slots: int, cuts: Iterable[int] = (), first: int = 0) -> None:
         length = min(BLOCK_SLOTS, slots)
-        self._slots = slots
+        self._ends = {*block_starts(slots, cuts), slots}
+        self._start = first
         self._x_hat = np.empty((length, n, trials))
         self._P = np.empty((length, n, n, trials))
         self._action = np.empty((length, trials), np.uint8)
 
-    def add(self, k: int, belief: Belief) -> Digests | None:
-        """Take slot k; at the end of a block, its digest for every trial, (R, 32)."""
-        row = k % BLOCK_SLOTS
+    def add(self, k: int, belief: Belief) -> tuple[int, Digests] | None:
+        """Take slot k; at the end of a block, its first slot and its digest for every trial, (R, 32)."""
+        if k in self._ends:
+            self._start = k
+        row = k - self._start
         self._x_hat[row], self._P[row], self._action[row] = belief.x_hat, belief.P, belief.action
-        if row == BLOCK_SLOTS - 1 or k == self._slots - 1:
-            return self._digest(row + 1)
-        return None
+        return (self._start, self._digest(row + 1)) if k + 1 in self._ends else None
 
     def rows(self, first: int, end: int) -> Rows:
         """The beliefs of slots first … end−1, which must be of the block at hand; overwritten as the next one fills."""
-        start = first % BLOCK_SLOTS
-        rows = slice(start, start + end - first)
+        rows = slice(first - self._start, end - self._start)
         return Rows(self._x_hat[rows], self._P[rows], self._action[rows])
 
     def _digest(self, length: int) -> Digests:
@@ -90,7 +96,7 @@ class RunDigest:
         self._hash = sha256()
 
     def add(self, blocks: Mapping[int, Digests]) -> None:
-        """Take the next R trials: block number → digests, (R, 32)."""
+        """Take the next R trials: block → digests, (R, 32)."""
         self._hash.update(np.stack([blocks[block] for block in sorted(blocks)], axis=1).tobytes())
 
     @property

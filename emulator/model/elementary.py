@@ -50,6 +50,33 @@ def log(x: Floats) -> Floats:
     return result
 
 
+_EXP = (
+    1.66666666666666019037e-01,
+    -2.77777777770155933842e-03,
+    6.61375632143793436117e-05,
+    -1.65339022054652515390e-06,
+    4.13813679705723846039e-08,
+)
+_INVERSE_LN2 = 1.44269504088896338700e00
+_EXP_LEAST, _EXP_MOST = -745.2, 709.78
+
+
+def exp(x: Floats) -> Floats:
+    """Exponential of finite x, elementwise; error below one unit in the last place, 0 below −745, inf above 709.78.
+
+    Source: FreeBSD msun e_exp.c (Sun Microsystems, 1993), its polynomial and its order of operations.
+    """
+    within = np.clip(x, _EXP_LEAST, _EXP_MOST)
+    power = np.rint(within * _INVERSE_LN2)
+    high, low = within - power * _LN2_HIGH, power * _LN2_LOW
+    r = high - low
+    t = r * r
+    c = r - t * polynomial(_EXP, t)
+    value = np.ldexp(1.0 - ((low - (r * c) / (2.0 - c)) - high), power.astype(np.int64))
+    result: Floats = np.where(x < _EXP_LEAST, 0.0, np.where(x > _EXP_MOST, np.inf, value))
+    return result
+
+
 # Wichura (1988), "Algorithm AS 241: The percentage points of the normal distribution", PPND16.
 _CENTRE = (
     (3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
@@ -154,3 +181,24 @@ def triangular_factor(rows: Rows) -> Rows:
             for row in work[i:]:
                 row[i] = -row[i]
     return [row[:n] for row in work]
+
+
+def inverse(M: Floats) -> Floats:
+    """Inverse of a regular matrix (n, n), by elimination with row pivots.
+
+    Raises ValueError where a pivot is 0.
+    """
+    n = M.shape[0]
+    rows: Rows = [[*map(float, M[i]), *(1.0 if j == i else 0.0 for j in range(n))] for i in range(n)]
+    for c in range(n):
+        pivot = max(range(c, n), key=lambda i: abs(rows[i][c]))
+        if rows[pivot][c] == 0.0:
+            raise ValueError("singular")
+        rows[c], rows[pivot] = rows[pivot], rows[c]
+        divisor = rows[c][c]
+        rows[c] = [value / divisor for value in rows[c]]
+        for i in range(n):
+            if i != c:
+                factor = rows[i][c]
+                rows[i] = [value - factor * other for value, other in zip(rows[i], rows[c], strict=True)]
+    return np.array([row[n:] for row in rows])

@@ -1,86 +1,189 @@
-"""Expected covariances behind a link whose quality follows a Markov chain: losses in bursts and their like.
+"""Expected covariances behind a link whose quality follows a Markov chain, changes with time, or delays packets.
 
 For each link state s, E_k(s) = E[P_k; state s in slot k], and with q(s) its quality and T the transitions
 
-    E_k(s) = kept(q(s)) A (Σ_r T(r, s) E_{k−1}(r)) Aᵀ + π(s) (p_d(q(s)) Q + p_i(q(s)) f_k),
+    E_k(s) = kept(q(s)) A (Σ_r T(r, s) E_{k−1}(r)) Aᵀ + π(s) (p_d(q(s)) Q + p_i(q(s)) f_k + p_l(q(s)) M_k),
 
-because the state of slot k alone decides what becomes of its packet. The sum over s is E P_k.
+because the state of slot k alone decides what becomes of its packet. The sum over s is E P_k. Where packets may be late by
+up to W slots, the same runs from slot k − W, up to which all is settled, to slot k with q(s) times the probability that
+a packet of each slot is there by slot k: a late packet counts as if it had been in time.
 
-Source: docs/mathematics.md, losses in bursts.
+Source: docs/mathematics.md, losses in bursts and late packets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from bisect import bisect_right
+from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
+from emulator.model.leak import RemainingCovariances, remaining_limit
+from emulator.model.link_law import LinkLaw, Segment
 from emulator.model.links.link import Chain
 from emulator.model.process import Floats, Process
-from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, lyapunov, radius
-
-OutcomesAt = Callable[[float], Outcomes]
-"""From the quality of a link to what its receiver does with a slot."""
+from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, OutcomesAt, lyapunov, radius
 
 
 class ModulatedCovariance:
     """E P_k of a receiver behind such a link, the next slots at a time from k = 0. Final; as `ExpectedCovariance`."""
 
-    def __init__(self, process: Process, chain: Chain, outcomes_at: OutcomesAt) -> None:
-        outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-        self._process = process
-        self._chain = chain
-        self._kept = np.array([one.kept for one in outcomes])[:, None, None]
-        self._diffused = (
-            np.array([one.predicted for one in outcomes])[:, None, None] * chain.law[:, None, None] * process.Q
-        )
-        self._misled = 2.0 * np.array([one.misled for one in outcomes])[:, None, None] * chain.law[:, None, None]
-        start = np.array([one.initial for one in outcomes])[:, None, None] * chain.law[:, None, None]
-        self._states: Floats = start * process.initial_covariance
+    def __init__(self, process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> None:
+        self._process, self._law = process, law
+        never, always = outcomes_at(0.0), outcomes_at(1.0)
+        self._base = {name: getattr(never, name) for name in _PARTS}
+        self._slope = {name: getattr(always, name) - getattr(never, name) for name in _PARTS}
+        self._remaining = RemainingCovariances(process) if self._slope["leaked"] or self._base["leaked"] else None
         self._sigma = ExpectedCovariance(process, NOBODY)
+        self._k = 0
+        self._settled: Floats | None = None
+        self._window: deque[_Slot] = deque(maxlen=law.window)
         self._before: Floats | None = None
 
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,); inf once it overflows."""
-        A, T = self._process.A, self._chain.transitions
         traces = np.empty(slots)
         sigma = self._sigma.next(slots)
+        row = 0
         with np.errstate(over="ignore", invalid="ignore"):
-            for row in range(slots):
-                if self._before is not None:
-                    mixed = np.tensordot(T.T, self._states, axes=1)
-                    # Without the mask 0 · inf would undo a bounded expectation once Σ_k leaves double precision.
-                    grown = A @ self._before @ A.T
-                    misled = np.where(self._misled > 0.0, self._misled * grown, 0.0)
-                    self._states = self._kept * (A @ mixed @ A.T) + self._diffused + misled
-                self._before = sigma[row]
-                total = float(np.trace(self._states.sum(axis=0)))
-                traces[row] = total if np.isfinite(total) else np.inf
+            while row < slots:
+                segment, stop = self._segment(self._k)
+                count = min(slots - row, stop - self._k, _AHEAD)
+                quality = segment.quality(range(self._k, self._k + count))
+                for i in range(count):
+                    total = float(np.trace(self._next(segment, quality[i], sigma[row + i]).sum(axis=0)))
+                    traces[row + i] = total if np.isfinite(total) else np.inf
+                row += count
         return traces
+
+    def _segment(self, k: int) -> tuple[Segment, int]:
+        """The segment of a slot, and the first slot after it."""
+        starts = [one.start for one in self._law.segments] + [2**62]
+        number = bisect_right(starts, k) - 1
+        return self._law.segments[number], starts[number + 1]
+
+    def _next(self, segment: Segment, quality: Floats, sigma: Floats) -> Floats:
+        """E_k(s), (states, n, n), of the next slot, which has the covariance Σ_k."""
+        k = self._k
+        for start, stop, keeps in self._law.outages:
+            if start <= k < stop:
+                quality = np.zeros_like(quality)
+            if k == start > 0 and not keeps and self._before is not None and self._settled is not None:
+                self._settled = self._before[None] * segment.chain.law[:, None, None]
+        fresh = self._k == segment.start
+        remaining = self._remaining.next() if self._remaining is not None and k > 0 else None
+        slot = _Slot(k, segment, fresh, quality, self._before, remaining)
+        self._before, self._k = sigma, k + 1
+        if not self._law.window:
+            self._settled = self._step(self._settled, slot, 0)
+            return self._settled
+        if len(self._window) == self._law.window:
+            self._settled = self._step(self._settled, self._window[0], self._law.window)
+        self._window.append(slot)
+        states = self._settled
+        for one in self._window:
+            states = self._step(states, one, k - one.k)
+        assert states is not None  # noqa: S101 - the window holds slot k
+        return states
+
+    def _step(self, states: Floats | None, slot: _Slot, lag: int) -> Floats:
+        """E(s) after a slot, from that before it, when the slot is so many slots ago."""
+        A, chain = self._process.A, slot.segment.chain
+        quality = slot.quality * slot.segment.arrived[lag]
+        odds = {name: (self._base[name] + self._slope[name] * quality)[:, None, None] for name in _PARTS}
+        law = chain.law[:, None, None]
+        if states is None or slot.before is None:
+            first: Floats = odds["initial"] * law * self._process.initial_covariance
+            return first
+        mixed = states.sum(axis=0)[None] * law if slot.fresh else np.tensordot(chain.transitions.T, states, axes=1)
+        # Without the mask 0 · inf would undo a bounded expectation once Σ_k leaves double precision.
+        grown = 2.0 * (A @ slot.before @ A.T)
+        misled = np.where(odds["misled"] > 0.0, odds["misled"] * grown, 0.0)
+        source = odds["predicted"] * self._process.Q + misled
+        if slot.remaining is not None:
+            source = source + odds["leaked"] * slot.remaining
+        kept: Floats = odds["kept"] * (A @ mixed @ A.T) + law * source
+        return kept
+
+
+_PARTS = ("kept", "predicted", "misled", "leaked", "initial")
+_AHEAD = 256  # slots whose qualities are looked up at once
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """What a step needs to know of its slot."""
+
+    k: int
+    segment: Segment
+    fresh: bool
+    """Whether a segment begins, whose chain starts in its stationary law."""
+    quality: Floats
+    before: Floats | None
+    """Σ_{k−1}."""
+    remaining: Floats | None
+    """Of the genie."""
+
+
+def limit_of(process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> float:
+    """Trace of lim E P_k behind the link as it is in the end; inf if it has none."""
+    chain = law.last
+    states = limit_states(process, chain, outcomes_at)
+    if states is None:
+        return float("inf")
+    arrived = law.segments[-1].arrived
+    for lag in range(law.window - 1, -1, -1):
+        there = Chain(
+            chain.transitions, chain.law, chain.quality * (arrived[lag] / arrived[-1] if arrived[-1] else 0.0)
+        )
+        states = _limit_step(process, there, outcomes_at, states)
+    return float(np.trace(states.sum(axis=0)))
 
 
 def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> float:
     """Trace of lim E P_k; inf if it has none: the operator on (E(s)) does not contract, or misled errors grow."""
+    states = limit_states(process, chain, outcomes_at)
+    return float("inf") if states is None else float(np.trace(states.sum(axis=0)))
+
+
+def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Floats | None:
+    """Lim E_k(s), (states, n, n); None if there is none."""
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
+    n, states = process.n, len(chain.law)
     misled = any(one.misled > 0.0 for one in outcomes)
     if misled and radius(process) >= 1.0:
-        return float("inf")
-    if not misled and all(one.predicted == 0.0 and one.initial == 0.0 for one in outcomes):
-        return 0.0
-    n, states = process.n, len(chain.law)
+        return None
+    if not misled and all(one.predicted + one.leaked + one.initial == 0.0 for one in outcomes):
+        return np.zeros((states, n, n))
     kept = np.repeat([one.kept for one in outcomes], n * n)
     operator = kept[:, None] * np.kron(chain.transitions.T, np.kron(process.A, process.A))
     if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
-        return float("inf")
+        return None
+    source = _limit_sources(process, chain, outcomes).reshape(-1)
+    solution: Floats = np.linalg.solve(np.eye(len(operator)) - operator, source).reshape(states, n, n)
+    return solution
+
+
+def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> Floats:
+    """What a slot adds to E(s) in the limit, (states, n, n)."""
+    misled = any(one.misled > 0.0 for one in outcomes)
     f = 2.0 * (process.A @ lyapunov(process, 1.0) @ process.A.T) if misled else np.zeros_like(process.Q)
-    source = np.concatenate(
+    M = remaining_limit(process) if any(one.leaked for one in outcomes) else np.zeros_like(process.Q)
+    return np.array(
         [
-            law * (one.predicted * process.Q + one.misled * f).reshape(-1)
+            law * (one.predicted * process.Q + one.misled * f + one.leaked * M)
             for law, one in zip(chain.law, outcomes, strict=True)
         ]
     )
-    solution = np.linalg.solve(np.eye(len(operator)) - operator, source).reshape(states, n, n)
-    return float(np.trace(solution.sum(axis=0)))
+
+
+def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states: Floats) -> Floats:
+    outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
+    mixed = np.tensordot(chain.transitions.T, states, axes=1)
+    kept = np.array([one.kept for one in outcomes])[:, None, None]
+    stepped: Floats = kept * (process.A @ mixed @ process.A.T) + _limit_sources(process, chain, outcomes)
+    return stepped
 
 
 def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
@@ -89,7 +192,7 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     Source: docs/mathematics.md, losses in bursts.
     """
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-    if all(one.predicted == 0.0 for one in outcomes):
+    if all(one.predicted + one.leaked == 0.0 for one in outcomes):
         return outcomes[0]
     keeps = np.array([one.kept for one in outcomes])[:, None] * chain.transitions.T
     rate = min(1.0, float(np.max(np.abs(np.linalg.eigvals(keeps)))))

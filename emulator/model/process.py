@@ -19,6 +19,8 @@ from emulator.streams import Batch, BlockReader
 
 Floats = NDArray[np.float64]
 
+MARGINAL = 1e-7
+"""An eigenvalue of A this close to the unit circle is on it, computed: a double one has errors of 1e-8."""
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding does not explain
 
 
@@ -98,9 +100,13 @@ class Process:
 
 
 class ProcessNoise:
-    """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`. Final."""
+    """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`. Final.
 
-    def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
+    initial: x_0 (n, R), where a scheme's secret decides it.
+    """
+
+    def __init__(self, process: Process, key: bytes, batch: Batch, initial: Floats | None = None) -> None:
+        self._initial = initial
         self._reader = BlockReader(key, batch, process.n)
         self._initial_factor = cholesky(process.initial_covariance)
         self._factor = cholesky(process.Q)
@@ -109,6 +115,8 @@ class ProcessNoise:
 
     def at(self, k: int) -> Floats:
         """What slot k adds to A x_{k−1}, (n, R)."""
+        if k == 0 and self._initial is not None:
+            return self._initial
         if k not in self._slots:
             self._slots = self._reader.block(k)
             factors = np.broadcast_to(self._factor, (len(self._slots), *self._factor.shape))
@@ -121,11 +129,14 @@ class ProcessNoise:
 
 
 class Trajectory:
-    """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Final. Must be read slot by slot."""
+    """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Final. Must be read slot by slot.
 
-    def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
+    initial: x_0 (n, R), where a scheme's secret decides it.
+    """
+
+    def __init__(self, process: Process, key: bytes, batch: Batch, initial: Floats | None = None) -> None:
         self._process = process
-        self._noise = ProcessNoise(process, key, batch)
+        self._noise = ProcessNoise(process, key, batch, initial)
         self._next = 0
         self.x: Floats = np.zeros((process.n, batch.trials))
         self.predicted: Floats = self.x

@@ -24,7 +24,7 @@ class Action(IntEnum):
     STATE = 1
     """The packet was used as the state."""
     INNOVATION = 2
-    """The packet was decoded as an innovation, with the secret."""
+    """The packet was read as an innovation: decoded with the secret, or without it for the little that it leaks."""
     DISCARDED = 3
     """The packet was received and not used."""
 
@@ -38,6 +38,8 @@ class Heard(NamedTuple):
     """The packets, (n, R); of any value where nothing was received."""
     header: NDArray[np.int64] | None = None
     """What the scheme sends in clear beside each packet, (h, R); None for a scheme that has no header."""
+    truth: Floats | None = None
+    """x_k itself, (n, R), in the one slot whose state is betrayed to this receiver, received or not; else None."""
 
 
 class Belief(NamedTuple):
@@ -79,6 +81,17 @@ def trace_of(P: Floats) -> Floats:
     return trace
 
 
+def prior(process: Process, trials: int, first: int = 0) -> Belief:
+    """Belief before slot `first` of who has heard nothing yet: x̂ = 0, P = Σ_{first−1}, and Σ0 before slot 0.
+
+    Source: docs/mathematics.md, legitimate estimator.
+    """
+    sigma = process.initial_covariance[:, :, None]
+    for _ in range(first - 1):
+        sigma = process.diffuse(process.carry(sigma))
+    return Belief(np.zeros((process.n, trials)), np.repeat(sigma, trials, axis=2), np.zeros(trials, np.uint8))
+
+
 class Receiver(ABC):
     """Turns deliveries into beliefs, a slot at a time. It keeps no state but what its secret streams read ahead."""
 
@@ -86,11 +99,9 @@ class Receiver(ABC):
         self.process = process
         self.trials = trials
 
-    def prior(self) -> Belief:
-        """Belief before slot 0: x̂ = 0, P = Σ0 (docs/mathematics.md, legitimate estimator)."""
-        n = self.process.n
-        P = np.repeat(self.process.initial_covariance[:, :, None], self.trials, axis=2)
-        return Belief(np.zeros((n, self.trials)), P, np.zeros(self.trials, np.uint8))
+    def prior(self, first: int = 0) -> Belief:
+        """Belief before slot `first` of this receiver if it has heard nothing yet."""
+        return prior(self.process, self.trials, first)
 
     @abstractmethod
     def act(self, k: int, gamma: Flags) -> Codes:

@@ -11,21 +11,22 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emulator.model.process import Floats, Process
+from emulator.model.leak import RemainingCovariances, remaining_limit
+from emulator.model.process import MARGINAL, Floats, Process
 
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python, few enough to set up in 3 ms
 _LARGEST_POWER = 1e100  # of A's entries within a block, far from overflow
-_MARGINAL = 1e-7  # a spectral radius this close to 1 is 1, computed: a double eigenvalue has errors of 1e-8
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Probabilities of what a receiver does with a slot k ≥ 1; `predicted`, `decoded`, `state`, `misled` sum to 1.
+    """Probabilities of what a receiver does with a slot k ≥ 1; `predicted`, `decoded`, `leaked`, `state`, `misled` sum to 1.
 
     Source: docs/mathematics.md, expectations.
     """
@@ -40,6 +41,8 @@ class Outcomes:
     """p_i of the legitimate estimator: an innovation was decoded. P ← A P Aᵀ."""
     initial: float
     """p_0: the packet of slot 0, always the state, was not used. P_0 = Σ0."""
+    leaked: float = 0.0
+    """p_l of the genie: an innovation was read for what it leaks. P ← A P Aᵀ + Q − QΣ_k⁻¹Q."""
 
     @classmethod
     def legitimate(cls, mu: float, mu_d: float) -> Outcomes:
@@ -58,6 +61,14 @@ class Outcomes:
         misled = mu_e * (1.0 - mu_d) * use_innovation
         return cls(1.0 - state - misled, state, misled, decoded=0.0, initial=1.0 - mu_e * use_state)
 
+    @classmethod
+    def genie(cls, mu_e: float, mu_d: float) -> Outcomes:
+        """Who knows the type of every packet and uses all that it tells, behind a link of quality μ_e.
+
+        Source: docs/mathematics.md, genie.
+        """
+        return cls(1.0 - mu_e, mu_e * mu_d, misled=0.0, decoded=0.0, initial=1.0 - mu_e, leaked=mu_e * (1.0 - mu_d))
+
     @property
     def believed(self) -> Outcomes:
         """The same with every used packet taken for the state, which is what the receiver's own covariance assumes."""
@@ -65,9 +76,12 @@ class Outcomes:
 
     @property
     def kept(self) -> float:
-        """Probability that the error is carried on to the next slot: `predicted` + `decoded`."""
-        return self.predicted + self.decoded
+        """Probability that the error is carried on to the next slot: not to 0, not to f_k."""
+        return self.predicted + self.decoded + self.leaked
 
+
+OutcomesAt = Callable[[float], Outcomes]
+"""From the quality of a link to what its receiver does with a slot."""
 
 NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
 """Who is told nothing: its error covariance is that of the state itself."""
@@ -112,14 +126,17 @@ class ExpectedCovariance:
                   + 2 p_i Σ_{l<j} F^l (W_{j−l} − Q) F^lᵀ,
 
     all terms positive semidefinite, so nothing cancels. Values do not depend on how many slots are asked for at a time.
-    From the slot where a value leaves double precision, every entry is inf.
+    From the slot where a value leaves double precision, every entry is inf. What is leaked differs from slot to slot, and
+    its recursion is followed slot by slot.
 
     Source: Theorem IV.3 (proof, corrected), Theorem V.2 (corrected); docs/mathematics.md, expectations.
     """
 
     def __init__(self, process: Process, outcomes: Outcomes) -> None:
         n = process.n
-        self._misled = outcomes.misled
+        self._process = process
+        self._outcomes = outcomes
+        self._remaining = RemainingCovariances(process) if outcomes.leaked else None
         with np.errstate(over="ignore", invalid="ignore"):
             length = _block_length(process.A)
             self._powers = _powers(process.A, length)
@@ -167,12 +184,22 @@ class ExpectedCovariance:
             self._block = np.full(self._powers.shape, np.inf)
             return
         with np.errstate(over="ignore", invalid="ignore"):
+            if self._remaining is not None:
+                self._block = _unbounded_from_overflow(self._slot_by_slot(E, self._remaining))
+                return
             block = _congruences(self._kept_powers, E) + self._diffusion
-            if self._misled:
+            if self._outcomes.misled:
                 grown = _congruences(self._powers, self._sigma)
                 block += self._weights[:, None, None] * grown
                 self._sigma = grown[-1] + self._spread[-1]
         self._block = _unbounded_from_overflow(block)
+
+    def _slot_by_slot(self, E: Floats, remaining: RemainingCovariances) -> Floats:
+        block, one, A = np.empty(self._powers.shape), self._outcomes, self._process.A
+        noise = one.predicted * self._process.Q
+        for j in range(len(block)):
+            E = block[j] = one.kept * (A @ E @ A.T) + noise + one.leaked * remaining.next()
+        return block
 
 
 def expected_covariances(process: Process, outcomes: Outcomes, slots: int) -> Floats:
@@ -197,7 +224,7 @@ def radius(process: Process) -> float:
     Source: docs/mathematics.md, limits.
     """
     rho = process.spectral_radius
-    return 1.0 if abs(rho - 1.0) <= _MARGINAL else rho
+    return 1.0 if abs(rho - 1.0) <= MARGINAL else rho
 
 
 def stability_bound(process: Process, mu: float) -> float:
@@ -224,14 +251,16 @@ def lyapunov(process: Process, kept: float) -> Floats:
 def limit(process: Process, outcomes: Outcomes) -> Floats:
     """Limit of E P_k, (n, n), all inf if it is unbounded: p_d S(1 − kept), for whoever is never misled.
 
-    Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics.md, limits.
+    Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics.md, limits and genie.
     """
     source = outcomes.predicted * process.Q
+    if outcomes.leaked:
+        source = source + outcomes.leaked * remaining_limit(process)
     if outcomes.misled:
         if radius(process) >= 1.0:
             return np.full_like(process.Q, np.inf)
         source = source + 2.0 * outcomes.misled * (process.A @ lyapunov(process, 1.0) @ process.A.T)
-    elif outcomes.predicted == 0.0 and outcomes.initial == 0.0:
+    elif outcomes.predicted + outcomes.leaked + outcomes.initial == 0.0:
         return np.zeros_like(process.Q)
     return _stationary(process, outcomes.kept, source)
 
@@ -247,12 +276,15 @@ def limit_trace(process: Process, outcomes: Outcomes) -> float:
 def tail_index(process: Process, outcomes: Outcomes) -> float:
     """Exponent α of P(tr P_k > t) ~ t^−α for large k: −ln(1 − p_r) / (2 ln ρ). inf where there is no heavy tail.
 
-    inf too for whoever is misled: tr P_k then stays within a factor of its own, growing expectation.
+    inf too for whoever is misled, and for whoever never uses a state: tr P_k then stays within a factor of its own,
+    growing expectation.
 
     Source: docs/mathematics.md, heavy tails.
     """
+    if outcomes.state == 0.0:
+        return math.inf
     rho = radius(process)
-    if rho <= 1.0 or outcomes.misled or outcomes.predicted == 0.0 or outcomes.state >= 1.0:
+    if rho <= 1.0 or outcomes.misled or outcomes.predicted + outcomes.leaked == 0.0 or outcomes.state >= 1.0:
         return math.inf
     return -math.log1p(-outcomes.state) / (2.0 * math.log(rho))
 

@@ -16,7 +16,9 @@ LEGITIMATE = "legitimate"
 ROUTER = "router"
 OBSERVER = "observer"
 OPERATOR = "operator"
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR)
+ACKNOWLEDGEMENTS = "acknowledgements"
+"""No process: the name of their way back, whose random stream is `link/acknowledgements`."""
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR, ACKNOWLEDGEMENTS)
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,16 @@ class Keys:
     def journal(self) -> str:
         """Fates, router to observer."""
         return self._under("journal")
+
+    @property
+    def acknowledged(self) -> str:
+        """Acknowledgements, legitimate estimator to router."""
+        return self._under("ack/sent")
+
+    @property
+    def acknowledgements(self) -> str:
+        """Acknowledgements that were neither lost nor blocked, and those that are forged: router to sensor."""
+        return self._under("ack/delivered")
 
     def downlink(self, receiver: str) -> str:
         """Deliveries, router to one receiver."""
@@ -66,9 +78,12 @@ class Grant:
     process: str
     writes: tuple[str, ...]
     reads: tuple[str, ...]
-    token: str
+    token: str | None
     watches: tuple[str, ...] = ()
     """Liveliness tokens it may watch."""
+    answers: tuple[str, ...] = ()
+    """Keys at which it may be asked."""
+    asks: tuple[str, ...] = ()
 
 
 def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
@@ -80,7 +95,7 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
         Grant(
             SENSOR,
             writes=(keys.uplink, keys.telemetry(SENSOR)),
-            reads=(*(keys.progress(name) for name in followers), keys.control(SENSOR)),
+            reads=(*(keys.progress(name) for name in followers), keys.control(SENSOR), keys.acknowledgements),
             token=keys.alive(SENSOR),
         ),
         Grant(
@@ -89,13 +104,19 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
             token=keys.alive(OBSERVER),
             watches=tuple(keys.alive(name) for name in (*processes, ROUTER)),
+            answers=(keys.control(OBSERVER),),
         ),
+        Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
     ]
     for name in receivers:
         table.append(
             Grant(
                 name,
-                writes=(keys.telemetry(name), keys.progress(name)),
+                writes=(
+                    keys.telemetry(name),
+                    keys.progress(name),
+                    *((keys.acknowledged,) if name == LEGITIMATE else ()),
+                ),
                 reads=(keys.downlink(name), keys.control(name)),
                 token=keys.alive(name),
             )
@@ -122,9 +143,14 @@ def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
         ("reader", "egress", "declare_subscriber", grant.writes),
         ("subscribe", "ingress", "declare_subscriber", grant.reads),
         ("read", "egress", "put", grant.reads),
-        ("token", "ingress", "liveliness_token", (grant.token,)),
+        ("token", "ingress", "liveliness_token", () if grant.token is None else (grant.token,)),
         ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),
         ("watched", "egress", "liveliness_token", grant.watches),
+        ("offer", "ingress", "declare_queryable", grant.answers),
+        ("asked", "egress", "query", grant.answers),
+        ("answer", "ingress", "reply", grant.answers),
+        ("ask", "ingress", "query", grant.asks),
+        ("answered", "egress", "reply", grant.asks),
     ]
     for name, flow, message, keys in kinds:
         if keys:

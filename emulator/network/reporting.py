@@ -1,17 +1,18 @@
 """What a process reports, and when: columns of many slots, never a message per number.
 
-Reports end at the same slots everywhere: at the end of every `flow.batch` slots, and at the last. So a window that is
-full always holds a reported slot, and nobody can wait for a report that itself waits for a packet.
+Reports end at the same slots everywhere: at the end of every `flow.batch` slots, at the last, and at every mark between two
+slots. So a window that is full always holds a reported slot, and nobody can wait for a report that itself waits for a packet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.brief import Brief
-from emulator.model.digest import BLOCK_SLOTS, BeliefLog
+from emulator.model.digest import BeliefLog, Digests
 from emulator.model.process import Floats
 from emulator.model.receiver import Belief, Flags, trace_of
 from emulator.network.wire import Report, Truth, progress
@@ -23,49 +24,99 @@ def is_due(brief: Brief, k: int) -> bool:
 
 
 class TruthReporter:
-    """The sensor's reports: states and schedule. Final."""
+    """The sensor's reports: states and schedule; what was sent at all, and alarms, where there are such things. Final."""
 
-    def __init__(self, brief: Brief, put: Callable[[bytes], None]) -> None:
+    def __init__(
+        self, brief: Brief, put: Callable[[bytes], None], may_be_silent: bool = False, watches: bool = False
+    ) -> None:
         self._brief = brief
         self._put = put
         self._x = np.empty((brief.flow.batch, len(brief.model.A), brief.trials))
         self._nu = np.empty((brief.flow.batch, brief.trials), np.bool_)
+        self._sent = np.ones_like(self._nu) if may_be_silent else None
+        self._alarms = np.zeros_like(self._nu) if watches else None
+        self._first = 0
 
-    def add(self, k: int, x: Floats, nu: Flags) -> None:
+    def add(self, k: int, x: Floats, nu: Flags, sent: Flags | None = None, alarms: Flags | None = None) -> None:
         """Take slot k, and report if it is time."""
         row = k % self._brief.flow.batch
         self._x[row] = x
         self._nu[row] = nu
+        for column, values in ((self._sent, sent), (self._alarms, alarms)):
+            if column is not None:
+                column[row] = values
         if is_due(self._brief, k):
-            self._put(Truth(k - row, self._x[: row + 1], self._nu[: row + 1]).pack())
+            self.flush(k + 1)
+
+    def flush(self, end: int) -> None:
+        """Report all slots below `end` that are not reported yet."""
+        if end > self._first:
+            row = self._first % self._brief.flow.batch
+            rows = slice(row, row + end - self._first)
+            flags = (None if column is None else column[rows] for column in (self._sent, self._alarms))
+            self._put(Truth(self._first, self._x[rows], self._nu[rows], *flags).pack())
+        self._first = end
 
 
 class BeliefReporter:
-    """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress. Final."""
+    """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress. Final.
 
-    def __init__(self, brief: Brief, put: Callable[[bytes], None], put_progress: Callable[[bytes], None]) -> None:
+    cuts: where it goes away or is back; first: its first slot; counts_late: whether it can make use of late packets.
+    """
+
+    def __init__(
+        self,
+        brief: Brief,
+        put: Callable[[bytes], None],
+        put_progress: Callable[[bytes], None],
+        cuts: Iterable[int] = (),
+        first: int = 0,
+        counts_late: bool = False,
+    ) -> None:
         self._brief = brief
         self._put = put
         self._put_progress = put_progress
-        self._log = BeliefLog(len(brief.model.A), brief.trials, brief.slots)
-        self._first = 0
+        self._log = BeliefLog(len(brief.model.A), brief.trials, brief.slots, cuts, first)
+        self._late = np.zeros((2, brief.flow.batch, brief.trials), np.uint16) if counts_late else None
+        self._first = first
 
-    def add(self, k: int, belief: Belief) -> None:
-        """Take slot k, and report if it is time: also at the end of a digest's block, where the log starts anew."""
+    def add(self, k: int, belief: Belief, late: tuple[NDArray[np.uint16], NDArray[np.uint16]] | None = None) -> None:
+        """Take slot k, in which so many late packets of each trial arrived and were used, (R,) each, and report if it is time.
+
+        It is, too, at the end of a digest's block, where the log starts anew.
+        """
+        if self._late is not None:
+            self._late[:, k % self._brief.flow.batch] = 0 if late is None else late
         digests = self._log.add(k, belief)
-        if digests is None and not is_due(self._brief, k):
+        if digests is not None or is_due(self._brief, k):
+            self._report(k + 1, {} if digests is None else dict([digests]))
+        if is_due(self._brief, k):
+            self._put_progress(progress(k + 1))
+
+    def flush(self, end: int) -> None:
+        """Report all slots below `end`, and that they are done."""
+        self._report(end, {})
+        self._put_progress(progress(end))
+
+    def skip(self, end: int) -> None:
+        """Go on from slot `end`: somebody else reports the slots before it, in which this receiver was not there."""
+        self._first = end
+
+    def _report(self, end: int, digests: dict[int, Digests]) -> None:
+        if end == self._first:
             return
-        log = self._log.rows(self._first, k + 1)
+        log = self._log.rows(self._first, end)
         trace = trace_of(log.P.transpose(1, 2, 0, 3))
+        row = self._first % self._brief.flow.batch
         report = Report(
             self._first,
             log.x_hat,
             log.action,
             np.ascontiguousarray(log.P[..., : self._brief.recorded]),
             np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
-            {} if digests is None else {k // BLOCK_SLOTS: digests},
+            None if self._late is None else self._late[0, row : row + end - self._first],
+            digests,
+            None if self._late is None else self._late[1, row : row + end - self._first],
         )
         self._put(report.pack())
-        self._first = k + 1
-        if is_due(self._brief, k):
-            self._put_progress(progress(k + 1))
+        self._first = end

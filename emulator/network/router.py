@@ -4,7 +4,8 @@
                      ├── link of receiver 2 ── fate, γ ── downlink/2      fates of all ── journal
                      └── …
 
-It never loses a message: a receiver gets one delivery in every slot, with the packets its link did not erase.
+It never loses a message: a receiver that is there gets one delivery in every slot, with all that arrives in it. At a mark
+on the uplink it journals all slots before, and waits until the conductor lets it go on; links change nowhere else.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,29 @@ from typing import Any
 import numpy as np
 
 from emulator.brief import Brief
-from emulator.model.links import link_of
-from emulator.model.links.link import Fate, Link, losses
+from emulator.model.account import Account, Accountant
+from emulator.model.acknowledgements import WayBack
+from emulator.model.link import Change, Course, Fates, Link, streams_of
 from emulator.model.process import Floats
-from emulator.model.receiver import Codes, Flags
-from emulator.network.access import access_control, grants
+from emulator.model.receiver import Flags
+from emulator.model.transit import Late, Transit
+from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, access_control, grants
+from emulator.network.postman import Postman
 from emulator.network.session import Session, router_config
-from emulator.network.wire import Journal, delivery, packed_flags, read_uplink
+from emulator.network.wire import (
+    Beside,
+    Journal,
+    Reader,
+    acknowledgement,
+    delivery,
+    hold,
+    is_hold,
+    packed_flags,
+    packed_header,
+    read_acknowledgement,
+    read_beside,
+    read_uplink,
+)
 
 _FAREWELL_SECONDS = 10.0
 
@@ -34,74 +51,210 @@ _FAREWELL_SECONDS = 10.0
 class Downlink:
     """One receiver's link, decided a batch of slots ahead, and its outlet. Final."""
 
-    def __init__(self, link: Link, put: Callable[[bytes], None]) -> None:
-        self._link = link
+    def __init__(self, name: str, spec: Mapping[str, Any], brief: Brief, put: Callable[[bytes, float], None]) -> None:
+        self._course = Course.of(spec)
+        keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, self._course)}
+        self._link = Link(self._course, name, keys, brief.batch)
+        self._accountant = Accountant(self._course.window, brief.trials)
+        self._transit = Transit()
         self._put = put
-        self._first = 0
-        self.fates: Codes
-        """Of the batch at hand, (c, R)."""
-        self._delivered: Flags
+        self._pace = float(brief.part["pace"])
+        self._rests: dict[int, float] = {}
+        """Slot → the part of a slot that the first trial's packet takes besides, of packets that may still arrive."""
+        self._leak: int | None = brief.part["leaks"].get(name)
+        self._slots = range(0)
+        self._fates: Fates
+        self._own = False
         self._masks: list[bytes]
         self._received: list[int]
 
     def plan(self, slots: range) -> None:
         """Decide the next batch of slots."""
-        self._first = slots.start
-        self.fates = self._link.fates(slots)
-        self._delivered = self.fates == Fate.DELIVERED
-        self._masks = [mask.tobytes() for mask in packed_flags(self._delivered)]
-        self._received = np.count_nonzero(self._delivered, axis=1).tolist()
+        self._take(slots, self._link.planned(slots))
 
-    def deliver(self, k: int, z: Floats, whole: bytes) -> None:
-        """Send slot k's delivery: the packets z (n, R), or as bytes the whole of them, that the link does not erase."""
-        row = k - self._first
+    def amend(self, at: int, changes: Iterable[Change]) -> None:
+        """Decide the slots of the batch from `at` on once more, by what changes from then on; none may have been journaled."""
+        self._take(range(at, self._slots.stop), self._link.amended(at, changes))
+
+    def _take(self, slots: range, fates: Fates) -> None:
+        self._slots, self._fates, self._in_time, self._own = slots, fates, fates.in_time, False
+        self._masks = [mask.tobytes() for mask in packed_flags(self._in_time)]
+        self._received = np.count_nonzero(self._in_time, axis=1).tolist()
+
+    def account(self, slots: range) -> Account:
+        """What became of the packets of the next slots, which are of the batch at hand."""
+        rows = slice(slots.start - self._slots.start, slots.stop - self._slots.start)
+        return self._accountant.account(slots, self._fates.part(rows))
+
+    def present(self, k: int) -> bool:
+        """Whether the receiver is there in slot k."""
+        return not any(away.start <= k < away.stop for away in self._course.outages)
+
+    def gamma(self, k: int) -> Flags:
+        """γ of slot k, which is of the batch at hand and was delivered, (R,)."""
+        in_time: Flags = self._in_time[k - self._slots.start]
+        return in_time
+
+    def _silence(self, row: int, sent: Flags) -> None:
+        """Take the packets that are not sent out of the account."""
+        if not self._own:
+            self._fates, self._own = self._fates.copied(), True
+        self._fates.silence(row, sent)
+        self._in_time[row] &= sent
+        self._masks[row] = packed_flags(self._in_time[row]).tobytes()
+        self._received[row] = int(np.count_nonzero(self._in_time[row]))
+
+    def deliver(self, k: int, z: Floats, whole: bytes, beside: Beside) -> None:
+        """Send slot k's delivery: of the packets z (n, R), or as bytes the whole of them, those that arrive in it."""
+        row = k - self._slots.start
+        if beside.sent is not None:
+            self._silence(row, beside.sent)
+        late: tuple[Late, ...] = ()
+        if self._fates.delays is not None or self._fates.again is not None or self._transit.busy:
+            late = self._transit.arrival(k, self._fates, row, z, beside.header).late
+        if not self.present(k):
+            return
         received = self._received[row]
         payload = (
             whole
             if received == z.shape[1]
-            else np.compress(self._delivered[row], z, axis=1).tobytes()
+            else np.compress(self._in_time[row], z, axis=1).tobytes()
             if received
             else b""
         )
-        self._put(delivery(k, self._masks[row], payload))
+        header = packed_header(beside.header, self._in_time[row]) if beside.header is not None else b""
+        truth = beside.truth.tobytes() if beside.truth is not None and k == self._leak else b""
+        self._put(delivery(k, self._masks[row], payload, late, header, truth), self._rest(k, row, late) * self._pace)
+
+    def _rest(self, k: int, row: int, late: tuple[Late, ...]) -> float:
+        """The part of a slot by which slot k's delivery is to be later than the slot: of what the first trial receives in it."""
+        if self._fates.rests is not None:
+            self._rests[k] = float(self._fates.rests[row])
+        if not self._rests:
+            return 0.0
+        arrived = [one.k for one in late if one.heard.gamma[0]] + [k] * bool(self._in_time[row, 0])
+        rest = max((self._rests.get(slot, 0.0) for slot in arrived), default=0.0)
+        self._rests.pop(k - self._course.window, None)
+        return rest
+
+    def mark(self, k: int) -> None:
+        """Pass a mark on, if the receiver is there."""
+        if not any(away.start < k <= away.stop for away in self._course.outages):
+            self._put(hold(k), 0.0)
 
 
-def journal_of(slots: range, downlinks: Mapping[str, Downlink]) -> bytes:
-    """The journal message of the batch at hand."""
-    fates = {name: downlink.fates for name, downlink in downlinks.items()}
-    delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
-    return Journal(slots.start, len(slots), delivered, {name: losses(codes) for name, codes in fates.items()}).pack()
+class WayBackLink:
+    """The link of the acknowledgements, from the legitimate estimator to the sensor, and who attacks it. Final."""
+
+    def __init__(self, brief: Brief, session: Session, spec: Mapping[str, Any]) -> None:
+        key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
+        self._way = WayBack(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
+        self._jammer: str | None = spec["jammer"]
+        self._trials = brief.trials
+        self._key = session.keys.acknowledged
+        self._sent = session.inbox(self._key)
+        self._put = session.outlet(session.keys.acknowledgements)
+
+    def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink]) -> None:
+        """Wait for the acknowledgements of slot k, and pass on what reaches the sensor; sent (R,): as in `Beside`.
+
+        A receiver that is not there acknowledges nothing.
+        """
+        gamma = np.zeros(self._trials, np.bool_)
+        if downlinks[LEGITIMATE].present(k):
+            message = Reader(self._key, self._sent.recv().payload.to_bytes())
+            gamma = read_acknowledgement(message, k, self._trials)
+        gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
+        self._put(acknowledgement(k, self._way.arrived(k, sent, gamma, gamma_e)))
 
 
 def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
-    receivers = tuple(brief.part["links"])
-    keys, batch = brief.stream_keys, brief.batch
-    links = {name: link_of(spec, keys[f"link/{name}"], batch) for name, spec in brief.part["links"].items()}
-    shape = (len(brief.model.A), brief.trials)
-    table = grants(brief.run, receivers)
+    table = grants(brief.run, tuple(brief.part["links"]))
     with _opened(brief, access_control(table)) as session:
-        present = {grant.process: False for grant in table}
+        present = {grant.process: False for grant in table if grant.token is not None}
         for name in present:
             session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
-        uplink = session.inbox(session.keys.uplink)
-        put_journal = session.outlet(session.keys.journal)
-        downlinks = {name: Downlink(link, session.outlet(session.keys.downlink(name))) for name, link in links.items()}
-        session.ready()
-        for first in range(0, brief.slots, brief.flow.batch):
-            slots = range(first, min(first + brief.flow.batch, brief.slots))
-            for downlink in downlinks.values():
-                downlink.plan(slots)
-            for k in slots:
-                z = read_uplink(session.keys.uplink, uplink.recv().payload.to_bytes(), k, shape)
-                whole = z.tobytes()
-                for downlink in downlinks.values():
-                    downlink.deliver(k, z, whole)
-            put_journal(journal_of(slots, downlinks))
-        session.wait_for("end")
+        Routing(brief, session).carry_on()
         deadline = time.monotonic() + _FAREWELL_SECONDS
         while any(present.values()) and time.monotonic() < deadline:
             time.sleep(0.005)
+
+
+class Routing:
+    """The router's work on an open session. Final."""
+
+    def __init__(self, brief: Brief, session: Session) -> None:
+        self._brief, self._session = brief, session
+        self._shape = (len(brief.model.A), brief.trials)
+        self._uplink = session.inbox(session.keys.uplink)
+        self._put_journal = session.outlet(session.keys.journal)
+        postman = Postman() if brief.part["pace"] else None
+
+        def outlet(name: str, course: Mapping[str, Any]) -> Callable[[bytes, float], None]:
+            put = session.outlet(session.keys.downlink(name))
+            delays = any(
+                "delay" in (one or {}) for one in (course["settings"], *(c["settings"] for c in course["changes"]))
+            )
+            return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
+
+        self._downlinks = {
+            name: Downlink(name, spec, brief, outlet(name, spec)) for name, spec in brief.part["links"].items()
+        }
+        acknowledgements = brief.part["acknowledgements"]
+        self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
+
+    def carry_on(self) -> None:
+        """Route all slots, then wait for the conductor's end."""
+        self._session.ready()
+        for first in range(0, self._brief.slots, self._brief.flow.batch):
+            slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
+            for downlink in self._downlinks.values():
+                downlink.plan(slots)
+            self._route(slots)
+        self._session.wait_for("end")
+
+    def _route(self, slots: range) -> None:
+        """Deliver the packets of a batch of slots, and journal it in parts that end at the marks."""
+        journaled = slots.start
+        for k in slots:
+            message = self._next()
+            while is_hold(message):
+                message.slot(k)
+                self._journal(range(journaled, k))
+                journaled = k
+                self._hold(k)
+                message = self._next()
+            z = read_uplink(message, k, self._shape)
+            beside = read_beside(message, self._shape, self._brief.model.header)
+            whole = z.tobytes()
+            for downlink in self._downlinks.values():
+                downlink.deliver(k, z, whole, beside)
+            if self._way_back is not None:
+                self._way_back.carry(k, beside.sent, self._downlinks)
+        self._journal(range(journaled, slots.stop))
+
+    def _next(self) -> Reader:
+        return Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes())
+
+    def _journal(self, slots: range) -> None:
+        if slots:
+            accounts = {name: downlink.account(slots) for name, downlink in self._downlinks.items()}
+            self._put_journal(Journal(slots.start, len(slots), accounts).pack())
+
+    def _hold(self, k: int) -> None:
+        """Pass a mark on, and do what the conductor says until it lets us go on."""
+        for downlink in self._downlinks.values():
+            downlink.mark(k)
+        while (command := self._session.command()).text("do") != "go":
+            if command.text("do") == "change":
+                changes = [_change(one) for one in command.maps("changes")]
+                self._downlinks[command.text("link")].amend(k, changes)
+
+
+def _change(found: Reader) -> Change:
+    settings = found.map("settings") if found.has("settings") else None
+    return Change(found.integer("at"), settings, found.flag("cut") if found.has("cut") else None)
 
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:

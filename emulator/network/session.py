@@ -10,8 +10,9 @@ import json
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import zenoh
 from zenoh.handlers import FifoChannel
@@ -20,7 +21,7 @@ from emulator.brief import Brief
 from emulator.errors import BriefError, RunError
 from emulator.launched import when_launcher_is_gone
 from emulator.network.access import Keys
-from emulator.network.wire import read_control
+from emulator.network.wire import Reader
 
 CONNECT_SECONDS = 20.0
 READY_SECONDS = 30.0
@@ -40,13 +41,29 @@ def _transport() -> dict[str, Any]:
     }
 
 
-def client_config(brief: Brief) -> dict[str, Any]:
+class Credentials(Protocol):
+    """Where the router is, and who asks to be let in: a brief, or the operator's control file."""
+
+    @property
+    def router(self) -> str:
+        """Zenoh endpoint."""
+
+    @property
+    def user(self) -> str:
+        """Its user."""
+
+    @property
+    def password(self) -> str:
+        """The user's."""
+
+
+def client_config(entry: Credentials) -> dict[str, Any]:
     """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
-    auth = {"usrpwd": {"user": brief.user, "password": brief.password}}
+    auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
     return {
         "mode": "client",
         "connect": {
-            "endpoints": [brief.router],
+            "endpoints": [entry.router],
             "timeout_ms": int(CONNECT_SECONDS * 1000),
             "exit_on_failure": True,
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
@@ -65,6 +82,20 @@ def router_config(endpoint: str, users_file: str, access: dict[str, Any]) -> dic
         "transport": {**_transport(), "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
     }
+
+
+class Question:
+    """What somebody asks, to be answered once. Final."""
+
+    def __init__(self, key: str, query: zenoh.Query) -> None:
+        self._key, self._query = key, query
+        self.payload = b"" if query.payload is None else query.payload.to_bytes()
+
+    def answer(self, payload: bytes) -> None:
+        """Send the answer, if whoever asked is still there."""
+        with suppress(zenoh.ZError):
+            self._query.reply(self._key, payload)
+        self._query.drop()  # type: ignore[no-untyped-call]
 
 
 class Session:
@@ -111,6 +142,10 @@ class Session:
         self._publishers.append(publisher)
         return publisher.put
 
+    def asked(self, key: str, receive: Callable[[Question], None]) -> None:
+        """Be asked at one exact key; `receive` is called on a thread of Zenoh's and must only hand the question on."""
+        self._session.declare_queryable(key, lambda query: receive(Question(key, query)))
+
     def watch(self, process: str, changed: Callable[[bool], None]) -> None:
         """Call `changed` with true when a process is there, with false when it is gone; on a thread of Zenoh's."""
         self._session.liveliness().declare_subscriber(
@@ -137,5 +172,14 @@ class Session:
 
     def wait_for(self, command: str) -> None:
         """Wait for one command of the conductor: `start` or `end`."""
-        while read_control(str(self._control.key_expr), self._control.recv().payload.to_bytes()) != command:
+        while self.command().text("do") != command:
             pass
+
+    def command(self) -> Reader:
+        """The next command of the conductor; its field `do` says what."""
+        return Reader(str(self._control.key_expr), self._control.recv().payload.to_bytes())
+
+    def commanded(self) -> Reader | None:
+        """The next command of the conductor if there is one."""
+        sample = self._control.try_recv()
+        return None if sample is None else Reader(str(self._control.key_expr), sample.payload.to_bytes())

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.errors import Gap, MalformedMessage
+from emulator.model.account import COUNTED_BURSTS, Account
 from emulator.model.digest import DIGEST_BYTES, Digests
-from emulator.model.links.link import Fate
+from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
-from emulator.model.receiver import Action, Codes, Flags
+from emulator.model.receiver import Action, Belief, Codes, Flags, Heard
+from emulator.model.transit import Arrival, Late
 
-_REASONS = frozenset(fate.name.lower() for fate in Fate if fate is not Fate.DELIVERED)
+Headers = NDArray[np.int64]
 
 
 def pack(fields: Mapping[str, Any]) -> bytes:
@@ -77,6 +79,20 @@ class Reader:
             raise self.malformed(f"{name} = {value!r}", f"a string {name}")
         return value
 
+    def flag(self, name: str) -> bool:
+        """A boolean field."""
+        value = self._fields.get(name)
+        if type(value) is not bool:
+            raise self.malformed(f"{name} = {value!r}", f"a boolean {name}")
+        return value
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """A list of strings."""
+        value = self._fields.get(name)
+        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+            raise self.malformed(f"{name} = {value!r}", f"a list {name} of strings")
+        return tuple(value)
+
     def array(self, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """A binary field as an array of the shape (read-only)."""
         value = self._fields.get(name)
@@ -95,6 +111,13 @@ class Reader:
         if not isinstance(value, dict):
             raise self.malformed(f"{name} = {value!r}", f"a map {name}")
         return value
+
+    def maps(self, name: str) -> list[Reader]:
+        """A list of maps, each as a reader of its own."""
+        value = self._fields.get(name)
+        if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+            raise self.malformed(f"{name} = {value!r:.60}", f"a list {name} of maps")
+        return [Reader(self.key, self._payload, one) for one in value]
 
     def nested(self, name: str) -> Reader:
         """A map field, as a reader of its own."""
@@ -115,34 +138,131 @@ class Reader:
         return array
 
 
-def uplink(k: int, z: Floats) -> bytes:
-    """A packet: slot k, z (n, R)."""
-    return pack({"k": k, "z": z.tobytes()})
+class Beside(NamedTuple):
+    """What a packet has beside its slot and payload; None where a scheme, or a slot, has no such thing."""
+
+    header: Headers | None = None
+    """(h, R)."""
+    sent: Flags | None = None
+    """Whether there is a packet at all, (R,); None is everywhere."""
+    truth: Floats | None = None
+    """x_k (n, R), for the one receiver that it is betrayed to."""
+
+    @property
+    def given(self) -> dict[str, NDArray[Any]]:
+        """What there is."""
+        return {name: value for name, value in self._asdict().items() if value is not None}
 
 
-def read_uplink(key: str, payload: bytes, k: int, shape: tuple[int, int]) -> Floats:
+def uplink(
+    k: int, z: Floats, header: Headers | None = None, sent: Flags | None = None, truth: Floats | None = None
+) -> bytes:
+    """A packet: slot k, z (n, R), and what is beside it, as in `Beside`."""
+    fields = {"k": k, "z": (z if sent is None else np.where(sent, z, 0.0)).tobytes()}
+    if header is not None:
+        fields["header"] = header.astype("<i8").tobytes()
+    if sent is not None:
+        fields["sent"] = packed_flags(sent).tobytes()
+    if truth is not None:
+        fields["truth"] = truth.tobytes()
+    return pack(fields)
+
+
+def read_uplink(message: Reader, k: int, shape: tuple[int, int]) -> Floats:
     """Z (n, R) of the packet that must be of slot k."""
-    message = Reader(key, payload)
     message.slot(k)
     return message.finite("z", shape)
 
 
-def delivery(k: int, mask: bytes, z: bytes) -> bytes:
-    """A delivery: slot k, γ as a bit mask, and the z of the trials that received, (n, received)."""
-    if not z:
-        return pack({"k": k, "gamma": mask})
-    return pack({"k": k, "gamma": mask, "z": z})
+def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> Beside:
+    """What a packet has beside z; header: rows that the scheme's packets have."""
+    n, trials = shape
+    return Beside(
+        message.array("header", "<i8", (header, trials)) if header else None,
+        flags_of(message.array("sent", "u1", ((trials + 7) // 8,)), trials) if message.has("sent") else None,
+        message.finite("truth", (n, trials)) if message.has("truth") else None,
+    )
 
 
-def read_delivery(key: str, payload: bytes, k: int, shape: tuple[int, int]) -> tuple[Flags, Floats]:
-    """γ (R,) and z (n, R) of the delivery that must be of slot k; z is 0 where nothing was received."""
-    message = Reader(key, payload)
+def acknowledgement(k: int, acknowledged: Flags) -> bytes:
+    """The acknowledgements of slot k, (R,): from the legitimate estimator, and as they reach the sensor."""
+    return pack({"k": k, "gamma": packed_flags(acknowledged).tobytes()})
+
+
+def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
+    """The acknowledgements (R,) that must be of slot k."""
     message.slot(k)
+    return flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
+
+
+def hold(k: int) -> bytes:
+    """A mark between slots k − 1 and k, on uplink and downlinks: everybody reports all slots below k."""
+    return pack({"k": k, "hold": True})
+
+
+def is_hold(message: Reader) -> bool:
+    """Whether a message of uplink or downlink is such a mark."""
+    return message.has("hold")
+
+
+def delivery(
+    k: int, mask: bytes, z: bytes, late: tuple[Late, ...] = (), header: bytes = b"", truth: bytes = b""
+) -> bytes:
+    """A delivery: slot k, γ as a bit mask, z (n, received) and header (h, received) of the trials that received, late ones.
+
+    truth: x_k (n, R), of all trials, where it is betrayed to this receiver.
+    """
+    fields: dict[str, Any] = {"k": k, "gamma": mask}
+    if z:
+        fields["z"] = z
+    if header:
+        fields["header"] = header
+    if truth:
+        fields["truth"] = truth
+    if late:
+        fields["late"] = [_packets(one.k, one.heard) for one in late]
+    return pack(fields)
+
+
+def _packets(k: int, heard: Heard) -> dict[str, Any]:
+    z = np.compress(heard.gamma, heard.z, axis=1)
+    fields = {"k": k, "gamma": packed_flags(heard.gamma).tobytes(), "z": z.tobytes()}
+    if heard.header is not None:
+        fields["header"] = packed_header(heard.header, heard.gamma)
+    return fields
+
+
+def packed_header(header: Headers, received: Flags) -> bytes:
+    """The headers (h, received) of the trials that received."""
+    return np.compress(received, header, axis=1).astype("<i8").tobytes()
+
+
+def read_delivery(message: Reader, k: int, shape: tuple[int, int], header: int = 0) -> Arrival:
+    """What arrives in slot k, of which the delivery must be; z (n, R) and header (h, R) are 0 where nothing was received."""
+    message.slot(k)
+    late = []
+    for one in message.maps("late") if message.has("late") else ():
+        slot = one.integer("k")
+        if slot > k:
+            raise one.malformed(f"a late packet of slot {slot}", f"one of slot {k} or before")
+        late.append(Late(slot, _heard(one, shape, header)))
+    heard = _heard(message, shape, header)
+    if message.has("truth"):
+        heard = heard._replace(truth=message.finite("truth", shape))
+    return Arrival(heard, tuple(late))
+
+
+def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Heard:
     n, trials = shape
     gamma = flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
     received = int(np.count_nonzero(gamma))
+    header = None
+    if rows:
+        header = np.zeros((rows, trials), np.int64)
+        if received:
+            header[:, gamma] = message.array("header", "<i8", (rows, received))
     if received == trials:
-        return gamma, message.finite("z", shape)
+        return Heard(gamma, message.finite("z", shape), header)
     z = np.zeros(shape)
     if received:
         # Row by row, which numpy does three times as fast as the rows at once.
@@ -150,7 +270,17 @@ def read_delivery(key: str, payload: bytes, k: int, shape: tuple[int, int]) -> t
             row[gamma] = values
     elif message.has("z"):
         raise message.malformed("z although nothing was received", "no z")
-    return gamma, z
+    return Heard(gamma, z, header)
+
+
+def held(k: int) -> bytes:
+    """The sensor's telemetry when it holds before slot k."""
+    return pack({"k": k, "held": True})
+
+
+def is_held(message: Reader) -> bool:
+    """Whether the sensor's telemetry says that it holds."""
+    return message.has("held")
 
 
 def progress(k: int) -> bytes:
@@ -163,14 +293,9 @@ def read_progress(key: str, payload: bytes) -> int:
     return Reader(key, payload).integer("k")
 
 
-def control(command: str) -> bytes:
-    """A command of the conductor."""
-    return pack({"do": command})
-
-
-def read_control(key: str, payload: bytes) -> str:
-    """The command."""
-    return Reader(key, payload).text("do")
+def control(command: str, **fields: Any) -> bytes:
+    """A command of the conductor: `start`, `end`, `hold`, `change` or `go`, and what goes with it."""
+    return pack({"do": command, **fields})
 
 
 @dataclass(frozen=True)
@@ -182,6 +307,10 @@ class Truth:
     """(c, n, R)."""
     nu: Flags
     """(c, R)."""
+    sent: Flags | None = None
+    """Whether there was a packet, (c, R); None of a scheme that sends in every slot."""
+    alarms: Flags | None = None
+    """Whether the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch them."""
 
     @property
     def count(self) -> int:
@@ -190,16 +319,24 @@ class Truth:
 
     def pack(self) -> bytes:
         """As a message."""
-        return pack({"k": self.first, "c": self.count, "x": self.x.tobytes(), "nu": packed_flags(self.nu).tobytes()})
+        fields = {"k": self.first, "c": self.count, "x": self.x.tobytes(), "nu": packed_flags(self.nu).tobytes()}
+        if self.sent is not None:
+            fields["sent"] = packed_flags(self.sent).tobytes()
+        if self.alarms is not None:
+            fields["alarms"] = packed_flags(self.alarms).tobytes()
+        return pack(fields)
 
 
-def read_truth(key: str, payload: bytes, first: int, shape: tuple[int, int]) -> Truth:
+def read_truth(message: Reader, first: int, shape: tuple[int, int]) -> Truth:
     """The sensor's telemetry that must begin at slot `first`."""
-    message = Reader(key, payload)
     k, c = message.slot(first), message.integer("c", 1)
     n, trials = shape
+    flags = {
+        name: flags_of(message.array(name, "u1", (c, (trials + 7) // 8)), trials) if message.has(name) else None
+        for name in ("sent", "alarms")
+    }
     masks = message.array("nu", "u1", (c, (trials + 7) // 8))
-    return Truth(k, message.finite("x", (c, n, trials)), flags_of(masks, trials))
+    return Truth(k, message.finite("x", (c, n, trials)), flags_of(masks, trials), **flags)
 
 
 @dataclass(frozen=True)
@@ -215,8 +352,12 @@ class Report:
     """Believed covariance of the recorded trials, (c, n, n, recorded)."""
     trace: Floats
     """Sum over all trials of tr P and of its square, (c, 2)."""
+    late: NDArray[np.uint16] | None
+    """Packets of earlier slots that arrived within the window, (c, R); None of who has none."""
     digests: Mapping[int, Digests]
-    """Block number → digests, (R, 32), of the blocks that ended in these slots."""
+    """Block, by its first slot → digests, (R, 32), of the blocks that ended in these slots."""
+    late_used: NDArray[np.uint16] | None = None
+    """Those of `late` that were used, and not discarded, (c, R)."""
 
     @property
     def count(self) -> int:
@@ -233,14 +374,15 @@ class Report:
                 "action": self.action.tobytes(),
                 "P": self.P.tobytes(),
                 "trace": self.trace.tobytes(),
+                **({} if self.late is None else {"late": self.late.astype("<u2").tobytes()}),
+                **({} if self.late_used is None else {"late_used": self.late_used.astype("<u2").tobytes()}),
                 "digests": {block: digests.tobytes() for block, digests in self.digests.items()},
             }
         )
 
 
-def read_report(key: str, payload: bytes, first: int, shape: tuple[int, int], recorded: int) -> Report:
+def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: int) -> Report:
     """A receiver's telemetry that must begin at slot `first`."""
-    message = Reader(key, payload)
     k, c = message.slot(first), message.integer("c", 1)
     n, trials = shape
     action = message.array("action", "u1", (c, trials))
@@ -257,8 +399,27 @@ def read_report(key: str, payload: bytes, first: int, shape: tuple[int, int], re
         action,
         message.finite("P", (c, n, n, recorded)),
         message.finite("trace", (c, 2)),
+        message.array("late", "<u2", (c, trials)) if message.has("late") else None,
         digests,
+        message.array("late_used", "<u2", (c, trials)) if message.has("late_used") else None,
     )
+
+
+def leaving(k: int, belief: Belief) -> bytes:
+    """A receiver's last word before an outage that begins with slot k: what it believes."""
+    return pack({"k": k, "leaves": True, "x_hat": belief.x_hat.tobytes(), "P": belief.P.tobytes()})
+
+
+def is_leaving(message: Reader) -> bool:
+    """Whether a receiver's telemetry is such a word."""
+    return message.has("leaves")
+
+
+def read_leaving(message: Reader, shape: tuple[int, int]) -> tuple[int, Belief]:
+    """The slot before which a receiver leaves, and what it believes."""
+    n, trials = shape
+    x_hat, P = message.finite("x_hat", shape), message.finite("P", (n, n, trials))
+    return message.integer("k"), Belief(x_hat, P, np.zeros(trials, np.uint8))
 
 
 @dataclass(frozen=True)
@@ -267,34 +428,40 @@ class Journal:
 
     first: int
     count: int
-    delivered: Mapping[str, Flags]
-    """Receiver → which trials' packets were passed on, (c, R)."""
-    lost: Mapping[str, Mapping[str, NDArray[np.uint32]]]
-    """Receiver → reason → packets lost for it, (c,)."""
+    links: Mapping[str, Account]
 
     def pack(self) -> bytes:
         """As a message."""
-        links = {
-            name: {
-                "delivered": packed_flags(flags).tobytes(),
-                "lost": {reason: counts.astype("<u4").tobytes() for reason, counts in self.lost[name].items()},
-            }
-            for name, flags in self.delivered.items()
-        }
+        links = {name: _account(link) for name, link in self.links.items()}
         return pack({"k": self.first, "c": self.count, "links": links})
 
 
-def read_journal(key: str, payload: bytes, first: int, receivers: tuple[str, ...], trials: int) -> Journal:
-    """The journal that must begin at slot `first`, with every receiver in it."""
-    message = Reader(key, payload)
+def _account(link: Account) -> dict[str, Any]:
+    return {
+        "delivered": packed_flags(link.delivered).tobytes(),
+        "lost": {reason: counts.astype("<u4").tobytes() for reason, counts in link.lost.items()},
+        **({} if link.late is None else {"late": link.late.astype("<u2").tobytes()}),
+        "bursts": link.bursts.astype("<u4").tobytes(),
+        "delays": link.delays.astype("<u4").tobytes(),
+        **({} if link.unsent is None else {"unsent": link.unsent.astype("<u4").tobytes()}),
+    }
+
+
+def read_journal(message: Reader, first: int, windows: Mapping[str, int], trials: int) -> Journal:
+    """The journal that must begin at slot `first`, with every receiver in it; windows: receiver → its window."""
     k, c = message.slot(first), message.integer("c", 1)
-    delivered: dict[str, Flags] = {}
-    lost: dict[str, dict[str, NDArray[np.uint32]]] = {}
-    for name in receivers:
+    links: dict[str, Account] = {}
+    for name, window in windows.items():
         link = message.nested("links").nested(name)
-        delivered[name] = flags_of(link.array("delivered", "u1", (c, (trials + 7) // 8)), trials)
         reasons = link.nested("lost")
-        if set(link.map("lost")) != _REASONS:
-            raise message.malformed(f"{name} lost for {list(link.map('lost'))}", f"the reasons {sorted(_REASONS)}")
-        lost[name] = {reason: reasons.array(reason, "<u4", (c,)) for reason in sorted(_REASONS)}
-    return Journal(k, c, delivered, lost)
+        if set(link.map("lost")) != set(REASONS):
+            raise message.malformed(f"{name} lost for {list(link.map('lost'))}", f"the reasons {sorted(REASONS)}")
+        links[name] = Account(
+            flags_of(link.array("delivered", "u1", (c, (trials + 7) // 8)), trials),
+            {reason: reasons.array(reason, "<u4", (c,)) for reason in REASONS},
+            link.array("late", "<u2", (c, trials)) if link.has("late") else None,
+            link.array("bursts", "<u4", (COUNTED_BURSTS,)),
+            link.array("delays", "<u4", (window + 2,)),
+            link.array("unsent", "<u4", (c,)) if link.has("unsent") else None,
+        )
+    return Journal(k, c, links)

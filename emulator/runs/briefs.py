@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from emulator.brief import Brief, Flow, Model
 from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.schemes import SCHEMES
-from emulator.network.access import LEGITIMATE, OBSERVER, ROUTER, SENSOR
+from emulator.model.link import Course, streams_of
+from emulator.model.schemes import scheme_of
+from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.runs.acknowledging import chart_of, way_back_of
 from emulator.runs.folder import new_folder
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
@@ -56,14 +58,23 @@ class StreamKeys:
         """Of the sensor's process noise."""
         return stream_key(self.seed_root, "process")
 
-    def link(self, receiver: str) -> bytes:
-        """Of a receiver's link."""
-        return stream_key(self.seed_root, f"link/{receiver}")
+    def link(self, receiver: str, course: Course) -> dict[str, bytes]:
+        """Of all that a receiver's link draws from."""
+        return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
 
-    def eavesdropper(self, name: str, strategy: str) -> dict[str, bytes]:
+    def links(self, courses: Mapping[str, Course]) -> dict[str, bytes]:
+        """Of all links."""
+        return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
+
+    @property
+    def way_back(self) -> bytes:
+        """Of the losses of acknowledgements."""
+        return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
+
+    def eavesdropper(self, name: str, strategy: str, parameters: Mapping[str, Any]) -> dict[str, bytes]:
         """What an eavesdropper's strategy must be given: the schedule's key, its own coin's, or nothing."""
         keys = {}
-        for stream in STRATEGIES[strategy].streams:
+        for stream in STRATEGIES[strategy].streams(parameters):
             own = stream_key(self.seed_root, f"coin/{name}")
             keys[stream] = own if stream == "coin" else stream_key(self.secret_root, stream)
         return keys
@@ -95,10 +106,12 @@ def briefs_of(
     """Process name → brief, with passwords and a run name made afresh."""
     run = f"r{secrets.token_hex(4)}"
     keys = StreamKeys.of(scenario)
-    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, OBSERVER)}
-    model = Model(scenario.process.A, scenario.process.Q, scenario.process.initial_covariance, scenario.encoding.mu_d)
-    scheme = scenario.encoding.scheme
-    secret = keys.secret(SCHEMES[scheme].secret_streams)
+    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, OBSERVER, OPERATOR)}
+    spec = scenario.encoding.spec
+    scheme = scheme_of(scenario.process.process, spec)
+    public, mu_d = scenario.process, scenario.encoding.mu_d
+    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header))
+    leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
 
     def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
         return Brief(
@@ -119,17 +132,43 @@ def briefs_of(
             ends_with_stdin=ends_with_stdin,
         )
 
-    links = {name: scenario.link(name).spec for name in scenario.receivers}
-    link_keys = {f"link/{name}": keys.link(name) for name in scenario.receivers}
+    courses = {name: scenario.course(name) for name in scenario.receivers}
+    links = {name: course.plain() for name, course in courses.items()}
+    link_keys = keys.links(courses)
+    if back is not None:
+        link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.way_back
     made = [
-        brief(ROUTER, "router", link_keys, {"links": links, "users": users}),
+        brief(
+            ROUTER,
+            "router",
+            link_keys,
+            {
+                "links": links,
+                "pace": scenario.pace,
+                "users": users,
+                "leaks": leaks,
+                "acknowledgements": None if back is None else back._asdict(),
+            },
+        ),
         brief(
             SENSOR,
             "sensor",
-            {"process": keys.process, **secret},
-            {"scheme": scheme, "pace": scenario.pace, "receivers": list(scenario.receivers)},
+            {"process": keys.process, **keys.secret(scheme.secret_streams)},
+            {
+                "scheme": spec,
+                "pace": scenario.pace,
+                "receivers": list(scenario.receivers),
+                "holds": sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
+                "leaks": leaks,
+                "chart": None if chart is None else asdict(chart),
+            },
         ),
-        brief(LEGITIMATE, "legitimate", secret, {"scheme": scheme}),
+        brief(
+            LEGITIMATE,
+            "legitimate",
+            keys.secret(scheme.estimator_streams),
+            {"scheme": spec, **_presence(scenario, LEGITIMATE)},
+        ),
         brief(
             OBSERVER,
             "observer",
@@ -139,13 +178,20 @@ def briefs_of(
                 "results": str(observation.results.absolute()),
                 "recording": observation.recording,
                 "live": observation.live,
+                "operator": users[OPERATOR],
             },
         ),
     ]
     for name, table in scenario.eavesdroppers.items():
-        part = {"strategy": table.strategy, "parameters": table.parameters}
-        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy), part))
+        part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
+        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
     return {one.process: one for one in made}
+
+
+def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
+    """What a receiver is told of late packets, and of its own outages alone."""
+    outages = [[one.start, one.stop, one.keeps_state] for one in scenario.timeline.outages[receiver]]
+    return {"window": scenario.window(receiver), "outages": outages}
 
 
 def write_briefs(scenario: Scenario, endpoint: str, results: Path, folder: Path) -> list[Path]:

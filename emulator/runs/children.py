@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
+import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -19,9 +19,12 @@ from typing import Any
 from emulator.brief import Brief
 from emulator.errors import RunError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
+from emulator.runs.environment import own_environment
 
 News = Mapping[str, Any]
-GRACE_SECONDS = 3.0  # for the observer to begin to write what there is, and for the others to leave
+GRACE_SECONDS = 3.0  # for everybody to leave
+_BEGIN_SECONDS = 10.0  # for the observer to begin to write what there is
+_GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
 _FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
@@ -67,12 +70,17 @@ class Children:
         self.started = False
         """Whether the conductor has started the run."""
         self._finishing = False
+        self._briefs: dict[str, Brief] = {}
+        self._killed: set[int] = set()
+        """Processes that were ended because the scenario says so."""
 
     def __enter__(self) -> Children:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for name in self._processes:
+        for name, process in self._processes.items():
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGCONT)  # one that is paused could not end
             self.terminate(name, 0.0)
         deadline = time.monotonic() + GRACE_SECONDS
         for process in self._processes.values():
@@ -90,12 +98,21 @@ class Children:
         Raises RunError if the system does not let us.
         """
         conducts = brief.role == "observer"
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        self._briefs[brief.process] = brief
+        if brief.part.get("outages"):
+            state_file = str((self._private / f"{brief.process}.state").absolute())
+            brief = replace(brief, part={**brief.part, "state_file": state_file})
+        environment = {
+            **own_environment(),
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONUNBUFFERED": "1",
+        }
         if brief.role == "router":
             environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
         try:
             path = brief.write(self._private)
-            with (self._logs / f"{brief.process}.log").open("wb") as log:
+            with (self._logs / f"{brief.process}.log").open("ab" if brief.first else "wb") as log:
                 process = subprocess.Popen(
                     [sys.executable, "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
@@ -117,7 +134,33 @@ class Children:
                 for line in lines:
                     with contextlib.suppress(ValueError):
                         self._news.put(json.loads(line))
-        self._news.put(Exit(name, process.wait()))
+        status = process.wait()
+        if process.pid not in self._killed:
+            self._news.put(Exit(name, status))
+
+    def act(self, request: News) -> None:
+        """Do to a process what the observer asks for, and tell it so.
+
+        Raises RunError if a process cannot be started again.
+        """
+        name, do = str(request["process"]), request["do"]
+        process = self._processes[name]
+        if do == "kill":
+            self._killed.add(process.pid)
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+        elif do == "restart":
+            self.start(replace(self._briefs[name], first=int(request["first"])))
+        else:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal({"pause": signal.SIGSTOP, "resume": signal.SIGCONT}[str(do)])
+        observer = self._processes[OBSERVER].stdin
+        if observer is not None:
+            with contextlib.suppress(OSError):
+                observer.write(b"%d\n" % request["number"])
+                observer.flush()
 
     def news(self, seconds: float) -> News | Exit | None:
         """The next news, or None if there are none for so long."""
@@ -129,11 +172,14 @@ class Children:
         if isinstance(news, Exit):
             return news
         self.silent_seconds = 0.0
-        if news["event"] == "started":
+        if news["event"] in {"started", "back"}:
             self.started = True
             self._forget_briefs()
+        if news["event"] == "act":
+            self.act(news)
+            return None
         self._finishing = self._finishing or news["event"] == "finishing"
-        return None if news["event"] in {"alive", "finishing"} else news
+        return None if news["event"] in {"alive", "finishing", "back"} else news
 
     def _forget_briefs(self) -> None:
         """Everybody has read its own: the keys need not lie on a disk any longer."""
@@ -145,7 +191,7 @@ class Children:
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
         ending: News | None = None
-        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else GRACE_SECONDS):
+        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS):
             news = self.news(0.05)
             if isinstance(news, Exit):
                 if news.process == OBSERVER:
@@ -193,9 +239,13 @@ class Children:
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
         """A child that failed, or left too early; never the observer. Who is missed is given a moment to be gone."""
-        deadline = time.monotonic() + (GRACE_SECONDS / 2 if suspects else 0.0)
+        deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
-            ended = {name: process.poll() for name, process in self._processes.items() if name != OBSERVER}
+            ended = {
+                name: process.poll()
+                for name, process in self._processes.items()
+                if name != OBSERVER and process.pid not in self._killed
+            }
             for name, status in ended.items():
                 if status:
                     return Exit(name, status)

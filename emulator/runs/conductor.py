@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
+from typing import Any
 
 from emulator.errors import Interrupted, RunError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
-from emulator.network.session import READY_SECONDS, Session
+from emulator.network.session import READY_SECONDS, Question, Session
 from emulator.network.wire import control, progress
 
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
@@ -18,15 +19,17 @@ _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 class Stop:
     """Set by a signal: the run must end now. Final."""
 
-    def __init__(self) -> None:
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
+        """orphaned: whether the launcher is gone, which asks for the end too."""
+        self._orphaned = orphaned
         self.wanted = False
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the end was asked for, or is within so many seconds."""
         deadline = time.monotonic() + patience
-        while not self.wanted and time.monotonic() < deadline:
+        while not (asked := self.wanted or self._orphaned()) and time.monotonic() < deadline:
             time.sleep(0.01)
-        if self.wanted:
+        if asked:
             raise Interrupted("interrupted; what was measured is in the results folder")
 
 
@@ -48,13 +51,27 @@ class Conductor:
             session.funnel(key, lambda payload, source=source: self._news.put((source, payload)))  # type: ignore[misc]
         for name in self._present:
             session.watch(name, lambda there, name=name: self._news.put((name, there)))  # type: ignore[misc]
+        self.absent: set[str] = set()
+        """Who is away by intent, and not missed."""
+        self.questions: SimpleQueue[Question] = SimpleQueue()
+        """What the operator asks."""
+        session.asked(keys.control(OBSERVER), self.questions.put)
         self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
         self._progress = session.outlet(keys.progress(OBSERVER))
 
     @property
     def missing(self) -> list[str]:
         """The processes that are not on the network."""
-        return [name for name, there in self._present.items() if not there]
+        return [name for name, there in self._present.items() if not there and name not in self.absent]
+
+    def there(self, name: str) -> bool:
+        """Whether a process is on the network."""
+        return self._present[name]
+
+    @property
+    def processes(self) -> dict[str, bool]:
+        """Process → whether it is on the network."""
+        return dict(self._present)
 
     def assemble(self) -> None:
         """Wait for every process. Raises RunError naming those that are missing after 30 s."""
@@ -85,6 +102,10 @@ class Conductor:
                 raise RunError(f"{', '.join(self.missing)} left the network before the run ended; look at the logs")
             return None
         return news[0], news[1]
+
+    def command(self, name: str, do: str, **fields: Any) -> None:
+        """Tell one process what to do."""
+        self._commands[name](control(do, **fields))
 
     def report(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""

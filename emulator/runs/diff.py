@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -24,7 +26,8 @@ class Difference:
 def difference(a: Results, b: Results) -> Difference:
     """Compare what every receiver received and believed, trial by trial, over the trials and receivers both have."""
     blocks_a, blocks_b = _blocks(a), _blocks(b)
-    common = [key for key in blocks_a.keys() & blocks_b.keys() if _length(a, key[2]) == _length(b, key[2])]
+    ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
+    common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]
     first = _first_row(a.trials, b.trials)
     if not common and first is None:
         return Difference(
@@ -35,20 +38,27 @@ def difference(a: Results, b: Results) -> Difference:
     )
     only = len(blocks_a) + len(blocks_b) - 2 * len(common)
     rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
-    if first is not None and (not unequal or first.slot // BLOCK_SLOTS <= unequal[0][0]):
+    if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
         return Difference(False, first.text + rest)
     if not unequal:
         peers = ", ".join(sorted({peer for peer, _, _ in common}))
         return Difference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
     block, trial, peer = unequal[0]
-    slots = f"slots {block * BLOCK_SLOTS} to {block * BLOCK_SLOTS + _length(a, block) - 1}"
+    slots = f"slots {block} to {ends_a[peer, block] - 1}"
     remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
     return Difference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
 
 
-def _length(results: Results, block: int) -> int:
-    """How many slots of a block a run has."""
-    return min(BLOCK_SLOTS, int(results.summary["slots"]) - block * BLOCK_SLOTS)
+def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:
+    """(Receiver, first slot of a block) → the first slot after it: a multiple of 256, the next block's, or the run's end."""
+    starts: dict[str, set[int]] = {}
+    for peer, _, block in blocks:
+        starts.setdefault(peer, set()).add(block)
+    ends = {}
+    for peer, of_peer in starts.items():
+        for block, after in pairwise([*sorted(of_peer), int(results.summary["slots"])]):
+            ends[peer, block] = min((block // BLOCK_SLOTS + 1) * BLOCK_SLOTS, after)
+    return ends
 
 
 def _blocks(results: Results) -> dict[tuple[str, int, int], bytes]:

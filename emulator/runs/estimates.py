@@ -18,14 +18,16 @@ def warnings_of(scenario: Scenario) -> list[str]:
     Source: docs/mathematics.md, secrecy and design (stability bound).
     """
     found = []
-    process, mu, mu_d = scenario.process.process, scenario.quality[LEGITIMATE], scenario.encoding.mu_d
+    process, mu_d = scenario.process.process, scenario.encoding.mu_d
     expectation = expectations_of(scenario)[LEGITIMATE]
+    alike = None if expectation.law is None else expectation.law.alike
+    mu = 0.0 if alike is None else float(alike.quality[0])
     bound = stability_bound(process, mu)
-    if not expectation.independent:
+    if alike is None:
         if math.isinf(expectation.limit):
             found.append(
                 f"the legitimate estimator's expected error grows without bound: with spectral radius "
-                f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the bursts of its link last too long"
+                f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the losses of its link last too long"
             )
     elif not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
         needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
@@ -46,6 +48,6 @@ def written_bytes(scenario: Scenario) -> float:
     """Bytes the results folder will have, about, before compression."""
     n, receivers = len(scenario.process.A), len(scenario.receivers)
     recorded_row = 8 * (2 * n + n * n) + 40
-    journal_row = scenario.trials / 8 + 40
+    journal_row = scenario.trials / 8 + 60
     digest_rows = scenario.trials / 256 * 50
     return scenario.slots * receivers * (recorded_row * scenario.record_trials + journal_row + digest_rows + 80)

@@ -10,10 +10,12 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.model.account import Account
 from emulator.model.digest import Digests
+from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
-from emulator.network.wire import Journal, Report, Truth, read_journal, read_report, read_truth
+from emulator.network.wire import Journal, Reader, Report, Truth, read_journal, read_report, read_truth
 
 Message = TypeVar("Message")
 
@@ -34,6 +36,14 @@ class ReceiverSlots:
     """What the router says it passed on, (c, R)."""
     lost: Mapping[str, NDArray[np.uint32]]
     """Reason → packets the router says were lost for it, (c,)."""
+    late: NDArray[np.uint16] | None = None
+    """Packets of earlier slots that it took in each slot, (c, R); None of who can take none."""
+    late_used: NDArray[np.uint16] | None = None
+    """Those of them that it used, (c, R)."""
+    late_delivered: NDArray[np.uint16] | None = None
+    """The same as the router says, (c, R)."""
+    unsent: NDArray[np.uint32] | None = None
+    """Trials in which there was no packet, as the router says, (c,); None: none that it knows of."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +56,10 @@ class Slots:
     nu: Flags
     """(c, R)."""
     receivers: Mapping[str, ReceiverSlots]
+    sent: Flags | None = None
+    """Whether there was a packet, as the sensor says, (c, R); None: always."""
+    alarms: Flags | None = None
+    """As in `Truth`."""
 
     @property
     def count(self) -> int:
@@ -63,7 +77,8 @@ class Slots:
             name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
             for name, one in self.receivers.items()
         }
-        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers)
+        sent = None if self.sent is None else self.sent.copy()
+        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent)
 
 
 def concatenated(parts: Sequence[Slots]) -> Slots:
@@ -76,7 +91,13 @@ def concatenated(parts: Sequence[Slots]) -> Slots:
         name: ReceiverSlots(**{one: column(name, one) for one in _ARRAYS}, lost={}) for name in parts[0].receivers
     }
     x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
-    return Slots(parts[0].first, x, nu, receivers)
+    sent = None if parts[0].sent is None else np.concatenate([_all(part.sent, part.nu) for part in parts])
+    return Slots(parts[0].first, x, nu, receivers, sent)
+
+
+def _all(flags: Flags | None, like: Flags) -> Flags:
+    """Flags that are all set where none are given."""
+    return np.ones_like(like) if flags is None else flags
 
 
 _ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
@@ -85,37 +106,48 @@ _ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
 class Joiner:
     """Takes the messages of all processes as they come and gives back slots as soon as all have reported them. Final."""
 
-    def __init__(self, receivers: tuple[str, ...], shape: tuple[int, int], recorded: int) -> None:
-        self._receivers = receivers
+    def __init__(self, windows: Mapping[str, int], shape: tuple[int, int], recorded: int) -> None:
+        """windows: receiver → slots by which a packet may be late for it."""
+        self._windows = windows
         self._shape = shape
         self._recorded = recorded
         self._truth = _Column[Truth]()
         self._journal = _Column[Journal]()
-        self._reports = {name: _Column[Report]() for name in receivers}
+        self._reports = {name: _Column[Report]() for name in windows}
         self._done = 0
-        self.digests: dict[str, dict[int, Digests]] = {name: {} for name in receivers}
-        """Receiver → block number → digests."""
+        self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
+        """Receiver → block, by its first slot → digests."""
 
     @property
     def done(self) -> int:
         """The first slot that has not been given back."""
         return self._done
 
-    def truth(self, key: str, payload: bytes) -> None:
+    @property
+    def sent(self) -> int:
+        """The first slot that the sensor has not reported."""
+        return self._truth.end
+
+    def reported(self, name: str) -> int:
+        """The first slot that a receiver has not reported."""
+        return self._reports[name].end
+
+    def truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
-        message = read_truth(key, payload, self._truth.end, self._shape)
+        message = read_truth(telemetry, self._truth.end, self._shape)
         self._truth.add(message, message.count)
 
-    def report(self, name: str, key: str, payload: bytes) -> None:
+    def report(self, name: str, telemetry: Reader) -> None:
         """Take a receiver's telemetry."""
-        message = read_report(key, payload, self._reports[name].end, self._shape, self._recorded)
+        message = read_report(telemetry, self._reports[name].end, self._shape, self._recorded)
         self._reports[name].add(message, message.count)
         self.digests[name].update(message.digests)
 
-    def journal(self, key: str, payload: bytes) -> None:
-        """Take the router's journal."""
-        message = read_journal(key, payload, self._journal.end, self._receivers, self._shape[1])
+    def journal(self, journal: Reader) -> Mapping[str, Account]:
+        """Take the router's journal; the accounts in it."""
+        message = read_journal(journal, self._journal.end, self._windows, self._shape[1])
         self._journal.add(message, message.count)
+        return message.links
 
     def take(self) -> Slots | None:
         """The next slots that all have reported, if there are any."""
@@ -126,22 +158,44 @@ class Joiner:
         truth = self._truth.take(count)
         journal = self._journal.take(count)
         receivers = {}
-        for name in self._receivers:
+        for name, window in self._windows.items():
             parts = self._reports[name].take(count)
             receivers[name] = ReceiverSlots(
                 x_hat=_rows(parts, [part.x_hat for part, _ in parts]),
                 action=_rows(parts, [part.action for part, _ in parts]),
                 P=_rows(parts, [part.P for part, _ in parts]),
                 trace=_rows(parts, [part.trace for part, _ in parts]),
-                delivered=_rows(journal, [part.delivered[name] for part, _ in journal]),
+                delivered=_rows(journal, [part.links[name].delivered for part, _ in journal]),
                 lost={
-                    reason: _rows(journal, [part.lost[name][reason] for part, _ in journal])
-                    for reason in journal[0][0].lost[name]
+                    reason: _rows(journal, [part.links[name].lost[reason] for part, _ in journal]) for reason in REASONS
                 },
+                late=_rows(parts, [_known(part.late, part.action) for part, _ in parts]) if window else None,
+                late_used=_rows(parts, [_known(part.late_used, part.action) for part, _ in parts]) if window else None,
+                late_delivered=_rows(
+                    journal, [_known(link.late, link.delivered) for link in (part.links[name] for part, _ in journal)]
+                )
+                if window
+                else None,
+                unsent=_counted([(part.links[name].unsent, part.count, rows) for part, rows in journal]),
             )
         x = _rows(truth, [part.x for part, _ in truth])
         nu = _rows(truth, [part.nu for part, _ in truth])
-        return Slots(first, x, nu, receivers)
+        sent, alarms = (
+            None
+            if getattr(truth[0][0], name) is None
+            else _rows(truth, [_all(getattr(part, name), part.nu) for part, _ in truth])
+            for name in ("sent", "alarms")
+        )
+        return Slots(first, x, nu, receivers, sent, alarms)
+
+
+def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:
+    """Counts of some slots, from parts with their lengths and rows; None if there are none."""
+    if all(counts is None for counts, _, _ in parts):
+        return None
+    return np.concatenate(
+        [(np.zeros(count, np.uint32) if counts is None else counts)[rows] for counts, count, rows in parts]
+    )
 
 
 class _Column(Generic[Message]):
@@ -172,6 +226,11 @@ class _Column(Generic[Message]):
                 self._messages.popleft()
                 self._taken = 0
         return parts
+
+
+def _known(late: NDArray[np.uint16] | None, like: NDArray[Any]) -> NDArray[np.uint16]:
+    """Counts of late packets, 0 where none are given."""
+    return np.zeros(like.shape, np.uint16) if late is None else late
 
 
 def _rows(parts: list[tuple[Message, slice]], arrays: list[NDArray[Any]]) -> NDArray[Any]:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from emulator.control import remove_control
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
@@ -70,6 +71,8 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
             elif isinstance(error, EvedropError):
                 _note(folder, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
             raise
+        finally:
+            remove_control(folder)
     return Ended(status, viewer)
 
 

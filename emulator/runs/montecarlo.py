@@ -17,14 +17,19 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import Interrupted, RunError, UsageError
-from emulator.model.digest import BLOCK_SLOTS, RunDigest
+from emulator.model.digest import RunDigest, block_starts
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.outcomes import eavesdropper_outcomes
+from emulator.model.schemes import scheme_of
+from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
+from emulator.runs.judge import replay_of
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.score import SlotSums, Tally, merged, squared_errors
-from emulator.runs.scorekeeper import Ending, resolved, summary_of
+from emulator.runs.scorekeeper import Ending, events_of, summary_of, write_resolved
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.simulation import Mode
 from emulator.runs.trials import BatchResult, Task, tasks_of
@@ -72,7 +77,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
         tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
         new_folder(folder)
         with said_of(folder):
-            (folder / "scenario.toml").write_text(resolved(scenario), encoding="utf-8")
+            write_resolved(folder, scenario)
             with (
                 ResultsWriter(folder, scenario.receivers, len(scenario.process.A)) as writer,
                 contextlib.closing(results_of(tasks, workers, client, told, stop.is_set)) as results,
@@ -87,7 +92,8 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
                 shutil.rmtree(folder)
                 raise failure or Interrupted("interrupted before anything was done; nothing was kept")
             how = str(failure) if failure else "complete" if merger.complete else "interrupted"
-            summary = merger.summary(Ending(time.monotonic() - started, how))
+            replay = replay_of(folder, scenario, plan.mode.value)
+            summary = merger.summary(Ending(time.monotonic() - started, how, replay))
             write_summary(folder, summary)
     if failure is not None:
         raise failure
@@ -108,15 +114,51 @@ def said_of(folder: Path) -> Iterator[None]:
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
-    """Raise UsageError where a mode cannot follow the scenario: numbers that leave double precision altogether."""
+    """Raise UsageError where a mode cannot follow the scenario: who reads packets, numbers that leave double precision."""
     if mode is Mode.EXACT:
         return
+    _check_scheme(scenario, mode)
+    for name in scenario.receivers:
+        if scenario.timeline.outages[name] or scenario.window(name):
+            raise UsageError(
+                f"{name} makes use of late packets or goes away, which the mode {mode.value} cannot follow; "
+                "leave --mode out, or take its window and its outages out of the scenario"
+            )
+    for name, table in scenario.eavesdroppers.items():
+        if not STRATEGIES[table.strategy].follows_gamma(table.parameters):
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and what {name} does (strategy {table.strategy}) "
+                f"depends on more; give --mode exact, or take {name} out of the scenario"
+            )
     for name, expected in expected_traces_of(scenario).items():
         beyond = np.flatnonzero(np.isinf(expected))
         if beyond.size:
             raise UsageError(
                 f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
                 f"give --slots {beyond[0]} or fewer, or take {name} out of the scenario"
+            )
+
+
+def _check_scheme(scenario: Scenario, mode: Mode) -> None:
+    """Raise UsageError for schemes, and who takes their packets for states, whose events alone do not tell what happens."""
+    name = scenario.encoding.scheme
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    reasons = {
+        "reads its packets": scheme.reads_packets,
+        "acts on acknowledgements": scheme.needs_acknowledgements,
+        "may stay silent": scheme.may_be_silent,
+    }
+    for what, so in reasons.items():
+        if so:
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and the scheme {name} {what}; give --mode exact"
+            )
+    for receiver, table in scenario.eavesdroppers.items():
+        follows = STRATEGIES[table.strategy].follows_gamma(table.parameters)
+        if follows and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) uses what "
+                f"the scheme {name} has made of the state; give --mode exact, or take {receiver} out of the scenario"
             )
 
 
@@ -169,6 +211,7 @@ class Merger:
         self._errors: dict[str, SlotHistograms] = {}
         self._traces: dict[str, SlotHistograms] = {}
         self._whole = mode is Mode.EXACT
+        self._detections: list[Detection] = []
         self.trials = 0
 
     @property
@@ -182,6 +225,7 @@ class Merger:
         """Take the next batch; its digests and recorded trials are written if there is somewhere to."""
         for block in result.blocks:
             self.trials += block.trials
+            self._detections.append(block.detection)
             for name in self._scenario.receivers:
                 self._sums[name].add(0, block.sums[name])
                 self._tallies[name][block.start] = block.tallies[name]
@@ -201,9 +245,8 @@ class Merger:
     def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter | None) -> None:
         if writer is not None:
             writer.digest_rows(start, digests)
-        blocks = -(-self._scenario.slots // BLOCK_SLOTS)
         for name, of_blocks in digests.items():
-            self._whole &= len(of_blocks) == blocks
+            self._whole &= sorted(of_blocks) == block_starts(self._scenario.slots, self._scenario.cuts(name))
             if self._whole:
                 self._digests[name].add(of_blocks)
 
@@ -226,4 +269,6 @@ class Merger:
         totals = {name: merged(tallies) for name, tallies in self._tallies.items()}
         whole = self._whole and self.complete
         digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
-        return summary_of(self._scenario, totals, digests, ending, self._mode.value)
+        detection = Detection.merged(self._detections) if self._mode is Mode.EXACT else None
+        events = events_of(self._scenario, min(total.done for total in totals.values()))
+        return summary_of(self._scenario, totals, digests, ending, self._mode.value, events, detection)

@@ -10,25 +10,34 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from emulator.brief import Brief
-from emulator.errors import EvedropError, Interrupted, RunError
-from emulator.launched import when_launcher_is_gone
-from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
-from emulator.network.session import Session
+from emulator.control import Control, remove_control
+from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
+from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.network.access import LEGITIMATE, OPERATOR, ROUTER, SENSOR
+from emulator.network.operator import Answer, read_request
+from emulator.network.session import Question, Session
+from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.joined import Joiner, Slots
+from emulator.runs.judge import replay_of
+from emulator.runs.orders import Order
 from emulator.runs.results import ResultsWriter, write_summary
-from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, resolved, summary_of
+from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
+from emulator.runs.stand_in import StandIn
+from emulator.runs.steering import Steering
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -41,17 +50,19 @@ _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 def observe(brief: Brief) -> int:
     """Run the observer of a brief; the exit status of the run."""
-    stop = Stop()
+    stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    by_hand = not brief.ends_with_stdin
     if brief.ends_with_stdin:
-        when_launcher_is_gone(_end_orphaned)
+        when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
-    observation = Observation(brief, scenario)
+    observation = Observation(brief, scenario, confirmations)
     status, how = 0, "complete"
     try:
-        (observation.folder / "scenario.toml").write_text(resolved(scenario))
+        observation.folder.mkdir(parents=True, exist_ok=True)  # on another host than that of the briefs it is not there
+        write_resolved(observation.folder, scenario)
         with observation.writer():
             try:
                 observation.conduct(stop)
@@ -60,11 +71,19 @@ def observe(brief: Brief) -> int:
             finally:
                 tell("finishing")
     except OSError as error:
-        status, how = RunError.exit_status, f"the results cannot be written ({error}); free some room and run again"
+        status, how = RunError.exit_status, _unwritten(error)
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
-    return observation.finish(status, how)
+    status, how = observation.finish(status, how)
+    if by_hand and status not in {0, 1}:
+        print(f"evedrop: {how}", file=sys.stderr)  # noqa: T201 - nobody else says it
+    return status
+
+
+def _unwritten(error: OSError) -> str:
+    """What a summary and a message say of results that could not be written."""
+    return f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again"
 
 
 def _end_orphaned() -> None:
@@ -83,12 +102,17 @@ def tell(event: str, **news: Any) -> None:
 class Observation:
     """One run as the observer sees it. Final."""
 
-    def __init__(self, brief: Brief, scenario: Scenario) -> None:
+    def __init__(self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes]) -> None:
         self.folder = Path(brief.part["results"])
         self._brief = brief
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
-        self._joiner = Joiner(scenario.receivers, self._shape, scenario.record_trials)
+        windows = {name: scenario.window(name) for name in scenario.receivers}
+        self._joiner = Joiner(windows, self._shape, scenario.record_trials)
+        self._confirmations = confirmations
+        self._steering: Steering
+        self._events: list[dict[str, Any]] = []
+        self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
         self._writer: ResultsWriter
@@ -109,32 +133,105 @@ class Observation:
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
                 )
+            self._steering = Steering(self._scenario, conductor, tell, self._keep)
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
                 self._recent = (self._started, 0)
+                self._control.write(self.folder)
                 conductor.start()
                 tell("started")
                 while self._joiner.done < self._scenario.slots:
                     news = conductor.news()
                     if news is not None:
                         self._take(conductor, *news)
+                    self._steer(conductor)
             except RunError:
                 self._suspects = conductor.missing
                 raise
             finally:
+                self._dismiss(conductor)
                 self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
             conductor.end()
 
-    def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
-        key = conductor.keys[source]
-        if source == ROUTER:
-            self._joiner.journal(key, payload)
-        elif source == SENSOR:
-            self._joiner.truth(key, payload)
+    @property
+    def _control(self) -> Control:
+        return Control(self._brief.run, self._brief.router, OPERATOR, self._brief.part["operator"])
+
+    def _keep(self, scenario: Scenario) -> None:
+        """The run is of another scenario from now on, of which all slots so far are too."""
+        self._scenario = scenario
+        write_resolved(self.folder, scenario)
+
+    def _steer(self, conductor: Conductor) -> None:
+        """Do what is due, what the operator asks for, and what the launcher has done."""
+        while not self._confirmations.empty():
+            self._steering.done(int(self._confirmations.get()))
+        while not conductor.questions.empty():
+            self._answer(conductor, conductor.questions.get())
+        self._steering.carry_on(self._joiner.done)
+        for event in self._steering.events[len(self._events) :]:
+            self._events.append(event)
+            if self._recording is not None:
+                self._recording.note(event["slot"], "INFO", event_line(event))
+
+    def _answer(self, conductor: Conductor, question: Question) -> None:
+        """Take what the operator asks; what breaks the protocol is refused and does the run no harm."""
+        try:
+            order = Order(read_request(OPERATOR, question.payload), question)
+        except MalformedMessage as error:
+            question.answer(Answer(refused=(str(error),)).pack())
+            return
+        if order.request.do == "status":
+            order.tell(self._status(conductor))
         else:
-            self._joiner.report(source, key, payload)
+            self._steering.take(order, self._joiner.done)
+
+    def _dismiss(self, conductor: Conductor) -> None:
+        """The run is over: nobody can get at it, and whoever waits is told."""
+        remove_control(self.folder)
+        self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
+        while not conductor.questions.empty():
+            conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
+
+    def _status(self, conductor: Conductor) -> dict[str, Any]:
+        """How the run is doing, as docs/protocol.md has it."""
+        steering, now = self._steering, time.monotonic()
+        before, done = self._recent
+        links = {}
+        for name, tally in self._keeper.tallies.items():
+            account = tally.link
+            fraction = account["delivered"] / account["offered"] if account["offered"] else None
+            links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
+        return {
+            "slot": self._joiner.done,
+            "slots": self._scenario.slots,
+            "slots_per_second": 0.0 if steering.paused else (self._joiner.done - done) / max(now - before, 1e-3),
+            "state": "paused" if steering.paused else "running" if steering.at is None else "held",
+            "processes": conductor.processes,
+            "links": links,
+            "events": steering.events,
+        }
+
+    def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
+        message = Reader(conductor.keys[source], payload)
+        if source == ROUTER:
+            for name, account in self._joiner.journal(message).items():
+                self._keeper.tallies[name].count(account)
+        elif source != SENSOR and is_leaving(message):
+            self._leave(source, message)
+        elif source != SENSOR:
+            self._joiner.report(source, message)
+        elif is_held(message):
+            self._steering.held(message.slot(self._joiner.sent))
+        else:
+            self._joiner.truth(message)
+        for name, stand_in in list(self._stand_ins.items()):
+            if self._joiner.reported(name) == stand_in.next:
+                stand_in.follow(self._joiner.sent)
+            if stand_in.over:
+                del self._stand_ins[name]
         slots = self._joiner.take()
         if slots is None:
             return
@@ -144,6 +241,20 @@ class Observation:
             self._recording.add(shown(slots, scored))
         conductor.report(self._joiner.done)
         self._progress(scored)
+
+    def _leave(self, name: str, message: Reader) -> None:
+        """Report for a receiver from now on, until it is back."""
+        k, left = read_leaving(message, self._shape)
+        away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
+        if away is None:
+            raise message.malformed(f"a leave before slot {k}", "one where an event makes the receiver leave")
+        key = message.key
+
+        def put(payload: bytes) -> None:
+            self._joiner.report(name, Reader(key, payload))
+
+        self._steering.left(name, k)
+        self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
 
     def _beat(self) -> None:
         """Show the launcher that we live, when there is nothing else to tell."""
@@ -162,11 +273,19 @@ class Observation:
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
         tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
 
-    def finish(self, status: int, how: str) -> int:
-        """Close the view, write the summary, tell the launcher; the exit status of the run."""
+    def finish(self, status: int, how: str) -> tuple[int, str]:
+        """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
         safe = self._recording.close() if self._recording is not None else True
-        digests = {name: digest_of(self._scenario, blocks) for name, blocks in self._joiner.digests.items()}
-        summary = summary_of(self._scenario, self._keeper.tallies, digests, Ending(self._ended - self._started, how))
+        digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
+        ending = Ending(self._ended - self._started, how, replay_of(self.folder, self._scenario))
+        summary = summary_of(
+            self._scenario,
+            self._keeper.tallies,
+            digests,
+            ending,
+            events=self._events,
+            detection=self._keeper.detection,
+        )
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
             summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
@@ -176,12 +295,12 @@ class Observation:
             write_summary(self.folder, summary)
         except OSError as error:
             status = RunError.exit_status
-            summary["ended"] = f"the results cannot be written ({error}); free some room and run again"
+            summary["ended"] = _unwritten(error)
         view = self._recording.failure if self._recording is not None else None
         tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
         if not safe:
             os._exit(status)
-        return status
+        return status, str(summary["ended"])
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:

@@ -21,6 +21,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from emulator.runs.judge import told
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -68,6 +70,8 @@ class ProgressLine:
             self.console.print(f"live view: {news['address']}", soft_wrap=True)
         elif kind == "started":
             self._progress.update(self._task, description="running")
+        elif kind == "held":
+            self._progress.update(self._task, description=f"held before slot {news['before']}", rate="")
         elif kind == "progress":
             self._progress.update(
                 self._task,
@@ -88,6 +92,9 @@ def closing_table(summary: News, width: int) -> Table:
     if summary["mode"] != "live":
         rate = f"{summary['slots_per_second'] * summary['trials']:,.0f} trial-slots/s in memory"
     title = f"{summary['scenario']} · {summary['slots']:,} slots · {trials} · {rate}"
+    failed = [one["held"] for one in summary["expectations"]].count(False)
+    if failed:
+        title += f" · {failed} of {len(summary['expectations'])} expectations FAILED"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("receiver", no_wrap=True)
     covariances = summary["mode"] == "covariance-only"
@@ -117,6 +124,13 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
     console.print(closing_table(summary, console.width))
+    for name, link in summary["links"].items():
+        if link.get("within_interval") is False:
+            low, high = link["interval"]
+            console.print(
+                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
+                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
+            )
     for verdict in summary["secrecy"].values():
         console.print(verdict["sentence"])
     for name, peer in summary["peers"].items():
@@ -127,9 +141,9 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
     for expectation in summary["expectations"]:
-        word = {True: "held", False: "FAILED", None: "there is no such figure in this run"}[expectation["held"]]
-        found = "" if expectation["found"] is None else f", found {float(expectation['found']):.4g}"
-        console.print(f"expected {expectation['text']}: {word}{found}")
+        console.print(told(expectation))
+        if "replay" in expectation:
+            console.print(f"    see it again: {expectation['replay']}")
     surprising = summary["surprising"]
     if surprising is not None:
         console.print(
@@ -207,6 +221,8 @@ def print_design(design: Design) -> None:
             "–" if against.relative_from is None else str(against.relative_from),
         )
     console.print(table)
+    if design.omission is not None:
+        console.print(design.omission)
 
 
 def _figure(value: float | str | None, how: str = ".4g") -> str:
@@ -220,8 +236,8 @@ def _number(value: float) -> str:
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Whoever reads our output may leave; that is no failure of ours."""
-        raise BrokenPipeError
+        """Whoever reads our output may leave; that is no failure of ours, and cli.py knows what to do."""
+        raise  # noqa: PLE0704 - rich calls this where it has caught the error
 
 
 def _console() -> Console:

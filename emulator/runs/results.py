@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from emulator.errors import UsageError
 from emulator.model.digest import DIGEST_BYTES, Digests
+from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
 from emulator.network.wire import packed_flags
@@ -28,6 +29,7 @@ from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums
 
 _ROWS = 65_536  # rows of a table held back until they are worth writing
+_BYTES = 16 * 2**20  # the same of wide rows, as a journal's of many trials are; and a row group has no more
 
 SLOTS = pa.schema(
     [
@@ -50,12 +52,16 @@ JOURNAL = pa.schema(
         ("link", pa.dictionary(pa.int8(), pa.string())),
         ("offered", pa.int64()),
         ("delivered", pa.int64()),
+        ("late", pa.int64()),
         ("lost", pa.int64()),
+        *((f"lost_by_{reason}", pa.int64()) for reason in REASONS),
         ("delivered_mask", pa.binary()),
     ]
 )
 ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
 """What a receiver did, as the observer knows it: `misled` is an innovation used as the state."""
+SENT = ("state", "innovation", "nothing")
+"""What a packet was."""
 
 
 _NULLABLE = {
@@ -103,23 +109,27 @@ class _Table:
         self._schema = schema
         self._names = {column: pa.array(words) for column, words in names.items()}
         self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
-        self._rows = 0
+        self._rows = self._bytes = 0
 
     def add(self, columns: Sequence[NDArray[Any]]) -> None:
         """Take rows: an array for each column, codes where it has names, and two dimensions where it holds lists or bytes."""
         for held, column in zip(self._held, columns, strict=True):
             held.append(np.array(column))  # a copy: a view would keep a whole message from being forgotten
+            self._bytes += held[-1].nbytes
         self._rows += len(columns[0])
-        if self._rows >= _ROWS:
+        if self._rows >= _ROWS or self._bytes >= _BYTES:
             self._write()
 
     def _write(self) -> None:
-        if self._rows:
+        whole = [np.concatenate(held) for held in self._held] if self._rows else []
+        at_once = max(1, self._rows * _BYTES // max(1, self._bytes))
+        for first in range(0, self._rows, at_once):
             columns = [
-                self._column(field, np.concatenate(held)) for field, held in zip(self._schema, self._held, strict=True)
+                self._column(field, values[first : first + at_once])
+                for field, values in zip(self._schema, whole, strict=True)
             ]
             self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
-        self._held, self._rows = [[] for _ in self._schema], 0
+        self._held, self._rows, self._bytes = [[] for _ in self._schema], 0, 0
 
     def _column(self, field: pa.Field, values: NDArray[Any]) -> pa.Array:
         if field.name in self._names:
@@ -148,7 +158,7 @@ class ResultsWriter:
     def __init__(self, folder: Path, receivers: tuple[str, ...], n: int) -> None:
         self._receivers = receivers
         peers = {"peer": receivers}
-        words = {**peers, "sent": ("state", "innovation"), "action": ACTIONS}
+        words = {**peers, "sent": SENT, "action": ACTIONS}
         self._slots = _Table(folder / "slots.parquet", SLOTS, peers)
         self._trials = _Table(folder / "trials.parquet", _trials_schema(n), words)
         self._journal = _Table(folder / "journal.parquet", JOURNAL, {"link": receivers})
@@ -214,6 +224,7 @@ class ResultsWriter:
         k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
         trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
         nu = slots.nu[:, :recorded]
+        packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, len(SENT) - 1)
         x = slots.x[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)
         for name, receiver in slots.receivers.items():
             self._trials.add(
@@ -221,7 +232,7 @@ class ResultsWriter:
                     k,
                     self._names(name, count),
                     trials,
-                    nu.reshape(-1),
+                    packets.reshape(-1),
                     seen_actions(receiver.action[:, :recorded], nu).reshape(-1),
                     squared_errors[name][:, :recorded].reshape(-1),
                     np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
@@ -234,13 +245,20 @@ class ResultsWriter:
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
         for name, receiver in slots.receivers.items():
+            silent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
+            offered = np.full(slots.count, slots.trials) - silent
+            delivered = np.count_nonzero(receiver.delivered, axis=1)
+            by_reason = [receiver.lost[reason].astype(np.int64) for reason in REASONS]
+            lost = np.sum(by_reason, axis=0)
             self._journal.add(
                 [
                     np.arange(slots.first, slots.first + slots.count),
                     self._names(name, slots.count),
-                    np.full(slots.count, slots.trials),
-                    np.count_nonzero(receiver.delivered, axis=1),
-                    receiver.lost["lost"],
+                    offered,
+                    delivered,
+                    offered - delivered - lost,
+                    lost,
+                    *by_reason,
                     packed_flags(receiver.delivered),
                 ]
             )
@@ -287,17 +305,27 @@ class Results:
     folder: Path
     summary: Mapping[str, Any]
 
-    def _table(self, name: str) -> pa.Table:
+    def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
         path = self.folder / f"{name}.parquet"
         try:
-            return pq.read_table(path)
-        except (OSError, pa.ArrowInvalid) as error:
-            raise UsageError(f"{path} cannot be read ({error}); run the scenario again") from error
+            table = pq.read_table(path)
+        except (OSError, pa.ArrowException) as error:
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+        wanted = _trials_schema(_states_in(table.schema)) if expected is None else expected
+        if not table.schema.equals(wanted):
+            other = [field.name for field in wanted if field not in table.schema] or table.schema.names
+            raise UsageError(
+                f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
+            )
+        empty = [name for name in table.column_names if name not in _NULLABLE and table[name].null_count]
+        if empty:
+            raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
+        return table
 
     @property
     def slots(self) -> pa.Table:
         """A row per slot and peer: statistics over trials."""
-        return self._table("slots")
+        return self._table("slots", SLOTS)
 
     @property
     def trials(self) -> pa.Table:
@@ -307,12 +335,22 @@ class Results:
     @property
     def journal(self) -> pa.Table:
         """A row per slot and link."""
-        return self._table("journal")
+        return self._table("journal", JOURNAL)
 
     @property
     def digests(self) -> pa.Table:
         """A row per peer, trial and block of 256 slots."""
-        return self._table("digests")
+        return self._table("digests", DIGESTS)
+
+
+def _states_in(schema: pa.Schema) -> int:
+    """The number of states in a table of trials, as far as it is one."""
+    x = schema.field("x").type if "x" in schema.names else None
+    return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def load_results(folder: str | Path) -> Results:
@@ -326,6 +364,7 @@ def load_results(folder: str | Path) -> Results:
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
-    if not isinstance(summary, dict) or not {"peers", "secrecy", "links", "slots", "trials"} <= summary.keys():
+    parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
+    if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
         raise UsageError(f"{path} is no summary of a run; run the scenario again")
     return Results(Path(folder), summary)

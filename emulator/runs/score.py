@@ -8,8 +8,10 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.model.account import COUNTED_BURSTS, Account
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
+from emulator.runs.watched import Watched
 
 WINDOWS = 8
 """The slots k ≥ 1 are judged in so many windows, of equal length up to one slot."""
@@ -86,10 +88,13 @@ class Tally:
     slots: int
     """Of the whole run."""
     trials: int
+    watched: Watched = field(default_factory=lambda: Watched((), 0))
+    """What expectations ask of the receiver."""
     done: int = 0
     """Slots that all trials have."""
     offered: int = 0
-    """Packets: slots times trials."""
+    """Slots times trials: as many packets, but for those that were not sent."""
+    unsent: int = 0
     error: float = 0.0
     trace: float = 0.0
     expected_trace: float = 0.0
@@ -97,12 +102,23 @@ class Tally:
     used: int = 0
     unexplained: int = 0
     """Packets whose fate in the journal is not the receiver's."""
+    late: int = 0
+    """Packets that arrived after their own slot, within the window; and those of them that were used."""
+    late_used: int = 0
+    late_sent: int = 0
+    """Packets that the router has let through but for another slot."""
     lost: dict[str, int] = field(default_factory=dict)
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
+    bursts: NDArray[np.int64] = field(init=False)
+    """As in `Account`."""
+    delays: NDArray[np.int64] = field(init=False)
+    """As in `Account`; of no length before anything is counted."""
 
     def __post_init__(self) -> None:
         self.window_errors = np.zeros((WINDOWS + 1, self.trials))
+        self.bursts = np.zeros(COUNTED_BURSTS, np.int64)
+        self.delays = np.zeros(0, np.int64)
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
         """Take c slots: their errors (c, R), sums, and expected trace (c,)."""
@@ -120,11 +136,41 @@ class Tally:
             if inside.size:
                 self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
 
-    def account(self, delivered: Flags, action: Codes, lost: Mapping[str, NDArray[np.uint32]]) -> None:
-        """Hold the journal, delivered (c, R) and reason → lost (c,), against what the receiver did, (c, R)."""
+    def account(
+        self,
+        delivered: Flags,
+        action: Codes,
+        lost: Mapping[str, NDArray[np.uint32]],
+        unsent: NDArray[np.uint32] | None = None,
+    ) -> None:
+        """Hold the journal, delivered (c, R) in time, reason → lost (c,), unsent (c,), against what the receiver did, (c, R)."""
         self.unexplained += int(np.count_nonzero(delivered != (action != Action.LOST)))
+        count = delivered.size - int(np.count_nonzero(delivered))
         for reason, counts in lost.items():
             self.lost[reason] = self.lost.get(reason, 0) + int(counts.sum())
+            count -= int(counts.sum())
+        silent = 0 if unsent is None else int(unsent.sum())
+        self.unsent += silent
+        self.late_sent += count - silent
+
+    def account_sent(self, sent: Flags, delivered: Flags, unsent: NDArray[np.uint32] | None) -> None:
+        """Hold what the sensor says it sent, (c, R), against the journal's delivered (c, R) and unsent (c,)."""
+        silent = np.count_nonzero(~sent, axis=1)
+        self.unexplained += int(np.count_nonzero(delivered & ~sent))
+        self.unexplained += int(np.abs(silent - (0 if unsent is None else unsent.astype(np.int64))).sum())
+
+    def account_late(self, delivered: NDArray[np.uint16], taken: NDArray[np.uint16], used: NDArray[np.uint16]) -> None:
+        """Hold the late packets that the router delivered in each slot, (c, R), against those that the receiver took."""
+        self.late += int(taken.sum())
+        self.late_used += int(used.sum())
+        self.unexplained += int(np.count_nonzero(delivered != taken))
+
+    def count(self, account: Account) -> None:
+        """Take a link's bursts and delays."""
+        self.bursts += account.bursts
+        if self.delays.size < account.delays.size:
+            self.delays = np.zeros(account.delays.size, np.int64)
+        self.delays += account.delays
 
     @property
     def figures(self) -> dict[str, float]:
@@ -134,18 +180,22 @@ class Tally:
             "mean_squared_error": self.error / offered,
             "mean_trace_covariance": self.trace / offered,
             "expected_trace_covariance": self.expected_trace / offered,
-            "received_fraction": self.received / offered,
-            "used_fraction": self.used / offered,
+            "received_fraction": (self.received + self.late) / offered,
+            "used_fraction": (self.used + self.late_used) / offered,
         }
 
     @property
     def link(self) -> dict[str, int]:
         """The link's account: every packet offered is delivered or lost for a reason."""
-        lost = sum(self.lost.values())
-        missing = abs(self.offered - self.received - lost)
+        # Of a run cut short some packets are still under way; of a whole one the router has said which.
+        lost = sum(self.lost.values()) + max(0, self.late_sent - self.late)
+        delivered = self.received + self.late
+        offered = self.offered - self.unsent
+        missing = abs(offered - delivered - lost)
         return {
-            "offered": self.offered,
-            "delivered": self.received,
+            "offered": offered,
+            "delivered": delivered,
+            "late": self.late,
             "lost": lost,
             "unexplained": max(missing, self.unexplained),
         }
@@ -169,11 +219,27 @@ def merged(tallies: Mapping[int, Tally]) -> Tally:
     """One tally of several disjoint sets of trials, in the order of their keys."""
     parts = [tallies[key] for key in sorted(tallies)]
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
+    total.watched = Watched.of([part.watched for part in parts])
     total.done = min(part.done for part in parts)
     for part in parts:
-        for name in ("offered", "error", "trace", "expected_trace", "received", "used", "unexplained"):
+        for name in (
+            "offered",
+            "unsent",
+            "error",
+            "trace",
+            "expected_trace",
+            "received",
+            "used",
+            "unexplained",
+            "late",
+            "late_used",
+            "late_sent",
+        ):
             setattr(total, name, getattr(total, name) + getattr(part, name))
         for reason, count in part.lost.items():
             total.lost[reason] = total.lost.get(reason, 0) + count
+        total.bursts += part.bursts
+        if part.delays.size:
+            total.delays = part.delays + (total.delays if total.delays.size else 0)
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
     return total

@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import importlib.metadata
 import math
+import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
 
-from emulator.model.digest import BLOCK_SLOTS, Digests, RunDigest
+from emulator.model.digest import Digests, RunDigest, block_starts
 from emulator.model.process import Floats
 from emulator.network.access import LEGITIMATE
+from emulator.runs.acknowledging import Detection
+from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
+from emulator.runs.judge import Evidence
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.verdict import Secrecy, secrecy
-from emulator.scenario import ExpectTable, Scenario
+from emulator.runs.watched import Watched, watches_of
+from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
 
@@ -40,18 +46,30 @@ class Scorekeeper:
 
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
-        self.tallies = {name: Tally(scenario.slots, trials) for name in scenario.receivers}
+        self.detection = Detection(trials)
+        self.tallies = {
+            name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches_of(scenario).items()
+        }
 
     def add(self, slots: Slots) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory."""
         scored = {}
+        if slots.alarms is not None:
+            self.detection.add(slots.first, slots.alarms)
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
             self.tallies[name].add(slots.first, *one)
-            self.tallies[name].account(receiver.delivered, receiver.action, receiver.lost)
+            self.tallies[name].account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
+            if slots.sent is not None:
+                self.tallies[name].account_sent(slots.sent, receiver.delivered, receiver.unsent)
+            late = None
+            if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
+                late = (receiver.late, receiver.late_used)
+                self.tallies[name].account_late(receiver.late_delivered, *late)
+            self.tallies[name].watched.add(slots.first, errors, receiver.action, one.sums.trace, late)
             scored[name] = one
         return scored
 
@@ -64,6 +82,8 @@ class Ending:
     """Start command to last row on disk."""
     how: str = "complete"
     """`complete`, `interrupted`, or why it failed."""
+    replay: str | None = None
+    """The command that runs it once more, for whoever sees an expectation fail."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -79,6 +99,8 @@ def summary_of(
     digests: Mapping[str, str | None],
     ending: Ending,
     mode: str = "live",
+    events: Sequence[Mapping[str, Any]] = (),
+    detection: Detection | None = None,
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
     expected = expectations_of(scenario)
@@ -95,6 +117,9 @@ def summary_of(
         for peer in peers.values():
             peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
     user = tallies[LEGITIMATE]
+    links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
+    secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
+    evidence = Evidence(scenario, peers, links, tallies, expected, secret)
     return {
         "scenario": scenario.title,
         "mode": mode,
@@ -106,10 +131,12 @@ def summary_of(
         "slots_per_second": user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
         "ended": ending.how,
         "peers": peers,
-        "links": {name: tally.link for name, tally in tallies.items()},
-        "secrecy": {one.eavesdropper: one.as_dict() for one in verdicts(scenario, tallies)},
+        "links": links,
+        "events": list(events),
+        "secrecy": {name: one.as_dict() for name, one in secret.items()},
+        "detection": None if detection is None else detection.summary(scenario),
         "surprising": _surprising(scenario, tallies),
-        "expectations": [_expectation(expect, peers) for expect in scenario.expect],
+        "expectations": evidence.judged(ending.replay),
     }
 
 
@@ -149,24 +176,37 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, A
     return found
 
 
-def _expectation(expect: ExpectTable, peers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    receiver, figure = expect.figure.split(".")
-    found = peers[receiver][figure]
-    return {"text": expect.text, "held": None if found is None else expect.holds(found), "found": found}
-
-
-def digest_of(scenario: Scenario, blocks: Mapping[int, Digests]) -> str | None:
+def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) -> str | None:
     """A receiver's digest from all its blocks; None if the run was cut short."""
-    if len(blocks) != -(-scenario.slots // BLOCK_SLOTS):
+    if sorted(blocks) != block_starts(scenario.slots, scenario.cuts(receiver)):
         return None
     digest = RunDigest()
     digest.add(blocks)
     return digest.hexadecimal
 
 
+def events_of(scenario: Scenario, done: int) -> list[dict[str, Any]]:
+    """What the scenario has happen before slot `done`, as the summary lists it."""
+    return [{"slot": act.at, "event": act.said, "by": "scenario"} for act in scenario.timeline.acts if act.at < done]
+
+
+def event_line(event: Mapping[str, Any]) -> str:
+    """An event of the summary as a line of the view."""
+    return event["event"] if event["by"] == "scenario" else f"{event['event']} (by the {event['by']})"
+
+
+def write_resolved(folder: Path, scenario: Scenario) -> None:
+    """Write the scenario.toml of a results folder, whole at any moment."""
+    unfinished = folder / "scenario.toml.new"
+    unfinished.write_text(resolved(scenario), encoding="utf-8")
+    os.replace(unfinished, folder / "scenario.toml")
+
+
 def resolved(scenario: Scenario) -> str:
     """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
     tables = scenario.model_dump(mode="json", exclude_none=True)
+    if scenario.secret_file is not None:
+        tables["secret_file"] = str(Path(scenario.secret_file).absolute())
     tables["made_with"] = {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},

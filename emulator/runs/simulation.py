@@ -12,20 +12,24 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.model import update
-from emulator.model.digest import BLOCK_SLOTS, BeliefLog, Digests
+from emulator.model.digest import BeliefLog, Digests, block_starts
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.links import link_of
-from emulator.model.links.link import Fate
+from emulator.model.link import Fates, Link
+from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.process import Floats, ProcessNoise, Trajectory
-from emulator.model.receiver import Codes, Flags, Heard, Receiver, trace_of
-from emulator.model.schemes import SCHEMES
+from emulator.model.receiver import Codes, Flags, Receiver, trace_of
+from emulator.model.schemes import scheme_of
 from emulator.model.theory import misled_covariances
 from emulator.network.access import LEGITIMATE
+from emulator.runs.acknowledging import Acknowledging
+from emulator.runs.attendance import Attendance
 from emulator.runs.briefs import StreamKeys
 from emulator.runs.joined import ReceiverSlots, Slots
 from emulator.runs.score import squared_errors
@@ -53,8 +57,10 @@ class Measured:
     """Believed tr P, (c, R)."""
     action: Codes
     """(c, R)."""
-    fates: Codes
-    """(c, R)."""
+    fates: Fates
+    """Of the packets sent in these slots, (c, R)."""
+    late: NDArray[np.uint16] | None = None
+    """Packets of earlier slots that arrived, and that were used, (2, c, R); None of who can use none."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,8 @@ class Chunk:
     receivers: Mapping[str, Measured]
     recorded: Slots | None
     """The recorded trials in full; exact mode only."""
+    alarms: Flags | None = None
+    """Where the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch."""
 
 
 class Simulation:
@@ -77,16 +85,22 @@ class Simulation:
         self._batch = Batch(scenario.slots, len(trials), trials.start)
         self._process = scenario.process.process
         self._keys = StreamKeys.of(scenario)
-        scheme = SCHEMES[scenario.encoding.scheme](self._process, scenario.encoding.mu_d)
-        self._shared = scheme.shared(self._keys.secret(scheme.secret_streams), self._batch)
+        self._scheme = scheme_of(self._process, scenario.encoding.spec)
+        secret = self._keys.secret(self._scheme.secret_streams)
+        self._shared = self._scheme.shared(secret, self._batch)
+        self._initial = self._scheme.initial_state(secret, self._batch)
         self._receivers: dict[str, Receiver] = {LEGITIMATE: self._shared.estimator()}
         self._receivers.update({name: self._eavesdropper(name) for name in scenario.eavesdroppers})
+        self._betrayed = {
+            name: STRATEGIES[table.strategy].betrayed(table.parameters)
+            for name, table in scenario.eavesdroppers.items()
+        }
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.receivers}
         """Receiver → block number → digests, (R, 32); filled by the exact mode alone."""
 
     def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
-        keys = self._keys.eavesdropper(name, table.strategy)
+        keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
         return STRATEGIES[table.strategy](knowledge, self._batch)
 
@@ -94,7 +108,8 @@ class Simulation:
         """All slots, some tens or hundreds at a time."""
         slots = self._batch.slots
         names = self._scenario.receivers
-        links = {name: link_of(self._scenario.link(name).spec, self._keys.link(name), self._batch) for name in names}
+        courses = {name: self._scenario.course(name) for name in names}
+        links = {name: Link(one, name, self._keys.link(name, one), self._batch) for name, one in courses.items()}
         play = {
             Mode.EXACT: self._exact,
             Mode.ERROR_COORDINATES: self._error_coordinates,
@@ -102,41 +117,69 @@ class Simulation:
         }[self._mode]()
         # The same for any number of trials, so that sums over slots are formed in the same order.
         length = max(1, min(slots, _CHUNK_NUMBERS // self._process.n))
-        for block in range(0, slots, BLOCK_SLOTS):
-            end = min(block + BLOCK_SLOTS, slots)
+        bounds = sorted({slots, *(start for name in names for start in block_starts(slots, self._scenario.cuts(name)))})
+        for block, end in pairwise(bounds):
             for first in range(block, end, length):
                 chunk = range(first, min(first + length, end))
                 yield play(chunk, {name: links[name].fates(chunk) for name in names})
 
-    def _exact(self) -> Callable[[range, Mapping[str, Codes]], Chunk]:
+    def _exact(self) -> Callable[[range, Mapping[str, Fates]], Chunk]:
         n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
-        trajectory = Trajectory(self._process, self._keys.process, self._batch)
+        trajectory = Trajectory(self._process, self._keys.process, self._batch, self._initial)
         encoder = self._shared.encoder()
-        beliefs = {name: receiver.prior() for name, receiver in self._receivers.items()}
-        logs = {name: BeliefLog(n, trials, slots) for name in self._receivers}
+        back = Acknowledging.of(self._scenario, self._keys.way_back, self._batch)
+        windows = {name: self._scenario.window(name) for name in self._receivers}
+        present = {
+            name: Attendance(receiver, windows[name], self._scenario.timeline.outages[name])
+            for name, receiver in self._receivers.items()
+        }
+        logs = {name: BeliefLog(n, trials, slots, self._scenario.cuts(name)) for name in self._receivers}
 
-        def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
+        def play(chunk: range, fates: Mapping[str, Fates]) -> Chunk:
             x = np.empty((len(chunk), n, trials))
             nu = np.empty((len(chunk), trials), np.bool_)
-            delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
+            late = {
+                name: np.zeros((2, len(chunk), trials), np.uint16) if window else None
+                for name, window in windows.items()
+            }
+            alarms = np.zeros((len(chunk), trials), np.bool_) if back is not None and back.watches else None
+            if self._scheme.may_be_silent:
+                fates = {name: one.copied() for name, one in fates.items()}
+            sent = np.ones((len(chunk), trials), np.bool_) if self._scheme.may_be_silent else None
             for row, k in enumerate(chunk):
                 x[row] = trajectory.advance()
                 packet = encoder.encode(k, x[row], trajectory.predicted)
                 nu[row] = packet.nu
-                for name, receiver in self._receivers.items():
-                    beliefs[name] = receiver.step(k, beliefs[name], Heard(delivered[name][row], packet.z))
-                    digests = logs[name].add(k, beliefs[name])
+                if packet.sent is not None and sent is not None:
+                    sent[row] = packet.sent
+                    for of_link in fates.values():
+                        of_link.silence(row, packet.sent)
+                if back is not None:
+                    arrived = back.take(k, packet.sent, {name: fate.in_time_of(row) for name, fate in fates.items()})
+                    encoder.acknowledged(k, arrived)
+                    if alarms is not None:
+                        alarms[row] = back.alarms
+                for name, one in present.items():
+                    truth = x[row] if self._betrayed.get(name) == k else None
+                    belief = one.take(k, fates[name], row, packet.z, packet.header, truth)
+                    if (counts := late[name]) is not None:
+                        counts[:, row] = one.late, one.late_used
+                    digests = logs[name].add(k, belief)
                     if digests is not None:
-                        self.digests[name][k // BLOCK_SLOTS] = digests
+                        self.digests[name].update([digests])
             rows = {name: log.rows(chunk.start, chunk.stop) for name, log in logs.items()}
             measured = {
                 name: Measured(
-                    squared_errors(x, one.x_hat), trace_of(one.P.transpose(1, 2, 0, 3)), one.action, fates[name]
+                    squared_errors(x, one.x_hat),
+                    trace_of(one.P.transpose(1, 2, 0, 3)),
+                    one.action,
+                    fates[name],
+                    late[name],
                 )
                 for name, one in rows.items()
             }
             if not self._recorded:
-                return Chunk(chunk.start, measured, None)
+                return Chunk(chunk.start, measured, None, alarms)
             some = slice(0, self._recorded)
             receivers = {
                 name: ReceiverSlots(
@@ -144,27 +187,28 @@ class Simulation:
                     one.action[:, some],
                     one.P[..., some],
                     np.empty((len(chunk), 2)),
-                    delivered[name][:, some],
+                    fates[name].in_time[:, some],
                     {},
                 )
                 for name, one in rows.items()
             }
-            return Chunk(chunk.start, measured, Slots(chunk.start, x[..., some], nu[:, some], receivers))
+            shown = Slots(chunk.start, x[..., some], nu[:, some], receivers, None if sent is None else sent[:, some])
+            return Chunk(chunk.start, measured, shown, alarms)
 
         return play
 
-    def _error_coordinates(self) -> Callable[[range, Mapping[str, Codes]], Chunk]:
+    def _error_coordinates(self) -> Callable[[range, Mapping[str, Fates]], Chunk]:
         n, trials = self._process.n, self._batch.trials
-        noise = ProcessNoise(self._process, self._keys.process, self._batch)
+        noise = ProcessNoise(self._process, self._keys.process, self._batch, self._initial)
         # A state that nobody takes an innovation for is never needed, however large it grows.
         misleads = bool(self._misled())
-        trajectory = Trajectory(self._process, self._keys.process, self._batch) if misleads else None
+        trajectory = Trajectory(self._process, self._keys.process, self._batch, self._initial) if misleads else None
         errors = {name: np.zeros((n, trials)) for name in self._receivers}
         covariances = {name: receiver.prior().P for name, receiver in self._receivers.items()}
 
-        def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
+        def play(chunk: range, fates: Mapping[str, Fates]) -> Chunk:
             measured = self._blank(chunk, fates)
-            delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
+            delivered = {name: one.in_time for name, one in fates.items()}
             for row, k in enumerate(chunk):
                 nu, w = self._shared.nu(k), noise.at(k)
                 if trajectory is not None:
@@ -185,7 +229,7 @@ class Simulation:
 
         return play
 
-    def _covariances(self) -> Callable[[range, Mapping[str, Codes]], Chunk]:
+    def _covariances(self) -> Callable[[range, Mapping[str, Fates]], Chunk]:
         misled = self._misled()
         f = misled_covariances(self._process, self._batch.slots if misled else 0)
         trials, count = self._batch.trials, len(self._receivers)
@@ -195,12 +239,12 @@ class Simulation:
         believed = np.concatenate(list(priors.values()), axis=2)
         actual = {name: priors[name] for name in misled}
 
-        def play(chunk: range, fates: Mapping[str, Codes]) -> Chunk:
+        def play(chunk: range, fates: Mapping[str, Fates]) -> Chunk:
             nonlocal believed
             traces = np.empty((len(chunk), count * trials))
             actions = np.empty(traces.shape, np.uint8)
             errors = {name: np.empty((len(chunk), trials)) for name in misled}
-            delivered = {name: codes == Fate.DELIVERED for name, codes in fates.items()}
+            delivered = {name: one.in_time for name, one in fates.items()}
             for row, k in enumerate(chunk):
                 for name, receiver in self._receivers.items():
                     actions[row, places[name]] = receiver.act(k, delivered[name][row])
@@ -220,15 +264,14 @@ class Simulation:
 
     def _misled(self) -> set[str]:
         """Receivers that may take an innovation for the state."""
-        mixes = self._scenario.encoding.mu_d < 1.0
-        tables = self._scenario.eavesdroppers.items()
-        return {
-            name
-            for name, table in tables
-            if mixes and STRATEGIES[table.strategy].use_probabilities(table.parameters)[1] > 0.0
-        }
+        found = set()
+        for name, table in self._scenario.eavesdroppers.items():
+            outcomes = eavesdropper_outcomes(self._scheme, table.strategy, table.parameters)
+            if outcomes is not None and outcomes(1.0).misled > 0.0:
+                found.add(name)
+        return found
 
-    def _blank(self, chunk: range, fates: Mapping[str, Codes]) -> dict[str, Measured]:
+    def _blank(self, chunk: range, fates: Mapping[str, Fates]) -> dict[str, Measured]:
         shape = (len(chunk), self._batch.trials)
         return {
             name: Measured(np.empty(shape), np.empty(shape), np.empty(shape, np.uint8), codes)

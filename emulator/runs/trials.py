@@ -6,20 +6,23 @@ how the work was spread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from emulator.model.account import Accountant
 from emulator.model.digest import Digests
-from emulator.model.links.link import Fate, losses
 from emulator.model.process import Floats
+from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums, Tally, slot_sums
 from emulator.runs.simulation import Chunk, Measured, Mode, Simulation
+from emulator.runs.watched import Watched, watches_of
 from emulator.scenario import Scenario
 
 BLOCK_TRIALS = 500
@@ -45,7 +48,9 @@ class Block:
     trials: int
     sums: dict[str, SlotSums]
     tallies: dict[str, Tally]
+    accountants: dict[str, Accountant]
     digests: dict[str, dict[int, Digests]]
+    detection: Detection
 
 
 @dataclass(frozen=True)
@@ -61,12 +66,14 @@ class BatchResult:
 
 
 def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
-    """The work, in trial order."""
+    """The work, in trial order, in parts as equal as they can be and as many for each worker, so that all end together."""
     blocks = -(-scenario.trials // BLOCK_TRIALS)
-    length = BLOCK_TRIALS * max(1, min(_SIDE_BY_SIDE, -(-blocks // workers)))
+    rounds = -(-blocks // (workers * _SIDE_BY_SIDE))
+    count = min(blocks, rounds * workers)
     first, end = scenario.first_trial, scenario.first_trial + scenario.trials
+    bounds = [min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1)]
     tables = scenario.model_dump(mode="json")
-    return [Task(tables, mode, start, min(start + length, end)) for start in range(first, end, length)]
+    return [Task(tables, mode, start, stop) for start, stop in pairwise(bounds)]
 
 
 def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:
@@ -79,13 +86,23 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     scale = float(np.trace(scenario.process.process.Q))
     result = BatchResult(
         task.start,
-        [_empty_block(names, slots, start, task.stop) for start in trials[::BLOCK_TRIALS]],
+        [
+            _empty_block({name: scenario.window(name) for name in names}, slots, start, task.stop)
+            for start in trials[::BLOCK_TRIALS]
+        ],
         {name: SlotHistograms(slots, scale) for name in names},
         {name: SlotHistograms(slots, scale) for name in names},
     )
+    for name, watches in watches_of(scenario).items():
+        for block in result.blocks:
+            block.tallies[name].watched = Watched(watches, block.trials)
     expected = expected_traces_of(scenario)
     for chunk in simulation.chunks():
         _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
+        if chunk.alarms is not None:
+            for block in result.blocks:
+                place = block.start - result.start
+                block.detection.add(chunk.first, chunk.alarms[:, place : place + block.trials])
         if chunk.recorded is not None:
             result.recorded.append(chunk.recorded.copied())
         tell(len(trials) * _count(chunk))
@@ -98,14 +115,17 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     return result
 
 
-def _empty_block(names: tuple[str, ...], slots: int, start: int, stop: int) -> Block:
+def _empty_block(windows: Mapping[str, int], slots: int, start: int, stop: int) -> Block:
+    names = tuple(windows)
     trials = min(BLOCK_TRIALS, stop - start)
     return Block(
         start,
         trials,
         {name: SlotSums.zero(slots) for name in names},
         {name: Tally(slots, trials) for name in names},
+        {name: Accountant(window, trials) for name, window in windows.items()},
         {},
+        Detection(trials),
     )
 
 
@@ -120,8 +140,13 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
                 trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
                 sums = slot_sums(part.error, part.action, trace)
             block.sums[name].add(chunk.first, sums)
+            block.tallies[name].watched.add(chunk.first, part.error, part.action, sums.trace, part.late)
             block.tallies[name].add(chunk.first, part.error, sums, expected[name])
-            block.tallies[name].account(part.fates == Fate.DELIVERED, part.action, losses(part.fates))
+            account = block.accountants[name].account(range(chunk.first, chunk.first + len(part.error)), part.fates)
+            block.tallies[name].account(account.delivered, part.action, account.lost, account.unsent)
+            block.tallies[name].count(account)
+            if account.late is not None and part.late is not None:
+                block.tallies[name].account_late(account.late, *part.late)
         result.errors[name].add(chunk.first, measured.error)
         result.traces[name].add(chunk.first, measured.trace)
 
@@ -136,7 +161,8 @@ def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tupl
                 measured.error[:, rows],
                 measured.trace[:, rows],
                 measured.action[:, rows],
-                measured.fates[:, rows],
+                measured.fates.part(trials=rows),
+                None if measured.late is None else measured.late[..., rows],
             ),
         )
 

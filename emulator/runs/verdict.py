@@ -38,18 +38,20 @@ class Secrecy:
     relative: Verdict
     perfect: Verdict
     relative_by_theory: bool | None
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where there is no theory for a link."""
+    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where theory does not know."""
     relative_from: int | None
     """First slot k ≥ 1 from which on tr E P_k < tr E Pᵉ_k to the end of the run; None if it does not hold there."""
     windows: str
     """The slots of the windows in which relative secrecy failed or stayed undecided, such as "1 to 124"; empty if in all."""
     perfect_by_theory: bool | None
-    """J bounded and J_e not; None where there is no theory for a link."""
+    """J bounded and J_e not; None where theory does not know."""
     ratio: float
     """Mean error, eavesdropper's over legitimate; NaN before the first slot."""
     trials: int
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance and a mean is no measure."""
+    unknown: str = "there is no theory for these links"
+    """What is said where theory makes no claim."""
 
     def as_dict(self) -> dict[str, str | bool | int | None]:
         """As in the summary."""
@@ -67,7 +69,7 @@ class Secrecy:
     def sentence(self) -> str:
         """One sentence for the closing report."""
         theory = "perfect" if self.perfect_by_theory else "relative" if self.relative_by_theory else "no"
-        promise = "there is no theory for these links"
+        promise = self.unknown
         if self.relative_by_theory is not None:
             promise = f"theory promises {theory} secrecy"
         if theory == "no" and self.relative_from is not None:
@@ -152,12 +154,17 @@ def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: 
 def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
     """The verdict on one eavesdropper, from both tallies and what theory expects of both receivers."""
     (user, user_theory), (name, other, other_theory) = legitimate, eavesdropper
-    known = user_theory.known and other_theory.known
+    # A bound from below can make a promise, and can deny none.
+    bounded = other_theory.bound is not None
+    theirs = other_theory.bound or other_theory
+    known = user_theory.known and theirs.known
     user_bound = user_theory.limit if user_theory.known else math.inf
-    perfect_by_theory = math.isfinite(user_bound) and math.isinf(other_theory.limit) if known else None
+    perfect_by_theory = (math.isfinite(user_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
+    perfect_by_theory = perfect_by_theory if known else None
     complete = user.done == user.slots
     slots = user.slots if complete else max(user.done, 2)
-    gap = other_theory.traces(slots) - user_theory.traces(slots)
+    gap = theirs.traces(slots) - user_theory.traces(slots)
+    always = math.isfinite(user_bound) and slots > 1 and bool(np.all(gap[1:] > 0.0))
     user_means, other_means = window_means(user), window_means(other)
     heavy = user_theory.infinite_variance or other_theory.infinite_variance
     bounds_of = median_bounds if heavy else mean_bounds
@@ -173,13 +180,14 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         name,
         relative,
         perfect,
-        bool(math.isfinite(user_bound) and slots > 1 and np.all(gap[1:] > 0.0)) if known else None,
+        (always or (None if bounded else False)) if known else None,
         _holds_from(gap) if known and math.isfinite(user_bound) else None,
         windows,
         perfect_by_theory,
         ratio,
         user.trials,
         "median" if heavy else "mean",
+        *(["no closed form of its error is known"] if other_theory.outcomes_at is None else []),
     )
 
 

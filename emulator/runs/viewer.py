@@ -18,6 +18,7 @@ from typing import IO
 from urllib.parse import quote
 
 from emulator.errors import UsageError
+from emulator.runs.environment import viewer_environment
 from emulator.runs.ports import free_port
 
 _HOST = "127.0.0.1"
@@ -145,7 +146,7 @@ def spawn(
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env={**os.environ, "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
+            env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
             if all(_listens(process, awaited) for awaited in (port, web_port) if awaited):

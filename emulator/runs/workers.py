@@ -5,7 +5,6 @@ A worker process has a pipe of its own and shares no lock with anybody, so that 
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import signal
 import subprocess
@@ -18,11 +17,12 @@ from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
 from emulator.errors import RunError, UsageError
+from emulator.runs.environment import own_environment
 from emulator.runs.trials import BatchResult, Task, carry_out
 
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
-_REACH_SECONDS = 5
+_REACH_SECONDS = 5.0
 
 Tell = Callable[[int], None]
 Stopped = Callable[[], bool]
@@ -64,10 +64,14 @@ class _Worker:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
+                env=own_environment(),
             )
+        except OSError as error:
+            self.pipe.close()
+            raise RunError(f"no worker process can be started ({error}); try fewer --workers") from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        theirs.close()
+            theirs.close()
 
     def give(self, number: int, task: Task) -> None:
         self.number = number
@@ -163,6 +167,8 @@ def connected(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         yield None
         return
+    import asyncio  # noqa: PLC0415 - a tenth of what a worker imports, and none needs it
+
     try:
         from distributed import Client  # noqa: PLC0415 - an optional extra
         from distributed.comm.core import connect  # noqa: PLC0415 - the same
@@ -179,7 +185,7 @@ def connected(scheduler: str | None) -> Iterator[Any]:
         client = Client(scheduler, timeout=_REACH_SECONDS, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS} s; start one with "
+            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS:g} s; start one with "
             "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
         ) from error
     with contextlib.closing(client):

@@ -3,8 +3,9 @@
 Source: docs/scenario.md.
 """
 
+from emulator.scenario.expect import FIGURES, ExpectTable, link_figure
 from emulator.scenario.file import checked, load, parse, read, shipped, value_of, write_new
-from emulator.scenario.tables import FIGURES, SECRET_BYTES, ExpectTable, Scenario
+from emulator.scenario.tables import SECRET_BYTES, Scenario
 
 __all__ = [
     "FIGURES",
@@ -12,6 +13,7 @@ __all__ = [
     "ExpectTable",
     "Scenario",
     "checked",
+    "link_figure",
     "load",
     "parse",
     "read",

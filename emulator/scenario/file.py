@@ -19,6 +19,7 @@ from pydantic import (
 
 from emulator.errors import ScenarioError, UsageError
 from emulator.scenario.mistakes import across_tables, sentences
+from emulator.scenario.recordings import beside, read_recordings
 from emulator.scenario.tables import Scenario
 
 
@@ -46,7 +47,9 @@ def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond
 
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
-    return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon)
+    path = shipped().get(str(source), Path(source))
+    folder = path if path.is_dir() else path.parent
+    return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def read(source: str | Path) -> str:
@@ -72,27 +75,39 @@ def read(source: str | Path) -> str:
 
 
 def parse(
-    text: str, source: str, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False
+    text: str,
+    source: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    beyond_horizon: bool = False,
+    folder: Path = Path(),
 ) -> Scenario:
-    """The scenario in a TOML text. Raises ScenarioError with every mistake."""
+    """The scenario in a TOML text. Raises ScenarioError with every mistake.
+
+    folder: where the files are that it names; those that a change names are in the current one.
+    """
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
+    beside(tables, folder)
+    if isinstance(tables.get("secret_file"), str):
+        tables["secret_file"] = str((folder / tables["secret_file"]).absolute())
     return checked(tables, source, changes, beyond_horizon=beyond_horizon)
 
 
 def checked(
     tables: dict[str, Any], source: str, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False
 ) -> Scenario:
-    """The scenario that tables describe, changed. Raises ScenarioError with every mistake."""
+    """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake."""
     for key, value in (changes or {}).items():
         _set(tables, key, value)
+    recordings = read_recordings(tables)
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:
-        raise ScenarioError(source, [*sentences(error), *across_tables(tables, beyond_horizon)]) from error
-    mistakes = across_tables(tables, beyond_horizon)
+        raise ScenarioError(source, [*sentences(error), *recordings, *across_tables(tables, beyond_horizon)]) from error
+    mistakes = recordings + across_tables(tables, beyond_horizon)
     if mistakes:
         raise ScenarioError(source, mistakes)
     return scenario

@@ -4,32 +4,43 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ValidationError,
 )
 from pydantic_core import ErrorDetails
 
+from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.horizon import horizon
+from emulator.model.link import Course
+from emulator.model.link_law import law_of
+from emulator.model.outcomes import closed_form, eavesdropper_outcomes, legitimate_outcomes
 from emulator.model.process import Process
+from emulator.model.schemes import SCHEMES, scheme_of
 from emulator.network.access import LEGITIMATE
+from emulator.scenario.across import acknowledgement_mistakes, event_mistakes, link_mistakes
+from emulator.scenario.events import EventTable
+from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.table import Found
 from emulator.scenario.tables import (
-    FIGURES,
     SECRET_BYTES,
+    AcknowledgementsTable,
+    CorrelationTable,
     EavesdropperTable,
     EncodingTable,
-    ExpectTable,
-    Found,
     LegitimateTable,
     LinkTable,
     ProcessTable,
     Scenario,
 )
-from emulator.scenario.words import as_toml
+from emulator.scenario.words import as_toml, listed
 
+_ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # whether there is a theory does not depend on it
 _EXPECTED: Mapping[str, str] = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -64,18 +75,20 @@ def _sentence(detail: ErrorDetails) -> str:
     if kind == "missing":
         return f"is missing; expected {name}" + (f" = {as_toml(field.examples[0])}" if example else "")
     if kind == "extra_forbidden":
-        known = [known for known in table.model_fields if known != "made_with"] if table is not None else []
+        fields = table.model_fields if table is not None else {}
+        known = [field.alias or known for known, field in fields.items() if known != "made_with"]
         near = difflib.get_close_matches(name, known, 1)
         hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
         return f"is no entry of this table; {hint}"
     if kind == "expected":
-        return f"is {as_toml(found)}; expected {context['expected']}{example}"
+        return f"is {as_toml(found)}; expected {context['expected']}{context['hint'] or example}"
     if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {as_toml(found)}; expected a number {bound}{example}"
-    if kind == "too_long":
-        return f"has more than {context['max_length']} entries; expected at most so many"
+    if kind in {"too_long", "too_short"}:
+        limit = f"more than {context['max_length']}" if kind == "too_long" else f"fewer than {context['min_length']}"
+        return f"has {limit} entries; expected {'at most' if kind == 'too_long' else 'at least'} so many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(found)}; expected {expected}{example}"
 
@@ -89,8 +102,12 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "encoding": EncodingTable,
         "legitimate": LegitimateTable,
         "link": LinkTable,
+        "links": LinkTable,
         "eavesdroppers": EavesdropperTable,
         "expect": ExpectTable,
+        "event": EventTable,
+        "correlation": CorrelationTable,
+        "acknowledgements": AcknowledgementsTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -114,32 +131,85 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials > 0:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
+    if isinstance(tables.get("eavesdroppers", {}), dict):
+        found += _strategy_mistakes(tables.get("eavesdroppers", {}), tables.get("encoding"), slots)
     eavesdroppers, expectations = tables.get("eavesdroppers", {}), tables.get("expect", [])
     if isinstance(eavesdroppers, dict) and isinstance(expectations, list):
-        available = [f"{receiver}.{figure}" for receiver in (LEGITIMATE, *eavesdroppers) for figure in FIGURES]
+        encoding = tables.get("encoding")
+        around = Around(
+            (LEGITIMATE, *eavesdroppers),
+            slots if type(slots) is int and slots > 0 else None,
+            trials if type(trials) is int and trials > 0 else None,
+            lambda name: _no_theory(
+                name, tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name], encoding
+            ),
+        )
         for i, expectation in enumerate(expectations):
-            figure = expectation.get("figure") if isinstance(expectation, dict) else None
-            if isinstance(figure, str) and figure not in available:
-                near = difflib.get_close_matches(figure, available, 1)
-                hint = f"; did you mean {near[0]}?" if near else ""
-                names = f"RECEIVER ({', '.join((LEGITIMATE, *eavesdroppers))}).FIGURE ({', '.join(FIGURES)})"
-                found.append(f"expect.{i}.figure: is {as_toml(figure)}; expected {names}{hint}")
-            elif isinstance(figure, str) and figure.endswith(".expected_trace_covariance"):
-                receiver = figure.partition(".")[0]
-                if not _has_theory(tables.get(LEGITIMATE) if receiver == LEGITIMATE else eavesdroppers[receiver]):
-                    why = f"there is no theory for the losses of {receiver}'s link"
-                    found.append(f"expect.{i}.figure: is {as_toml(figure)}, but {why}; expected another figure")
+            if isinstance(expectation, dict):
+                found += [f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation)]
+    found += acknowledgement_mistakes(tables)
+    links = _links(tables)
+    found += link_mistakes(tables, links)
+    found += event_mistakes(tables, links, sentences)
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     return found
 
 
-def _has_theory(receiver: Any) -> bool:
-    """Whether there is a theory for a receiver's link, as far as it is one."""
+def _links(tables: Mapping[str, Any]) -> dict[str, LinkTable]:
+    """Receiver → its link, of those whose link is one."""
+    eavesdroppers = tables.get("eavesdroppers")
+    receivers = {LEGITIMATE: tables.get(LEGITIMATE), **(eavesdroppers if isinstance(eavesdroppers, dict) else {})}
+    found = {}
+    for name, receiver in receivers.items():
+        with suppress(TypeError, KeyError, ValidationError):
+            found[name] = LinkTable.model_validate(receiver["link"])
+    return found
+
+
+def _no_theory(name: str, receiver: Any, encoding: Any) -> str | None:
+    """Why there is no theory for a receiver, as far as it is one; None if there is."""
     try:
-        return LinkTable.model_validate(receiver["link"]).model.chain is not None
+        scheme = scheme_of(_ANY_PROCESS, EncodingTable.model_validate(encoding).spec)
+        if name == LEGITIMATE:
+            link = LinkTable.model_validate(receiver["link"])
+            if closed_form(encoding["scheme"], LEGITIMATE) is None and legitimate_outcomes(scheme) is None:
+                return f"no closed form is known for the scheme {encoding['scheme']}"
+        else:
+            table = EavesdropperTable.model_validate(receiver)
+            link = table.pool
+            closed = closed_form(encoding["scheme"], table.strategy) is not None
+            if not closed and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
+                return f"no closed form is known for the strategy {table.strategy} of {name}"
+        known = law_of(Course(link.settings(1.0), int(receiver.get("window", 0)))) is not None
+        return None if known else f"there is no theory for {name}'s link"
     except (TypeError, KeyError, ValidationError):
-        return True
+        return None
+
+
+def _strategy_mistakes(eavesdroppers: Mapping[str, Any], encoding: Any, slots: Any) -> list[str]:
+    """Strategies that need what the scheme does not have, or what comes after the run."""
+    found = []
+    scheme = SCHEMES.get(str(encoding.get("scheme"))) if isinstance(encoding, dict) else None
+    for name, entries in eavesdroppers.items():
+        try:
+            table = EavesdropperTable.model_validate(entries)
+        except ValidationError:
+            continue
+        strategy = STRATEGIES[table.strategy]
+        needed = [stream for stream in strategy.streams(table.parameters) if stream != "coin"]
+        lacking = [stream for stream in needed if scheme is not None and stream not in scheme.secret_streams]
+        if lacking:
+            entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
+            able = [one for one in READERS if not READERS[one].streams({})]
+            found.append(
+                f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by what it knows of the "
+                f"{listed(lacking)}, and the scheme {encoding['scheme']} has none; expected {listed(sorted(able))}"
+            )
+        betrayed = strategy.betrayed(table.parameters)
+        if betrayed is not None and type(slots) is int and betrayed >= slots > 0:
+            found.append(f"eavesdroppers.{name}.learns_at: is {betrayed}; expected a slot of the run, 0 to {slots - 1}")
+    return found
 
 
 def _secret_mistakes(file: str) -> list[str]:

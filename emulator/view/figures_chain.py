@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import Link
+from emulator.model.link import link_of
 from emulator.model.markov import step_probabilities, word_probability
 from emulator.model.process import Floats
 from emulator.model.schedule import Schedule
@@ -41,7 +40,7 @@ def simulate(mu: float, mu_d: float, trials: int, slots: int, progress: Callable
     """Follow link and schedule, and count where the estimator is. A word is kept as bits: 1, then 1 a drop, 0 not."""
     batch = Batch(_BURN_IN + slots, trials)
     root = root_of_seed(2023)
-    link = Link(Bernoulli(mu), stream_key(root, "link/legitimate"), batch)
+    link = link_of({"model": "bernoulli", "quality": mu}, stream_key(root, "link/legitimate"), batch)
     schedule = Schedule(stream_key(root, "schedule"), mu_d, batch)
     codes = [int("1" + "".join("1" if event == "D" else "0" for event in word[1:]), 2) for word in WORDS]
     steps, words = np.zeros((STEPS, trials)), np.zeros((len(WORDS), trials))

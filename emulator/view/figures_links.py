@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from emulator.model.links.link import Fate, Link
+from emulator.model.link import Link
 from emulator.model.receiver import Flags
 
 _AHEAD = 128  # slots drawn at once
@@ -13,4 +13,4 @@ _AHEAD = 128  # slots drawn at once
 def deliveries(link: Link, slots: int) -> Iterator[Flags]:
     """γ_k (R,) of slots 0 … slots−1, one after the other."""
     for start in range(0, slots, _AHEAD):
-        yield from link.fates(range(start, min(start + _AHEAD, slots))) == Fate.DELIVERED
+        yield from link.fates(range(start, min(start + _AHEAD, slots))).in_time

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import Link
+from emulator.model.link import link_of
 from emulator.model.process import Floats, Process
 from emulator.model.receiver import Action
 from emulator.model.schedule import Schedule
@@ -74,7 +73,10 @@ def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
     """
     batch = Batch(slots, trials)
     root = root_of_seed(2025)
-    links = [Link(Bernoulli(MU), stream_key(root, f"link/{name}"), batch) for name in ("legitimate", "eavesdropper")]
+    links = [
+        link_of({"model": "bernoulli", "quality": MU}, stream_key(root, f"link/{name}"), batch)
+        for name in ("legitimate", "eavesdropper")
+    ]
     schedules = [Schedule(stream_key(root, f"schedule/{mu_d}"), mu_d, batch) for mu_d in STATE_PROBABILITIES]
     width = len(schedules)
     processes = (process(), process(), uncertain_process())

@@ -13,8 +13,7 @@ import numpy as np
 
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.link import Link
+from emulator.model.link import link_of
 from emulator.model.process import Floats, Process, Trajectory
 from emulator.model.receiver import Heard, Receiver
 from emulator.model.schemes.innovation import Innovation
@@ -44,7 +43,9 @@ def outcomes() -> dict[str, Outcomes]:
     """What each receiver does with a slot, by receiver."""
     found = {"legitimate": Outcomes.legitimate(MU, MU_D)}
     for name in ("smart", "suspicious", "naive"):
-        found[name] = Outcomes.eavesdropper(MU, MU_D, *STRATEGIES[name].use_probabilities(_SUSPICIOUS))
+        outcomes_at = STRATEGIES[name].outcomes(_SUSPICIOUS, MU_D)
+        if outcomes_at is not None:
+            found[name] = outcomes_at(MU)
     return found
 
 
@@ -110,7 +111,7 @@ def _simulate_batch(batch: Batch, sums: dict[str, Floats]) -> None:
     for name in ("smart", "suspicious", "naive"):
         receivers[name] = STRATEGIES[name](Knowledge(model, MU_D, _SUSPICIOUS, keys), batch)
     trajectory = Trajectory(model, keys["process"], batch)
-    links = (Link(Bernoulli(MU), keys[name], batch) for name in ("link/l", "link/e"))
+    links = (link_of({"model": "bernoulli", "quality": MU}, keys[name], batch) for name in ("link/l", "link/e"))
     beliefs = {name: receiver.prior() for name, receiver in receivers.items()}
     for k, gammas in enumerate(zip(*(deliveries(link, batch.slots) for link in links), strict=True)):
         x = trajectory.advance()

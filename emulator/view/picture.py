@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
 from emulator.errors import UsageError
@@ -40,14 +42,31 @@ def reports(viewer: ViewerClient) -> list[str]:
     return [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
 
 
+def check(rrd: Path) -> None:
+    """Read a recording to its end. Raises UsageError if it is none, or broken.
+
+    The viewer itself would say nothing, and show nothing.
+    """
+    if not rrd.is_file():
+        raise UsageError(f"{rrd} does not exist; give the recording.rrd of a results folder")
+    try:
+        with warnings.catch_warnings():
+            # A recording that was cut short between two messages is shown as far as it goes.
+            warnings.simplefilter("ignore")
+            for _ in RrdReader(rrd).stream():
+                pass
+    except (RuntimeError, OSError) as error:
+        why = " ".join(str(error).split())
+        raise UsageError(f"{rrd} is broken ({why}); remove it, and it is made again from the tables") from error
+
+
 @contextmanager
 def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterator[ViewerClient]:
     """A headless viewer that has loaded a recording and shows a moment of it, by default the last, ready to be drawn.
 
     Raises UsageError as `picture` does.
     """
-    if not rrd.is_file():
-        raise UsageError(f"{rrd} does not exist; give the recording.rrd of a results folder")
+    check(rrd)
     port = free_port()
     arguments = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen", str(rrd.resolve())]
     with tempfile.TemporaryDirectory() as folder:

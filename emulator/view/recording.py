@@ -107,7 +107,10 @@ class Recording:
                 notes, self._notes = self._notes, []
                 closing = self._closing
                 self._changed.notify_all()
-            self._put(chunks, notes)
+            try:
+                self._put(chunks, notes)
+            except Exception as error:  # a thread that dies would leave the run waiting for it
+                self._give_up(repr(error))
             if closing:
                 break
         if self.failure is None:

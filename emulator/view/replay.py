@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from emulator.model.process import Floats
 from emulator.model.receiver import Action
 from emulator.runs.observer import open_recording
 from emulator.runs.results import Results, load_results
+from emulator.runs.scorekeeper import event_line
 from emulator.scenario import load
 from emulator.view.scene import PeerSlots, Slots
 
@@ -38,14 +40,29 @@ def replay(folder: Path) -> Path:
     x, nu = _truth(results, scenario.receivers[0])
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again without --covariance-only or the like")
+    _check_shapes(folder, len(scenario.process.A), x, peers)
     recording = open_recording(scenario, folder.name, path, None)
     for first in range(0, len(x), _CHUNK):
         rows = slice(first, min(first + _CHUNK, len(x)))
         recording.add(Slots(first, x[rows], nu[rows], {name: _cut(peer, rows) for name, peer in peers.items()}))
+    for event in results.summary.get("events", ()):
+        recording.note(event["slot"], "INFO", event_line(event))
     recording.close()
     if recording.failure is not None:
+        path.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written ({recording.failure}); make the folder writable")
     return path
+
+
+def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots]) -> None:
+    """Raise UsageError unless the tables hold the same slots of every receiver, of a process with n states."""
+    if x.shape[1] != n:
+        raise UsageError(
+            f"{folder}: trials.parquet has {x.shape[1]} states and scenario.toml {n}; run the scenario again"
+        )
+    for name, peer in peers.items():
+        if {len(x)} != {len(column) for column in (peer.x_hat, peer.squared_error)}:
+            raise UsageError(f"{folder}: its tables have not the same slots of {name}; run the scenario again")
 
 
 def _first_trial(results: Results, name: str) -> pa.Table:
@@ -68,6 +85,11 @@ def _peer(results: Results, name: str) -> PeerSlots:
     x_hat, P = _matrix(rows["x_hat"]), _matrix(rows["P"])
     n = x_hat.shape[1] if x_hat.ndim == 2 else 0
     words = rows["action"].cast(pa.string()).to_pylist()
+    unknown = sorted(set(words) - _CODES.keys())
+    if unknown:
+        raise UsageError(
+            f"{results.folder}: trials.parquet has the unknown action {unknown[0]}; run the scenario again"
+        )
     return PeerSlots(
         x_hat=x_hat,
         P=P.reshape(-1, n, n),

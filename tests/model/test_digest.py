@@ -32,7 +32,7 @@ def defined(beliefs: list[Belief], r: int) -> list[bytes]:
     blocks = []
     for start in range(0, len(beliefs), 256):
         whole = sha256()
-        for x_hat, P, action in beliefs[start : start + 256]:
+        for x_hat, P, action, _ in beliefs[start : start + 256]:
             n = len(x_hat)
             whole.update(struct.pack("<B", 1 if action[r] else 0))
             for i in range(n):
@@ -45,14 +45,16 @@ def defined(beliefs: list[Belief], r: int) -> list[bytes]:
 
 
 def logged(beliefs: list[Belief], n: int, trials: int) -> dict[int, np.ndarray]:
-    """Block number → digests (R, 32), by the program."""
+    """Block, by its first slot → digests (R, 32), by the program."""
     log = BeliefLog(n, trials, len(beliefs))
     found = {}
     for k, belief in enumerate(beliefs):
         digests = log.add(k, belief)
         assert (digests is not None) == (k % 256 == 255 or k == len(beliefs) - 1)
         if digests is not None:
-            found[k // BLOCK_SLOTS] = digests.copy()
+            block, rows = digests
+            assert block == k // BLOCK_SLOTS * BLOCK_SLOTS
+            found[block] = rows.copy()
     return found
 
 
@@ -64,7 +66,7 @@ def test_digests_are_as_defined(slots: int, n: int, trials: int, seed: int) -> N
     found = logged(beliefs, n, trials)
     expected = [defined(beliefs, r) for r in range(trials)]
     assert {block: [bytes(row) for row in rows] for block, rows in found.items()} == {
-        block: [one[block] for one in expected] for block in range(-(-slots // 256))
+        256 * block: [one[block] for one in expected] for block in range(-(-slots // 256))
     }
     whole = RunDigest()
     whole.add(found)
@@ -99,7 +101,7 @@ def test_any_bit_counts(seed: int, what: str, data: st.DataObject) -> None:
     beliefs = random_beliefs(5, 2, 3, seed)
     before = logged(beliefs, 2, 3)[0]
     k, r = data.draw(st.integers(0, 4)), data.draw(st.integers(0, 2))
-    x_hat, P, action = beliefs[k]
+    x_hat, P, action, _ = beliefs[k]
     if what == "gamma":
         action[r] = 0 if action[r] else 1
     else:

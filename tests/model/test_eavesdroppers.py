@@ -1,4 +1,4 @@
-"""Eavesdroppers, against the paper's table one trial at a time."""
+"""Eavesdroppers: what all of them must keep to, and those that take or ignore packets against the paper's table."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.process import Process
 from emulator.model.receiver import Action, Belief, Heard, Receiver
@@ -20,13 +20,25 @@ PROCESS = Process(
     np.array([[1.0, 0.3], [0.5, 1.001]]), np.array([[1e-3, 2e-4], [2e-4, 1e-3]]), np.array([[1.0, 0.1], [0.1, 0.5]])
 )
 MU_D, USE_STATE, USE_INNOVATION = 0.4, 0.8, 0.3
-PARAMETERS = {"naive": {}, "smart": {}, "suspicious": {"use_state": USE_STATE, "use_innovation": USE_INNOVATION}}
+LEARNS_AT = 7
+PARAMETERS = {
+    **{name: {} for name in STRATEGIES},
+    "suspicious": {"use_state": USE_STATE, "use_innovation": USE_INNOVATION},
+    "colluding": {"reads_as": "smart"},
+    "replay-informed": {"reads_as": "bayesian", "learns_at": LEARNS_AT},
+}
+STREAMS = {
+    **dict.fromkeys(STRATEGIES, ()),
+    **dict.fromkeys(("smart", "genie", "colluding"), ("schedule",)),
+    "suspicious": ("schedule", "coin"),
+}
+TAKERS = ("naive", "suspicious", "smart", "constant")
 
 
 def receiver(name: str, batch: Batch, **parameters: float) -> Receiver:
     """An eavesdropper that is given what its strategy names, and no more."""
     strategy = STRATEGIES[name]
-    keys = {stream: KEYS[stream] for stream in strategy.streams}
+    keys = {stream: KEYS[stream] for stream in STREAMS[name]}
     return strategy(Knowledge(PROCESS, MU_D, {**PARAMETERS[name], **parameters}, keys), batch)
 
 
@@ -41,9 +53,15 @@ def beliefs(name: str, batch: Batch, gamma: np.ndarray, z: np.ndarray) -> list[B
     one = receiver(name, batch)
     belief, found = one.prior(), []
     for k in range(batch.slots):
-        belief = one.step(k, belief, Heard(gamma[k], z[k]))
+        belief = one.step(k, belief, heard(name, k, gamma[k], z[k]))
         found.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
     return found
+
+
+def heard(name: str, k: int, gamma: np.ndarray, z: np.ndarray) -> Heard:
+    """What a strategy hears in a slot."""
+    truth = np.full(z.shape, 2.0) if name == "replay-informed" and k == LEARNS_AT else None
+    return Heard(gamma, z, truth=truth)
 
 
 def uniform(stream: str, k: int, r: int) -> float:
@@ -54,14 +72,14 @@ def uniform(stream: str, k: int, r: int) -> float:
 def uses(name: str, k: int, r: int) -> bool:
     """b_k of the paper's table, from the schedule's and the coin's own numbers."""
     nu = k > 0 and uniform("schedule", k, r) >= MU_D
-    if name == "naive":
-        return True
+    if name in {"naive", "constant"}:
+        return name == "naive"
     if name == "smart":
         return not nu
     return uniform("coin", k, r) < (USE_INNOVATION if nu else USE_STATE)
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", TAKERS)
 @settings(deadline=None)
 @given(seed=st.integers(0, 2**31), first=st.integers(0, 10_000))
 def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, first: int) -> None:
@@ -84,7 +102,7 @@ def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, f
             assert np.allclose(found[k].P[:, :, r], P, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_a_trial_alone_is_the_same_trial(name: str) -> None:
     """Beliefs of a trial are the same bits alone, among 6 and among 400."""
     gamma, z = events(300, 400)
@@ -98,7 +116,7 @@ def test_a_trial_alone_is_the_same_trial(name: str) -> None:
             assert np.array_equal(one.action, other.action[part])
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_what_is_lost_does_not_matter(name: str) -> None:
     """Of a packet that was lost not a bit enters the belief, not even NaN."""
     gamma, z = events(40, 30)
@@ -110,23 +128,75 @@ def test_what_is_lost_does_not_matter(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_it_needs_what_it_names_and_no_more(name: str) -> None:
-    """Without one of its keys or parameters an eavesdropper cannot be built; the naive one is given nothing."""
-    strategy = STRATEGIES[name]
-    assert {"naive": (), "smart": ("schedule",), "suspicious": ("schedule", "coin")}[name] == strategy.streams
-    assert set(strategy.parameters) == set(PARAMETERS[name])
-    for stream in strategy.streams:
-        keys = {other: KEYS[other] for other in strategy.streams if other != stream}
-        with pytest.raises(KeyError, match=stream):
-            strategy(Knowledge(PROCESS, MU_D, PARAMETERS[name], keys), Batch(2, 1))
-    for parameter in strategy.parameters:
-        with pytest.raises(KeyError, match=parameter):
-            strategy(
-                Knowledge(PROCESS, MU_D, {k: 0.5 for k in strategy.parameters if k != parameter}, KEYS), Batch(2, 1)
-            )
+def test_a_slot_can_be_computed_again(name: str) -> None:
+    """Same belief in, same bits out, also after later slots; and what went in is not changed by it."""
+    gamma, z = events(30, 20)
+    one, kept = receiver(name, Batch(30, 20)), []
+    belief = one.prior()
+    for k in range(30):
+        kept.append((belief, [part.tobytes() for part in (*belief[:3], *belief.memory)]))
+        belief = one.step(k, belief, heard(name, k, gamma[k], z[k]))
+    kept.append((belief, [part.tobytes() for part in (*belief[:3], *belief.memory)]))
+    for k in (29, 11, 12, 0, 7, 1):
+        again = one.step(k, kept[k][0], heard(name, k, gamma[k], z[k]))
+        assert [part.tobytes() for part in (*again[:3], *again.memory)] == kept[k + 1][1]
+    for belief, before in kept:
+        assert [part.tobytes() for part in (*belief[:3], *belief.memory)] == before
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
+def test_what_it_remembers_has_the_trials_last(name: str) -> None:
+    """Of any shape, so that a network can hand a batch's memory on, or a part of it."""
+    gamma, z = events(12, 20)
+    one = receiver(name, Batch(12, 20))
+    belief = one.prior()
+    for k in range(12):
+        assert all(part.shape[-1] == 20 for part in belief.memory)
+        belief = one.step(k, belief, heard(name, k, gamma[k], z[k]))
+    assert np.array_equal(belief.action == Action.LOST, ~gamma[11])
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_it_needs_what_it_names_and_no_more(name: str) -> None:
+    """Without one of its keys or parameters an eavesdropper cannot be built; most are given nothing."""
+    strategy, parameters = STRATEGIES[name], PARAMETERS[name]
+    assert strategy.streams(parameters) == STREAMS[name]
+    assert set(strategy.parameters) == set(parameters)
+    for stream in STREAMS[name]:
+        keys = {other: KEYS[other] for other in STREAMS[name] if other != stream}
+        with pytest.raises(KeyError, match=stream):
+            strategy(Knowledge(PROCESS, MU_D, parameters, keys), Batch(2, 1))
+    for parameter in strategy.parameters:
+        rest = {entry: value for entry, value in parameters.items() if entry != parameter}
+        with pytest.raises(KeyError, match=parameter):
+            strategy(Knowledge(PROCESS, MU_D, rest, KEYS), Batch(2, 1))
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_who_looks_at_packets_says_so(name: str) -> None:
+    """The action of a taker is known from γ; that of a reader is not, and asking for it is an error."""
+    one, gamma = receiver(name, Batch(2, 3)), np.ones(3, bool)
+    follows = STRATEGIES[name].follows_gamma(PARAMETERS[name])
+    assert follows == (name in {*TAKERS, "colluding"})
+    if name in {"bayesian", "likelihood", "reference", "selective", "replay-informed"}:
+        with pytest.raises(NotImplementedError, match="γ alone does not tell its action"):
+            one.act(0, gamma)
+    else:
+        assert np.array_equal(one.act(0, gamma), one.step(0, one.prior(), Heard(gamma, np.zeros((2, 3)))).action)
+
+
+def test_a_delegate_is_its_reader() -> None:
+    """Colluding with one reader is that reader, to the bit; so is the replay-informed one until it learns a state."""
+    gamma, z = events(12, 9)
+    for name, twin in (("colluding", "smart"), ("replay-informed", "bayesian")):
+        pairs = list(zip(beliefs(name, Batch(12, 9), gamma, z), beliefs(twin, Batch(12, 9), gamma, z), strict=True))
+        same = [all(np.array_equal(a, b) for a, b in zip(one, two, strict=True)) for one, two in pairs]
+        assert same[:LEARNS_AT] == [True] * LEARNS_AT
+        assert same[LEARNS_AT] == (name == "colluding")
+    assert set(STRATEGIES) == {*READERS, "colluding", "replay-informed"}
+
+
+@pytest.mark.parametrize("name", TAKERS)
 def test_use_probabilities_are_what_it_does(name: str) -> None:
     """P(b = 1 given ν) of theory is how often it uses states and innovations: binomial, at 1e-6 confidence."""
     slots, trials = 60, 2000
@@ -147,7 +217,7 @@ def test_use_probabilities_are_what_it_does(name: str) -> None:
     if name == "suspicious":  # in slot 0 every packet is the state
         assert stats.binomtest(int(used[0].sum()), trials, USE_STATE).pvalue > 1e-6
     else:
-        assert used[0].all()
+        assert used[0].all() == (name != "constant")
 
 
 def test_certain_suspicion_is_smart_or_naive() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtri
 
-from emulator.model.elementary import cholesky, log, normal_quantile, polynomial, triangular_factor
+from emulator.model.elementary import cholesky, exp, inverse, log, normal_quantile, polynomial, triangular_factor
 
 POSITIVE = st.floats(min_value=2.3e-308, max_value=1.7e308, allow_subnormal=False)
 PROBABILITIES = st.integers(1, 2**53 - 1).map(lambda i: i * 2.0**-53)
@@ -38,6 +38,23 @@ def test_log_at_landmarks() -> None:
 
 
 @settings(deadline=None)
+@given(st.lists(st.floats(-745.0, 709.7), min_size=1, max_size=50))
+def test_exp_is_within_one_unit_in_the_last_place(x: list[float]) -> None:
+    """The exponential is math.exp's to one unit in the last place, subnormal results too."""
+    for found, expected in zip(exp(np.array(x)).tolist(), map(math.exp, x), strict=True):
+        assert abs(found - expected) <= math.ulp(expected)
+
+
+def test_exp_at_landmarks() -> None:
+    """Exact at 0, right on both sides of every change of exponent, 0 and inf where nothing else is left."""
+    assert exp(np.array([0.0, -0.0, -800.0, -np.inf, 710.0, np.inf])).tolist() == [1.0, 1.0, 0.0, 0.0, np.inf, np.inf]
+    halves = np.arange(-1000, 1000) * (0.5 * math.log(2.0))
+    x = np.concatenate([halves, np.nextafter(halves, np.inf), np.nextafter(halves, -np.inf)])
+    expected = np.array([math.exp(value) for value in x.tolist()])
+    assert np.all(np.abs(exp(x) - expected) <= np.spacing(expected))
+
+
+@settings(deadline=None)
 @given(st.lists(PROBABILITIES, min_size=1, max_size=50))
 def test_quantile_is_scipys(u: list[float]) -> None:
     """The normal quantile agrees with scipy's to 1e-14, relatively."""
@@ -59,9 +76,9 @@ def test_quantile_in_every_region() -> None:
 @settings(deadline=None)
 @given(st.lists(PROBABILITIES, min_size=2, max_size=40), st.data())
 def test_a_number_alone_has_the_same_bits(u: list[float], data: st.DataObject) -> None:
-    """Alone, among others and in any shape, a number's logarithm and quantile are the same bits."""
+    """Alone, among others and in any shape, a number's logarithm, exponential and quantile are the same bits."""
     i = data.draw(st.integers(0, len(u) - 1))
-    for function in (log, normal_quantile):
+    for function in (log, exp, normal_quantile):
         among = function(np.array(u))
         assert function(np.array([u[i]])).tobytes() == among[i : i + 1].tobytes()
         square = function(np.tile(np.array(u), (3, 1)))
@@ -128,3 +145,14 @@ def test_cholesky_refuses_what_is_not_positive_definite(M: list[list[float]]) ->
     """Indefinite, singular and undefined matrices are errors, not NaN."""
     with pytest.raises(ValueError, match="not positive definite"):
         cholesky(np.array(M))
+
+
+@settings(deadline=None)
+@given(st.integers(1, 4), st.integers(0, 2**31))
+def test_inverse_is_the_inverse(n: int, seed: int) -> None:
+    """It is LAPACK's to the condition of the matrix, zero pivots on the way included; singular matrices are refused."""
+    M = np.random.default_rng(seed).integers(-2, 3, (n, n)).astype(float)
+    if abs(np.linalg.det(M)) > 0.5:
+        assert np.allclose(inverse(M), np.linalg.inv(M), rtol=1e-12, atol=1e-12)
+    with pytest.raises(ValueError, match="singular"):
+        inverse(np.zeros((n, n)))

@@ -10,13 +10,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.links import LOSS_MODELS, link_of
+from emulator.model.link import link_of
+from emulator.model.links import LOSS_MODELS
 from emulator.model.links.link import Fate, losses
 from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(8), "link/eve")
 SPECS: dict[str, dict[str, Any]] = {
     "bernoulli": {"model": "bernoulli", "quality": 0.7},
+    "distance": {
+        "model": "distance",
+        "sender": [0, 0],
+        "receiver": [[0, 90.0, 5.0], [40, 10.0, 90.0]],
+        "reference_snr": 70.0,
+        "exponent": 3.0,
+        "threshold": 8.0,
+        "shadowing": 6.0,
+        "shadowing_block": 7,
+        "fading_block": 3,
+    },
     "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.05, "bad": 0.8},
     "markov": {
         "model": "markov",
@@ -24,6 +36,7 @@ SPECS: dict[str, dict[str, Any]] = {
         "loss": [0.01, 0.4, 1.0],
     },
     "pattern": {"model": "pattern", "outcomes": "1101001"},
+    "trace": {"model": "trace", "outcomes": "110100111", "random_start": True},
 }
 
 
@@ -39,23 +52,23 @@ def test_fates_do_not_depend_on_blocks_or_batch(
     model: str, data: st.DataObject, slots: int, trials: int, first: int
 ) -> None:
     """Asked for in blocks of any length, for one trial or for many, a packet has the same fate."""
-    whole = link_of(SPECS[model], KEY, Batch(slots, trials, first)).fates(range(slots))
+    whole = link_of(SPECS[model], KEY, Batch(slots, trials, first)).fates(range(slots)).codes
     assert whole.shape == (slots, trials)
     link, start, parts = link_of(SPECS[model], KEY, Batch(slots, trials, first)), 0, []
     while start < slots:
         stop = data.draw(st.integers(start + 1, slots))
-        parts.append(link.fates(range(start, stop)).copy())
+        parts.append(link.fates(range(start, stop)).codes.copy())
         start = stop
     assert np.array_equal(np.concatenate(parts), whole)
     r = data.draw(st.integers(0, trials - 1))
-    alone = link_of(SPECS[model], KEY, Batch(slots, 1, first + r)).fates(range(slots))
+    alone = link_of(SPECS[model], KEY, Batch(slots, 1, first + r)).fates(range(slots)).codes
     assert np.array_equal(alone[:, 0], whole[:, r])
 
 
 @pytest.mark.parametrize("quality", [0.0, 0.05, 0.7, 1.0])
 def test_bernoulli_is_the_papers(quality: float) -> None:
     """γ = 1 exactly where the stream's uniform is below the quality, which comes to the quality, at 1e-6 confidence."""
-    fates = link_of({"model": "bernoulli", "quality": quality}, KEY, Batch(100, 1000, 7)).fates(range(100))
+    fates = link_of({"model": "bernoulli", "quality": quality}, KEY, Batch(100, 1000, 7)).fates(range(100)).codes
     drawn = uniforms(Stream(KEY, range(7, 1007), 1).words(range(100)))[:, :, 0]
     assert np.array_equal(fates == Fate.DELIVERED, drawn < quality)
     assert set(np.unique(fates)) <= {Fate.DELIVERED, Fate.LOST}
@@ -67,7 +80,9 @@ def test_bernoulli_is_the_papers(quality: float) -> None:
 def test_links_are_independent() -> None:
     """Fates on two links, and of neighbouring slots and trials of one, are uncorrelated, at 1e-6 confidence."""
     other = stream_key(root_of_seed(8), "link/legitimate")
-    a, b = (link_of(SPECS["bernoulli"], key, Batch(300, 500)).fates(range(300)) == Fate.LOST for key in (KEY, other))
+    a, b = (
+        link_of(SPECS["bernoulli"], key, Batch(300, 500)).fates(range(300)).codes == Fate.LOST for key in (KEY, other)
+    )
     for left, right in ((a, b), (a[1:], a[:-1]), (a[:, 1:], a[:, :-1])):
         assert abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 4.9 / np.sqrt(left.size)
 
@@ -76,8 +91,8 @@ def test_links_are_independent() -> None:
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 2**31))
 def test_losses_account_for_every_packet(slots: int, trials: int, seed: int) -> None:
     """Delivered and the losses of all reasons add up to what was offered, slot by slot."""
-    fates = np.random.default_rng(seed).integers(0, len(Fate), (slots, trials), np.uint8)
+    fates = np.random.default_rng(seed).integers(0, int(Fate.UNSENT), (slots, trials), np.uint8)
     counted = losses(fates)
-    assert set(counted) == {fate.name.lower() for fate in Fate} - {"delivered"}
+    assert set(counted) == {fate.name.lower() for fate in Fate} - {"delivered", "unsent"}
     assert np.array_equal((fates == Fate.DELIVERED).sum(axis=1) + sum(counted.values()), np.full(slots, trials))
     assert all(counts.dtype == np.uint32 for counts in counted.values())

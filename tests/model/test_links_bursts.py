@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.links import LOSS_MODELS, link_of, loss_of
+from emulator.model.link import link_of
+from emulator.model.links import LOSS_MODELS, loss_of
 from emulator.model.links.link import Fate
 from emulator.model.links.markov import stationary
 from emulator.model.process import Floats
@@ -50,11 +51,12 @@ def two_states(spec: dict[str, Any], u: Floats) -> list[int]:
 
 
 def any_chain(spec: dict[str, Any], u: Floats) -> list[int]:
-    """A Markov chain's losses in one trial, slot by slot: 1 where lost."""
+    """A Markov chain's losses in one trial, slot by slot: 1 where lost; what rounding leaves over is the last state's."""
     row, fates = stationary(np.array(spec["transitions"], float)).tolist(), []
     for first, second in u.tolist():
         state, bound = 0, row[0]
-        while first >= bound and state < len(row) - 1:
+        last = max(i for i, chance in enumerate(row) if chance > 0.0)
+        while first >= bound and state < last:
             state += 1
             bound += row[state]
         fates.append(int(second < spec["loss"][state]))
@@ -111,11 +113,11 @@ def test_fates_are_those_of_the_slot_by_slot_reference(
     link, start, parts = link_of(spec, KEY, Batch(slots, trials, first)), 0, []
     while start < slots:
         stop = data.draw(st.integers(start + 1, slots))
-        parts.append(link.fates(range(start, stop)).copy())
+        parts.append(link.fates(range(start, stop)).codes.copy())
         start = stop
     assert np.array_equal(np.concatenate(parts), expected)
     r = data.draw(st.integers(0, trials - 1))
-    alone = link_of(spec, KEY, Batch(slots, 1, first + r)).fates(range(slots))
+    alone = link_of(spec, KEY, Batch(slots, 1, first + r)).fates(range(slots)).codes
     assert np.array_equal(alone[:, 0], expected[:, r])
 
 
@@ -127,7 +129,7 @@ def test_marginal_loss_of_a_million_packets(spec: dict[str, Any]) -> None:
     chain's transitions, computed here by powers.
     """
     slots, trials = 1000, 1000
-    lost = float((link_of(spec, KEY, Batch(slots, trials)).fates(range(slots)) == Fate.LOST).mean())
+    lost = float((link_of(spec, KEY, Batch(slots, trials)).fates(range(slots)).codes == Fate.LOST).mean())
     loss, chain = 1.0 - loss_of(spec).quality, loss_of(spec).chain
     if chain is None:
         assert lost == pytest.approx(sum(by_rote(spec, np.empty(slots))) / slots, abs=1e-12)
@@ -141,6 +143,29 @@ def test_marginal_loss_of_a_million_packets(spec: dict[str, Any]) -> None:
     assert abs(lost - loss) < 4.9 * np.sqrt(loss * (1.0 - loss) / effective)
 
 
+@pytest.mark.parametrize("zeros", [0, 1, 3])
+def test_rounding_leads_to_no_state_that_cannot_be(zeros: int) -> None:
+    """Ten tenths add up to less than 1: the largest uniform number still leads to the tenth state, not to one behind it."""
+    row = [0.1] * 10 + [0.0] * zeros
+    assert sum(row[1:], row[0]) < 1.0 - 2.0**-54
+    chain = loss_of({"model": "markov", "transitions": [row] * len(row), "loss": [0.0] * 9 + [0.5] + [1.0] * zeros})
+    u = np.full((3, 2, 1), 1.0 - 2.0**-53)
+    u[:, 1] = 0.5
+    assert (
+        chain.fates(0, u) == Fate.DELIVERED
+    ).all()  # 0.5 is not below the tenth state's loss, and is below the others'
+
+
+def test_a_chain_of_many_states_is_searched_as_one_of_few() -> None:
+    """With more bounds than are compared one by one, fates are those of the slot-by-slot reference."""
+    weights = [[1 + (i * j) % 5 for j in range(30)] for i in range(30)]
+    rows = [[weight / sum(row) for weight in row] for row in weights]
+    spec = {"model": "markov", "transitions": rows, "loss": [i / 29 for i in range(30)]}
+    u = drawn(200, range(6), 2)
+    expected = np.array([any_chain(spec, u[:, r]) for r in range(6)]).T
+    assert np.array_equal(link_of(spec, KEY, Batch(200, 6)).fates(range(200)).codes, expected)
+
+
 def run_lengths(lost: np.ndarray[Any, Any]) -> list[int]:
     """Lengths of the bursts that begin and end within a trial."""
     edges = np.flatnonzero(np.diff(lost.astype(int)))
@@ -152,7 +177,7 @@ def run_lengths(lost: np.ndarray[Any, Any]) -> list[int]:
 def test_gilbert_elliott_bursts_are_geometric() -> None:
     """With good = 0 and bad = 1 a burst has length l with probability r(1−r)^(l−1): chi-square, at 1e-6 confidence."""
     r = BURSTS["r"]
-    lost = link_of(BURSTS, KEY, Batch(200_000, 5)).fates(range(200_000)) == Fate.LOST
+    lost = link_of(BURSTS, KEY, Batch(200_000, 5)).fates(range(200_000)).codes == Fate.LOST
     lengths = np.array([length for trial in lost.T for length in run_lengths(trial)])
     assert len(lengths) > 10_000
     last = 20
@@ -165,7 +190,7 @@ def test_gilbert_elliott_bursts_are_geometric() -> None:
 def test_slot_zero_has_the_stationary_law() -> None:
     """The first packet is lost as often as any other, at 1e-6 confidence."""
     for spec in (BURSTS, SOFT, FOUR_STATES):
-        fates = link_of(spec, KEY, Batch(1, 100_000)).fates(range(1))
+        fates = link_of(spec, KEY, Batch(1, 100_000)).fates(range(1)).codes
         assert stats.binomtest(int(fates.sum()), fates.size, 1.0 - loss_of(spec).quality).pvalue > 1e-6
 
 

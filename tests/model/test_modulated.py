@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulator.model.link_law import LinkLaw
 from emulator.model.links import loss_of
 from emulator.model.links.link import Chain
 from emulator.model.modulated import ModulatedCovariance, limit_trace, tail_outcomes
@@ -67,7 +68,7 @@ def test_a_link_whose_states_are_alike_is_the_papers(
     expected = expected_traces(process, outcomes_at(0.7), 60)
     for chain in (Chain(np.ones((1, 1)), np.ones(1), np.array([0.7])), bursts(0.1, 0.3, 0.3, 0.3)):
         np.testing.assert_allclose(
-            ModulatedCovariance(process, chain, outcomes_at).next_traces(60), expected, rtol=1e-12
+            ModulatedCovariance(process, LinkLaw.steady(chain), outcomes_at).next_traces(60), expected, rtol=1e-12
         )
         assert limit_trace(process, chain, outcomes_at) == pytest.approx(
             independent_limit(process, outcomes_at(0.7)), rel=1e-9
@@ -81,8 +82,8 @@ def test_a_link_whose_states_are_alike_is_the_papers(
 def test_slots_may_be_asked_for_in_any_pieces(good: float, bad: float, p: float, first: int) -> None:
     """The same numbers, whatever the pieces."""
     chain = bursts(p, 0.3, good, bad)
-    whole = ModulatedCovariance(MARGINAL, chain, RECEIVERS["suspicious"]).next_traces(50)
-    stream = ModulatedCovariance(MARGINAL, chain, RECEIVERS["suspicious"])
+    whole = ModulatedCovariance(MARGINAL, LinkLaw.steady(chain), RECEIVERS["suspicious"]).next_traces(50)
+    stream = ModulatedCovariance(MARGINAL, LinkLaw.steady(chain), RECEIVERS["suspicious"])
     assert np.array_equal(np.concatenate([stream.next_traces(first), stream.next_traces(50 - first)]), whole)
 
 
@@ -120,7 +121,7 @@ def test_the_recursion_is_the_sum_over_all_words(use: tuple[float, float] | None
     """Every word of link states and packets, weighed and added up by hand, gives the recursion's last value."""
     chain = bursts(0.2, 0.4, 0.1, 0.9)
     outcomes_at = legitimate if use is None else eavesdropper(*use)
-    found = ModulatedCovariance(UNSTABLE, chain, outcomes_at).next_traces(slots)
+    found = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), outcomes_at).next_traces(slots)
     assert found[-1] == pytest.approx(enumerated(UNSTABLE, chain, use, slots)[-1], rel=1e-12)
 
 
@@ -142,7 +143,7 @@ def test_the_limit_is_that_of_the_recursion(
 ) -> None:
     """A finite limit is what the recursion comes to; where it is inf, the recursion grows on and on."""
     limit = limit_trace(process, chain, outcomes_at)
-    traces = ModulatedCovariance(process, chain, outcomes_at).next_traces(6000)
+    traces = ModulatedCovariance(process, LinkLaw.steady(chain), outcomes_at).next_traces(6000)
     if math.isfinite(limit):
         assert traces[-1] == pytest.approx(limit, rel=1e-6)
     else:
@@ -155,7 +156,7 @@ def test_bursts_that_last_too_long_have_no_limit(r: float) -> None:
     chain, rho = bursts(0.05, r), UNSTABLE.spectral_radius
     bounded = (1.0 - r) * rho**2 < 1.0
     assert math.isfinite(limit_trace(UNSTABLE, chain, Outcomes.plain)) is bounded
-    traces = ModulatedCovariance(UNSTABLE, chain, Outcomes.plain).next_traces(4000)
+    traces = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), Outcomes.plain).next_traces(4000)
     assert bool(traces[-1] < 1.001 * traces[2000]) is bounded
 
 
@@ -167,16 +168,16 @@ def test_a_perfect_link_has_no_error() -> None:
         return Outcomes.legitimate(quality, 0.1)
 
     assert limit_trace(UNSTABLE, chain, rarely) == 0.0
-    assert not ModulatedCovariance(UNSTABLE, chain, rarely).next_traces(100).any()
+    assert not ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), rarely).next_traces(100).any()
     assert math.isinf(tail_index(UNSTABLE, tail_outcomes(chain, rarely)))
 
 
 def test_a_bounded_expectation_stays_so_beyond_double_precision() -> None:
     """The state's covariance leaves double precision after some thousand slots; a smart eavesdropper's does not."""
     chain = bursts(0.05, 0.7)
-    traces = ModulatedCovariance(UNSTABLE, chain, eavesdropper(1.0, 0.0)).next_traces(3000)
+    traces = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), eavesdropper(1.0, 0.0)).next_traces(3000)
     assert traces[-1] == pytest.approx(limit_trace(UNSTABLE, chain, eavesdropper(1.0, 0.0)), rel=1e-9)
-    misled = ModulatedCovariance(UNSTABLE, chain, eavesdropper(1.0, 1.0)).next_traces(3000)
+    misled = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), eavesdropper(1.0, 1.0)).next_traces(3000)
     beyond = int(np.flatnonzero(np.isinf(misled))[0])
     assert np.isfinite(misled[:beyond]).all()
     assert np.isinf(misled[beyond:]).all()

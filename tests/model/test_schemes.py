@@ -12,12 +12,14 @@ from scipy import stats
 
 from emulator.model.process import Process, Trajectory
 from emulator.model.receiver import Action, Belief, Heard
-from emulator.model.schemes import SCHEMES
+from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.model.schemes.scheme import Scheme
 from emulator.model.theory import state_covariances
 from emulator.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(4)
-KEYS = {name: stream_key(ROOT, name) for name in ("process", "schedule", "noise")}
+STREAMS = {stream for scheme in SCHEMES.values() for stream in scheme.secret_streams}
+KEYS = {name: stream_key(ROOT, name) for name in ("process", *sorted(STREAMS))}
 STABLE = Process(
     np.array([[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]]),
     np.array([[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]]),
@@ -27,10 +29,17 @@ UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.ey
 MU_D = 0.4
 
 
+def made(name: str, process: Process) -> Scheme:
+    """A scheme with its example parameters, but with μ_d as here."""
+    parameters = SCHEMES[name].parameters
+    given = {"state_probability": MU_D} if "state_probability" in parameters else {}
+    return scheme_of(process, {"scheme": name, **parameters, **given})
+
+
 def packets(scheme: str, process: Process, batch: Batch) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """X (n, R), z (n, R) and ν (R,) of every slot."""
     trajectory = Trajectory(process, KEYS["process"], batch)
-    encoder = SCHEMES[scheme](process, MU_D).encoder(KEYS, batch)
+    encoder = made(scheme, process).encoder(KEYS, batch)
     for k in range(batch.slots):
         x = trajectory.advance()
         z, nu, *_ = encoder.encode(k, x, trajectory.predicted)
@@ -39,7 +48,7 @@ def packets(scheme: str, process: Process, batch: Batch) -> Iterator[tuple[np.nd
 
 def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> list[Belief]:
     """What the legitimate estimator believes after every slot, given γ (slots, R)."""
-    estimator = SCHEMES[scheme](process, MU_D).estimator(KEYS, batch)
+    estimator = made(scheme, process).estimator(KEYS, batch)
     belief, found = estimator.prior(), []
     for k, (_, z, _) in enumerate(packets(scheme, process, batch)):
         belief = estimator.step(k, belief, Heard(gamma[k], z))
@@ -123,25 +132,6 @@ def test_plain_scheme_is_the_textbooks() -> None:
         assert np.array_equal(found[k].action, np.where(gamma[k], Action.STATE, Action.LOST))
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("process", [STABLE, UNSTABLE])
-def test_a_trial_alone_is_the_same_trial(scheme: str, process: Process) -> None:
-    """Packets and beliefs of a trial are the same bits alone, among 5 and among 300."""
-    gamma = np.random.default_rng(2).random((50, 300)) < 0.7
-    among = list(packets(scheme, process, Batch(50, 300, 100)))
-    believed = beliefs(scheme, process, Batch(50, 300, 100), gamma)
-    for first, count in ((137, 1), (200, 5)):
-        part = slice(first - 100, first - 100 + count)
-        batch = Batch(50, count, first)
-        for (_, z, nu), (_, z_among, nu_among) in zip(packets(scheme, process, batch), among, strict=True):
-            assert z.tobytes() == z_among[:, part].tobytes()
-            assert np.array_equal(nu, nu_among[part])
-        for one, other in zip(beliefs(scheme, process, batch, gamma[:, part].copy()), believed, strict=True):
-            assert one.x_hat.tobytes() == other.x_hat[:, part].tobytes()
-            assert one.P.tobytes() == other.P[:, :, part].tobytes()
-            assert np.array_equal(one.action, other.action[part])
-
-
 def test_a_lost_packet_desynchronises_nothing() -> None:
     """After any losses the next state packet makes the estimate exact, and decoded innovations keep it exact."""
     slots = 80
@@ -206,19 +196,8 @@ def test_schedule_has_its_probability() -> None:
 @pytest.mark.parametrize("mu_d", [0.0, 1.0])
 def test_certain_schedules(mu_d: float) -> None:
     """μ_d = 1 sends states only; μ_d = 0 innovations only, from slot 1 on."""
-    encoder = SCHEMES["innovation"](STABLE, mu_d).encoder(KEYS, Batch(30, 20))
+    encoder = scheme_of(STABLE, {"scheme": "innovation", "state_probability": mu_d}).encoder(KEYS, Batch(30, 20))
     trajectory = Trajectory(STABLE, KEYS["process"], Batch(30, 20))
     for k in range(30):
         x = trajectory.advance()
         assert encoder.encode(k, x, trajectory.predicted).nu.all() == (mu_d == 0.0 and k > 0)
-
-
-def test_streams_that_a_scheme_names_are_those_it_needs() -> None:
-    """Without one of its keys a scheme cannot be built; with exactly them it can."""
-    for scheme in SCHEMES.values():
-        keys = {stream: KEYS[stream] for stream in scheme.secret_streams}
-        scheme(STABLE, MU_D).estimator(keys, Batch(2, 1))
-        for stream in scheme.secret_streams:
-            fewer = {other: key for other, key in keys.items() if other != stream}
-            with pytest.raises(KeyError, match=stream):
-                scheme(STABLE, MU_D).estimator(fewer, Batch(2, 1))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from emulator.model.process import Floats, Process
 from emulator.model.theory import (
+    NOBODY,
     ExpectedCovariance,
     Outcomes,
     expected_covariances,
@@ -304,7 +305,6 @@ def test_variance_is_infinite_below_the_square_of_the_bound() -> None:
     assert not has_infinite_variance(EXAMPLE, Outcomes.legitimate(0.9, 0.8117))
     smart = Outcomes.eavesdropper(0.5, 0.9, 1, 0)
     assert tail_index(EXAMPLE, smart) == pytest.approx(-math.log(0.55) / (2 * math.log(EXAMPLE.spectral_radius)))
-    assert tail_index(EXAMPLE, Outcomes.legitimate(0.9, 0.0)) == 0.0
     for outcomes in (
         Outcomes.legitimate(1.0, 0.6), Outcomes.plain(1.0), Outcomes.eavesdropper(0.9, 0.6, 1, 1),
     ):  # fmt: skip
@@ -349,3 +349,12 @@ def test_importing_theory_and_design_does_not_import_scipy() -> None:
     """Both are on start-up paths: scipy waits until a function needs it."""
     code = "import sys, emulator.model.design, emulator.model.theory; sys.exit('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_who_never_uses_a_state_has_no_heavy_tail() -> None:
+    """p_r = 0: deaf, or never told a state, it grows alike in every trial; the largest trace is a few times the mean."""
+    for outcomes in (NOBODY, Outcomes.eavesdropper(0.0, 0.6, 1.0, 0.0), Outcomes.eavesdropper(0.9, 0.6, 0.0, 0.0),
+                     Outcomes.legitimate(0.6, 0.0)):  # fmt: skip
+        assert math.isinf(tail_index(EXAMPLE, outcomes))
+        assert not has_infinite_variance(EXAMPLE, outcomes)
+        assert expected_traces(EXAMPLE, NOBODY, 200)[-1] < 10.0 * expected_traces(EXAMPLE, outcomes, 200)[-1]

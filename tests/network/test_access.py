@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from bench import Bench, Ear, bench_of, connect, scenario_of, until
+from bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
 
 from emulator.network import wire
 from emulator.network.access import Grant, access_control, grants
@@ -42,11 +42,12 @@ def flow(stage: Bench) -> None:
     stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
     for name, ear in stage.downlinks.items():
         key, payload = ear.hear()
-        gamma, z = wire.read_delivery(key, payload, k, SHAPE)
+        (gamma, z, *_), late = wire.read_delivery(wire.Reader(key, payload), k, SHAPE)
         assert np.array_equal(z, np.where(gamma, stage.packet(k), 0.0)), name
+        assert late == (), name
     if stage.due % BATCH == 0:
-        key, payload = stage.journal.hear()
-        journal = wire.read_journal(key, payload, stage.due - BATCH, stage.scenario.receivers, 5)
+        windows = dict.fromkeys(stage.scenario.receivers, 0)
+        journal = wire.read_journal(wire.Reader(*stage.journal.hear()), stage.due - BATCH, windows, 5)
         assert journal.count == BATCH
 
 
@@ -150,7 +151,8 @@ def test_wildcard_alone_hears_nothing(key: str, stage: Bench) -> None:
         control.declare_subscriber(stage.keys.downlink(EVE), own)
         for session in (attacker, control):
             assert_heard(stage, session)
-        ear.all()  # what the attacker itself has just put
+        # A session hears itself: what it has just put.
+        assert {ear.hear()[0] for _ in range(2)} == {stage.keys.progress(EVE), stage.keys.telemetry(EVE)}
         talk(stage)
         own.hear()
         assert ear.all() == []
@@ -295,7 +297,7 @@ from emulator.network import session
 session.CONNECT_SECONDS = 1.0
 from emulator.cli import main
 raise SystemExit(main(["eavesdropper", {str(path)!r}]))"""],
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30, check=False,
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=LIMIT_SECONDS, check=False,
     )  # fmt: skip
     assert ended.returncode == 2
     assert "no session with the router at tcp/127.0.0.1:" in ended.stderr

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from bench import Ear, connect, until
+from bench import LIMIT_SECONDS, Ear, connect, until
 
 from emulator import montecarlo
 from emulator.brief import Brief, read_brief
@@ -65,6 +65,7 @@ raise SystemExit(main(sys.argv[2:]))
 """  # a run as it is, and a copy of every brief it writes
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
 EVERYBODY = (*PROCESSES, "router", "observer")
+TOKEN = "only-the-launcher-has-this"  # noqa: S105 - an example
 ENOUGH = 20  # messages on each of the keys that are meant to be heard
 
 
@@ -155,7 +156,7 @@ def attack(folder: Path) -> Evidence:
     scenario = load(path)
     options = ["run", str(path), "--view", "off", "--out", str(out)]
     command = [sys.executable, "-c", KEEPING_BRIEFS, str(kept), *options]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTEST")}
+    environment = {**os.environ, "ACCESS_TOKEN": TOKEN}
     with ExitStack() as stack:
         run = stack.enter_context(
             subprocess.Popen(
@@ -177,7 +178,7 @@ def attack(folder: Path) -> Evidence:
         counts = {key: Ear() for key in meant}
         for key, name in meant.items():
             stack.enter_context(connect(briefs[name])).declare_subscriber(key, counts[key])
-        until(lambda: all(not ear.messages.empty() for ear in counts.values()), "the run to flow", 30)
+        until(lambda: all(not ear.messages.empty() for ear in counts.values()), "the run to flow")
         refused = []
         for name, user, password in (("none", "", ""), ("wrong password", "eve", "guess"), ("no user", "trudy", "x")):
             auth = {"auth": {"usrpwd": {"user": user, "password": password}}} if user else {}
@@ -204,7 +205,7 @@ def attack(folder: Path) -> Evidence:
             for name, pid in found.items()
         }
         run.send_signal(signal.SIGTERM)
-        output, _ = run.communicate(timeout=30)
+        output, _ = run.communicate(timeout=LIMIT_SECONDS)
     for name, trace in traces.items():
         trace["log"] = (out / "logs" / f"{name}.log").read_bytes()
     return Evidence(scenario, out, briefs, traces, overheard, heard, refused, run.returncode, output)
@@ -254,7 +255,7 @@ def secrets_of(scenario: Scenario) -> dict[str, bytes]:
     """Every piece of key material of a scenario, by name."""
     keys = StreamKeys.of(scenario)
     found = {"seed's root": keys.seed_root, "secret's root": keys.secret_root, "process": keys.process}
-    found |= {f"link/{name}": keys.link(name) for name in scenario.receivers}
+    found |= keys.links({name: scenario.course(name) for name in scenario.receivers})
     found |= {f"coin/{name}": stream_key(keys.seed_root, f"coin/{name}") for name in scenario.eavesdroppers}
     return found | keys.secret(("schedule", "noise"))
 
@@ -262,7 +263,7 @@ def secrets_of(scenario: Scenario) -> dict[str, bytes]:
 MAY_KNOW = {
     "sensor": {"process", "schedule", "noise"},
     "legitimate": {"schedule", "noise"},
-    "router": {"link/legitimate", "link/eve", "link/mallory", "link/nadia"},
+    "router": {f"{what}/{name}" for what in ("link", "delay", "fate") for name in PROCESSES[1:]},
     "eve": {"schedule"},
     "mallory": {"schedule", "coin/mallory"},
     "nadia": set(),
@@ -294,11 +295,24 @@ def test_a_process_is_told_neither_seed_nor_others_passwords(name: str, evidence
     assert known == (set(others) if name == "router" else set())
 
 
+@pytest.mark.parametrize("name", EVERYBODY)
+def test_a_process_is_given_nothing_else_of_the_launchers_environment(name: str, evidence: Evidence) -> None:
+    """A token that the launcher has in its environment reaches nobody; where programs and libraries are does."""
+    traces = evidence.left_behind[name]
+    assert TOKEN.encode() not in b"\n".join(traces.values())
+    given = {entry.partition(b"=")[0] for entry in traces["environment"].split(b"\0") if entry}
+    assert b"PATH" in given
+    named = {b"PATH", b"HOME", b"LANG", b"LANGUAGE", b"TZ", b"TMPDIR", b"VIRTUAL_ENV", b"LD_LIBRARY_PATH"}
+    kinds = (b"LC_", b"PYTHON", b"ZENOH", b"RUST_", b"OMP_", b"OPENBLAS_")
+    assert {entry for entry in given - named if not entry.startswith(kinds)} == set()
+
+
 @pytest.mark.parametrize("name", ["eve", "mallory", "nadia"])
 def test_an_eavesdropper_is_told_no_truth(name: str, evidence: Evidence) -> None:
     """No state, schedule or scenario is in its brief; what it wrote is empty; other receivers are not even named."""
     brief = evidence.briefs[name]
-    assert set(brief.part) == {"strategy", "parameters"}
+    assert set(brief.part) == {"strategy", "parameters", "window", "outages"}
+    assert brief.part["outages"] == []
     assert evidence.left_behind[name]["log"] == b""
     for other in {"legitimate", "eve", "mallory", "nadia"} - {name}:
         assert other.encode() not in evidence.left_behind[name]["brief"]

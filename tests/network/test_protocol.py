@@ -13,10 +13,12 @@ import pytest
 
 from emulator.brief import read_brief
 from emulator.errors import MalformedMessage
+from emulator.model.account import COUNTED_BURSTS, Account
 from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.elementary import normal_quantile
-from emulator.model.receiver import Belief
-from emulator.network import wire
+from emulator.model.receiver import Belief, Heard
+from emulator.model.transit import Late
+from emulator.network import operator, wire
 from emulator.network.access import Keys, grants
 from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
@@ -37,17 +39,31 @@ def flags(rows: Any) -> np.ndarray:
     return np.array(rows, np.bool_)
 
 
+def heard_of(shape: dict[str, Any], gamma: Any, z: Any) -> Heard:
+    """What a receiver gets: payloads of the trials that receive one, 0 in the others."""
+    full = np.zeros((shape["n"], shape["trials"]))
+    full[:, flags(gamma)] = np.array(z, float).reshape(shape["n"], -1)
+    return Heard(flags(gamma), full)
+
+
+def packets_of(heard: Heard) -> dict[str, Any]:
+    """The same as values: z of the trials that received, and nothing in the others."""
+    assert not heard.z[:, ~heard.gamma].any()
+    return {"gamma": heard.gamma.astype(int).tolist(), "z": heard.z[:, heard.gamma].tolist()}
+
+
 def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
     mask = wire.packed_flags(flags(value["gamma"])).tobytes()
-    return wire.delivery(value["k"], mask, np.array(value["z"], float).tobytes())
+    late = tuple(Late(one["k"], heard_of(shape, one["gamma"], one["z"])) for one in value.get("late", ()))
+    return wire.delivery(value["k"], mask, np.array(value["z"], float).tobytes(), late)
 
 
 def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As a receiver reads it: z is (n, R), with 0 for the lost."""
-    gamma, z = wire.read_delivery(KEY, raw, value["k"], (shape["n"], shape["trials"]))
-    assert not z[:, ~gamma].any()
-    return {"k": value["k"], "gamma": gamma.astype(int).tolist(), "z": z[:, gamma].tolist()}
+    """As a receiver reads it."""
+    arrival = wire.read_delivery(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
+    late = [{"k": one.k, **packets_of(one.heard)} for one in arrival.late]
+    return {"k": value["k"], **packets_of(arrival.heard), **({"late": late} if late else {})}
 
 
 def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
@@ -58,15 +74,17 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     }
     columns = (np.array(value[name], float) for name in ("P", "trace"))
     x_hat, action = np.array(value["x_hat"], float), np.array(value["action"], np.uint8)
-    return wire.Report(value["k"], x_hat, action, *columns, digests).pack()
+    late = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
+    return wire.Report(value["k"], x_hat, action, *columns, next(late), digests, next(late)).pack()
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    report = wire.read_report(KEY, raw, value["k"], (shape["n"], shape["trials"]), shape["recorded"])
+    report = wire.read_report(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), shape["recorded"])
     columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in report.digests.items()}
-    return {"k": report.first, "c": report.count, **columns, "digests": digests}
+    late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(report, name)) is not None}
+    return {"k": report.first, "c": report.count, **columns, **late, "digests": digests}
 
 
 def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
@@ -76,37 +94,119 @@ def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    truth = wire.read_truth(KEY, raw, value["k"], (shape["n"], shape["trials"]))
+    truth = wire.read_truth(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
     return {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
 
 
 def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
-    delivered = {name: flags(link["delivered"]) for name, link in value["links"].items()}
-    lost = {
-        name: {reason: np.array(counts, np.uint32) for reason, counts in link["lost"].items()}
-        for name, link in value["links"].items()
-    }
-    return wire.Journal(value["k"], value["c"], delivered, lost).pack()
+    accounts = {}
+    for name, link in value["links"].items():
+        lost = {reason: np.array(counts, np.uint32) for reason, counts in link["lost"].items()}
+        late = np.array(link["late"], np.uint16) if "late" in link else None
+        bursts = np.zeros(COUNTED_BURSTS, np.uint32)
+        bursts[: len(link["bursts"])] = link["bursts"]
+        delays = np.array(link["delays"], np.uint32)
+        accounts[name] = Account(flags(link["delivered"]), lost, late, bursts, delays)
+    return wire.Journal(value["k"], value["c"], accounts).pack()
 
 
 def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    journal = wire.read_journal(KEY, raw, value["k"], tuple(shape["receivers"]), shape["trials"])
+    journal = wire.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], shape["trials"])
     links = {
         name: {
-            "delivered": journal.delivered[name].astype(int).tolist(),
-            "lost": {reason: counts.tolist() for reason, counts in journal.lost[name].items()},
+            "delivered": link.delivered.astype(int).tolist(),
+            "lost": {reason: counts.tolist() for reason, counts in link.lost.items()},
+            **({} if link.late is None else {"late": link.late.tolist()}),
+            "bursts": np.trim_zeros(link.bursts, "b").tolist(),
+            "delays": link.delays.tolist(),
         }
-        for name in shape["receivers"]
+        for name, link in journal.links.items()
     }
     return {"k": journal.first, "c": journal.count, "links": links}
 
 
+def encode_leaving(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As a receiver makes it."""
+    belief = Belief(np.array(value["x_hat"]), np.array(value["P"]), np.zeros(shape["trials"], np.uint8))
+    return wire.leaving(value["k"], belief)
+
+
+def decode_leaving(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    message = wire.Reader(KEY, raw)
+    assert wire.is_leaving(message)
+    k, belief = wire.read_leaving(message, (shape["n"], shape["trials"]))
+    return {"k": k, "x_hat": belief.x_hat.tolist(), "P": belief.P.tolist()}
+
+
+def decode_mark(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As router and receivers read it."""
+    message = wire.Reader(KEY, raw)
+    assert wire.is_hold(message)
+    return {"k": message.slot(value["k"]), "hold": message.flag("hold")}
+
+
+def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    message = wire.Reader(KEY, raw)
+    assert wire.is_held(message)
+    return {"k": message.slot(value["k"]), "held": message.flag("held")}
+
+
+def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As processes read it."""
+    message = wire.Reader(KEY, raw)
+    found: dict[str, Any] = {"do": message.text("do")}
+    if message.has("absent"):
+        found["absent"] = list(message.names("absent"))
+    if message.has("until"):
+        found["until"] = message.integer("until")
+    if message.has("changes"):
+        found |= {"link": message.text("link"), "changes": value["changes"]}
+        for one, change in zip(message.maps("changes"), value["changes"], strict=True):
+            assert one.integer("at") == change["at"]
+            assert "cut" not in change or one.flag("cut") == change["cut"]
+            assert "settings" not in change or one.map("settings") == change["settings"]
+    return found
+
+
 def decode_packet(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the router reads it."""
-    z = wire.read_uplink(KEY, raw, value["k"], (shape["n"], shape["trials"]))
+    z = wire.read_uplink(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
     return {"k": value["k"], "z": z.tolist()}
+
+
+def decode_acknowledgement(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the router and the sensor read it."""
+    gamma = wire.read_acknowledgement(wire.Reader(KEY, raw), value["k"], shape["trials"])
+    return {"k": value["k"], "gamma": gamma.astype(int).tolist()}
+
+
+def decode_request(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    request = operator.read_request(KEY, raw)
+    return {name: found for name in ("do", "event", "slots") if (found := getattr(request, name)) is not None}
+
+
+def encode_answer(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the observer makes it."""
+    refused = tuple(value.get("refused", ()))
+    return operator.Answer(value.get("k"), value.get("said", ""), refused, value.get("status")).pack()
+
+
+def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the operator reads it."""
+    answer = operator.read_answer(KEY, raw)
+    if answer.refused:
+        return {"refused": list(answer.refused)}
+    return {"k": answer.slot, "said": answer.said} if answer.status is None else {"status": answer.status}
+
+
+def rest_of(value: dict[str, Any]) -> dict[str, Any]:
+    """What goes with a command."""
+    return {name: inner for name, inner in value.items() if name != "do"}
 
 
 Encode = Callable[[dict[str, Any], dict[str, Any]], bytes]
@@ -114,14 +214,20 @@ Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
 CODECS: dict[str, tuple[Encode, Decode]] = {
     "packet": (lambda _shape, value: wire.uplink(value["k"], np.array(value["z"])), decode_packet),
     "delivery": (encode_delivery, decode_delivery),
+    "acknowledgement": (
+        lambda _shape, value: wire.acknowledgement(value["k"], flags(value["gamma"])),
+        decode_acknowledgement,
+    ),
     "progress": (
         lambda _shape, value: wire.progress(value["k"]),
         lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw)},
     ),
-    "control": (
-        lambda _shape, value: wire.control(value["do"]),
-        lambda _shape, _value, raw: {"do": wire.read_control(KEY, raw)},
-    ),
+    "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
+    "mark": (lambda _shape, value: wire.hold(value["k"]), decode_mark),
+    "held": (lambda _shape, value: wire.held(value["k"]), decode_held),
+    "leaving": (encode_leaving, decode_leaving),
+    "request": (lambda _shape, value: operator.Request(**value).pack(), decode_request),
+    "answer": (encode_answer, decode_answer),
     "truth": (encode_truth, decode_truth),
     "report": (encode_report, decode_report),
     "journal": (encode_journal, decode_journal),
@@ -221,9 +327,11 @@ def test_digest() -> None:
     log = BeliefLog(2, 2, 3)
     blocks = [log.add(k, Belief(x_hat[k], P[k], gamma[k])) for k in range(3)]
     assert blocks[:2] == [None, None]
-    assert [bytes(row).hex() for row in blocks[2]] == golden["blocks"]
+    first, digests = blocks[2]
+    assert first == 0
+    assert [bytes(row).hex() for row in digests] == golden["blocks"]
     whole = RunDigest()
-    whole.add({0: blocks[2]})
+    whole.add({first: digests})
     assert whole.hexadecimal == golden["receiver"]
 
 
@@ -233,8 +341,9 @@ def test_table_of_keys_is_the_access_table() -> None:
     prefix = f"evedrop/{'r'}/"
     documented: dict[tuple[str, str], set[str]] = {}
     everybody = {"sensor": ["sensor"], "router": ["router"], "observer": ["observer"], "receiver": list(receivers)}
+    everybody["legitimate"] = ["legitimate"]
     rows = re.findall(r"^\| (`[a-z]+(?:/.*?)?`.*?) \| (.*?) \| (.*?) \| (.*?) \|$", TEXT.split("## A run")[0], re.M)
-    assert len(rows) == 8
+    assert len(rows) == 10
     for paths, _, writers, readers in rows:
         for path in re.findall(r"`(.*?)`", paths):
             names = [*receivers, "sensor", "router", "observer"] if "<process>" in path else receivers
@@ -247,7 +356,7 @@ def test_table_of_keys_is_the_access_table() -> None:
     granted: dict[tuple[str, str], set[str]] = {}
     for grant in grants("r", receivers):
         for what, keys in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
-            for key in keys:
+            for key in filter(None, keys):
                 granted.setdefault((what, key), set()).add(grant.process)
     keys = Keys("r")
     no_row = {
@@ -256,3 +365,9 @@ def test_table_of_keys_is_the_access_table() -> None:
         ("reads", keys.alive("observer")),
     }
     assert {entry: users for entry, users in documented.items() if users and entry not in no_row} == granted
+    assert {grant.process: grant.asks for grant in grants("r", receivers) if grant.asks} == {
+        "operator": (keys.control("observer"),)
+    }
+    assert {grant.process: grant.answers for grant in grants("r", receivers) if grant.answers} == {
+        "observer": (keys.control("observer"),)
+    }

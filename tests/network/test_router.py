@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 import struct
+import time
 from collections.abc import Callable
 
 import msgpack
 import numpy as np
 import pytest
-from bench import Bench
+from bench import LIMIT_SECONDS, Bench
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from emulator.network import wire
@@ -34,18 +35,19 @@ def run_through(bench: Bench) -> tuple[dict[str, np.ndarray], dict[str, np.ndarr
         bench.put("sensor", keys.uplink, wire.uplink(k, bench.packet(k)))
     for name in scenario.receivers:
         for k in range(scenario.slots):
-            key, payload = bench.downlinks[name].hear()
-            gamma, z = wire.read_delivery(key, payload, k, shape)
+            (gamma, z, *_), late = wire.read_delivery(wire.Reader(*bench.downlinks[name].hear()), k, shape)
             assert np.array_equal(z, np.where(gamma, bench.packet(k), 0.0))
+            assert late == ()
             gammas[name][k] = gamma
     lost = {name: np.zeros(scenario.slots, int) for name in scenario.receivers}
     k = 0
     while k < scenario.slots:
-        journal = wire.read_journal(*bench.journal.hear(), k, scenario.receivers, scenario.trials)
+        windows = dict.fromkeys(scenario.receivers, 0)
+        journal = wire.read_journal(wire.Reader(*bench.journal.hear()), k, windows, scenario.trials)
         rows = slice(k, k + journal.count)
         for name in scenario.receivers:
-            assert np.array_equal(journal.delivered[name], gammas[name][rows])
-            lost[name][rows] = sum(journal.lost[name].values())
+            assert np.array_equal(journal.links[name].delivered, gammas[name][rows])
+            lost[name][rows] = sum(journal.links[name].lost.values())
         k += journal.count
     return gammas, lost
 
@@ -60,7 +62,7 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
     stage.put("observer", stage.keys.control("router"), wire.control("end"))
-    assert stage.router.wait(20) == 0
+    assert stage.router.wait(LIMIT_SECONDS) == 0
     assert stage.log.read_text() == ""
 
 
@@ -99,7 +101,7 @@ def test_bad_packet_ends_the_router(name: str, bench: Callable[..., Bench]) -> N
     stage = bench()
     for message in messages:
         stage.put("sensor", stage.keys.uplink, message)
-    assert stage.router.wait(20) == 3
+    assert stage.router.wait(LIMIT_SECONDS) == 3
     text = stage.log.read_text()
     assert re.search(line, text), text
     assert "Traceback" not in text
@@ -111,8 +113,21 @@ def test_nothing_of_a_bad_packet_is_delivered(bench: Callable[..., Bench]) -> No
     stage = bench()
     for message in (GOOD, GOOD):
         stage.put("sensor", stage.keys.uplink, message)
-    assert stage.router.wait(20) == 3
+    assert stage.router.wait(LIMIT_SECONDS) == 3
     assert stage.tokens.hear()[0].startswith("deleted")
     for ear in stage.downlinks.values():
         ear.hear()
         assert ear.all() == []
+
+
+def test_a_part_of_a_slot_is_waited_for_in_real_time(bench: Callable[..., Bench]) -> None:
+    """With half a slot of delay and a tenth of a second a slot, a delivery is 50 ms later than that of a link without."""
+    delayed = {"quality": 1.0, "delay": {"model": "constant", "value": 0.5}}
+    eve = {"strategy": "naive", "link": {"quality": 1.0}}
+    stage = bench(slots=3, pace=0.1, legitimate={"link": delayed}, eavesdroppers={"eve": eve})
+    for k in range(3):
+        began = time.monotonic()
+        stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+        stage.downlinks["eve"].hear()
+        stage.downlinks["legitimate"].hear()
+        assert time.monotonic() - began >= 0.05

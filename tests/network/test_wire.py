@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -12,7 +14,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from emulator.errors import EvedropError, Gap, MalformedMessage, RunError
+from emulator.model.account import COUNTED_BURSTS, Account
+from emulator.model.links.link import REASONS
+from emulator.model.receiver import Belief, Heard
+from emulator.model.transit import Late
 from emulator.network import wire
+from emulator.network.wire import Reader
 from emulator.runs.joined import Joiner
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -25,7 +32,7 @@ SIZES = st.integers(1, 19)
 def test_packet(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A packet reads back bit by bit, negative zeros and subnormal numbers included."""
     z = data.draw(arrays(float, (n, trials), elements=FINITE))
-    assert wire.read_uplink("u", wire.uplink(k, z), k, (n, trials)).tobytes() == z.tobytes()
+    assert wire.read_uplink(Reader("u", wire.uplink(k, z)), k, (n, trials)).tobytes() == z.tobytes()
 
 
 @settings(deadline=None)
@@ -35,10 +42,66 @@ def test_delivery(data: st.DataObject, k: int, n: int, trials: int) -> None:
     z = data.draw(arrays(float, (n, trials), elements=FINITE))
     gamma = data.draw(arrays(bool, trials))
     raw = wire.delivery(k, wire.packed_flags(gamma).tobytes(), z[:, gamma].tobytes())
-    found, heard = wire.read_delivery("d", raw, k, (n, trials))
-    assert np.array_equal(found, gamma)
-    assert heard.tobytes() == np.where(gamma, z, 0.0).tobytes()
+    heard, late = wire.read_delivery(Reader("d", raw), k, (n, trials))
+    assert np.array_equal(heard.gamma, gamma)
+    assert heard.z.tobytes() == np.where(gamma, z, 0.0).tobytes()
+    assert late == ()
     assert len(msgpack.unpackb(raw).get("z", b"")) == 8 * n * gamma.sum()
+
+
+@settings(deadline=None)
+@given(st.data(), SLOTS, st.integers(1, 3), SIZES, st.integers(0, 3))
+def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials: int, count: int) -> None:
+    """Late packets read back with their slots, in order, each with z of exactly the trials that it arrived in."""
+    late = tuple(
+        Late(
+            data.draw(st.integers(0, k)),
+            Heard(
+                data.draw(arrays(bool, trials).filter(np.any)),
+                data.draw(arrays(float, (n, trials), elements=FINITE)),
+            ),
+        )
+        for _ in range(count)
+    )
+    raw = wire.delivery(k, bytes((trials + 7) // 8), b"", late)
+    heard, found = wire.read_delivery(Reader("d", raw), k, (n, trials))
+    assert not heard.gamma.any()
+    assert [one.k for one in found] == [one.k for one in late]
+    for one, sent in zip(found, late, strict=True):
+        assert np.array_equal(one.heard.gamma, sent.heard.gamma)
+        assert one.heard.z.tobytes() == np.where(sent.heard.gamma, sent.heard.z, 0.0).tobytes()
+    sizes = [len(one["z"]) for one in msgpack.unpackb(raw).get("late", [])]
+    assert sizes == [8 * n * one.heard.gamma.sum() for one in late]
+
+
+def test_a_late_packet_from_the_future_is_refused() -> None:
+    """What arrives in slot 4 was not sent in slot 5."""
+    late = (Late(5, Heard(np.ones(1, bool), np.zeros((1, 1)))),)
+    with pytest.raises(MalformedMessage, match="a late packet of slot 5; expected one of slot 4 or before"):
+        wire.read_delivery(Reader("d", wire.delivery(4, b"\0", b"", late)), 4, (1, 1))
+
+
+@given(SLOTS)
+def test_marks(k: int) -> None:
+    """A mark is no packet and no delivery, a word that the sensor holds no truth, and each says before which slot."""
+    mark, held = Reader("u", wire.hold(k)), Reader("t", wire.held(k))
+    assert (wire.is_hold(mark), wire.is_hold(Reader("u", wire.uplink(k, np.zeros((1, 1)))))) == (True, False)
+    truth = wire.Truth(k, np.zeros((1, 1, 1)), np.zeros((1, 1), bool)).pack()
+    assert (wire.is_held(held), wire.is_held(Reader("t", truth))) == (True, False)
+    assert mark.slot(k) == held.slot(k) == k
+
+
+@settings(deadline=None)
+@given(st.data(), SLOTS, st.integers(1, 3), SIZES)
+def test_leaving(data: st.DataObject, k: int, n: int, trials: int) -> None:
+    """A receiver's last word reads back bit by bit."""
+    x_hat = data.draw(arrays(float, (n, trials), elements=FINITE))
+    P = data.draw(arrays(float, (n, n, trials), elements=FINITE))
+    message = Reader("t", wire.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
+    assert wire.is_leaving(message)
+    found, belief = wire.read_leaving(message, (n, trials))
+    assert (found, belief.x_hat.tobytes(), belief.P.tobytes()) == (k, x_hat.tobytes(), P.tobytes())
+    assert not belief.action.any()
 
 
 @settings(deadline=None)
@@ -47,7 +110,7 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     """Truth reads back."""
     x = data.draw(arrays(float, (count, n, trials), elements=FINITE))
     nu = data.draw(arrays(bool, (count, trials)))
-    found = wire.read_truth("t", wire.Truth(k, x, nu).pack(), k, (n, trials))
+    found = wire.read_truth(Reader("t", wire.Truth(k, x, nu).pack()), k, (n, trials))
     assert (found.first, found.count, found.x.tobytes()) == (k, count, x.tobytes())
     assert np.array_equal(found.nu, nu)
 
@@ -63,45 +126,86 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
         data.draw(arrays(np.uint8, (count, trials), elements=st.integers(0, 3))),
         data.draw(arrays(float, (count, n, n, recorded), elements=FINITE)),
         data.draw(arrays(float, (count, 2), elements=FINITE)),
+        data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials)))),
         {b: data.draw(arrays(np.uint8, (trials, 32))) for b in data.draw(st.sets(st.integers(0, 2**24), max_size=2))},
     )
-    found = wire.read_report("r", report.pack(), k, (n, trials), recorded)
+    found = wire.read_report(Reader("r", report.pack()), k, (n, trials), recorded)
     for name in ("x_hat", "action", "P", "trace"):
         assert getattr(found, name).tobytes() == getattr(report, name).tobytes()
     assert {b: d.tobytes() for b, d in found.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
     assert found.count == count
+    assert (found.late is None) == (report.late is None)
+    assert found.late is None or np.array_equal(found.late, report.late)
+
+
+def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Account:
+    """The account of a link that only loses; changes replace its columns."""
+    count, trials = delivered.shape
+    lost = {reason: np.zeros(count, np.uint32) for reason in REASONS}
+    lost["lost"] = (trials - delivered.sum(axis=1)).astype(np.uint32)
+    bursts, delays = np.zeros(COUNTED_BURSTS, np.uint32), np.zeros(window + 2, np.uint32)
+    return replace(Account(delivered, lost, None, bursts, delays), **changes)
 
 
 @settings(deadline=None)
 @given(st.data(), SLOTS, SIZES, st.integers(1, 5))
 def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
     """A journal reads back, receiver by receiver, reason by reason."""
-    names = ("legitimate", "eve", "mallory")
-    delivered = {name: data.draw(arrays(bool, (count, trials))) for name in names}
-    lost = {name: {"lost": (~flags).sum(axis=1).astype(np.uint32)} for name, flags in delivered.items()}
-    found = wire.read_journal("j", wire.Journal(k, count, delivered, lost).pack(), k, names, trials)
-    for name in names:
-        assert np.array_equal(found.delivered[name], delivered[name])
-        assert np.array_equal(found.lost[name]["lost"], lost[name]["lost"])
+    windows = {"legitimate": 0, "eve": 3, "mallory": 1000}
+    links = {
+        name: Account(
+            data.draw(arrays(bool, (count, trials))),
+            {reason: data.draw(arrays(np.uint32, count)) for reason in REASONS},
+            data.draw(arrays(np.uint16, (count, trials))) if window else None,
+            data.draw(arrays(np.uint32, 64)),
+            data.draw(arrays(np.uint32, window + 2, fill=st.just(0))),
+        )
+        for name, window in windows.items()
+    }
+    found = wire.read_journal(Reader("j", wire.Journal(k, count, links).pack()), k, windows, trials)
+    assert (found.first, found.count, set(found.links)) == (k, count, set(links))
+    for name, link in links.items():
+        for column in ("delivered", "bursts", "delays"):
+            assert np.array_equal(getattr(found.links[name], column), getattr(link, column))
+        assert {reason: counts.tolist() for reason, counts in found.links[name].lost.items()} == {
+            reason: counts.tolist() for reason, counts in link.lost.items()
+        }
+        assert (found.links[name].late is None) == (link.late is None)
+        assert link.late is None or np.array_equal(found.links[name].late, link.late)
 
 
 READERS = {
-    "packet": lambda raw: wire.read_uplink("key", raw, 0, (2, 3)),
-    "delivery": lambda raw: wire.read_delivery("key", raw, 0, (2, 3)),
+    "packet": lambda raw: wire.read_uplink(Reader("key", raw), 0, (2, 3)),
+    "mark": lambda raw: wire.is_hold(Reader("key", raw)) and Reader("key", raw).slot(0),
+    "delivery": lambda raw: wire.read_delivery(Reader("key", raw), 0, (2, 3)),
     "progress": lambda raw: wire.read_progress("key", raw),
-    "control": lambda raw: wire.read_control("key", raw),
-    "truth": lambda raw: wire.read_truth("key", raw, 0, (2, 3)),
-    "report": lambda raw: wire.read_report("key", raw, 0, (2, 3), 1),
-    "journal": lambda raw: wire.read_journal("key", raw, 0, ("a", "b"), 3),
+    "control": lambda raw: Reader("key", raw).text("do"),
+    "go": lambda raw: (Reader("key", raw).names("absent"), Reader("key", raw).integer("until")),
+    "change": lambda raw: (
+        Reader("key", raw).text("link"),
+        Reader("key", raw).map("settings"),
+        Reader("key", raw).flag("cut"),
+    ),
+    "truth": lambda raw: wire.read_truth(Reader("key", raw), 0, (2, 3)),
+    "report": lambda raw: wire.read_report(Reader("key", raw), 0, (2, 3), 1),
+    "leaving": lambda raw: wire.read_leaving(Reader("key", raw), (2, 3)),
+    "journal": lambda raw: wire.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, 3),
 }
-FIELDS = ("k", "c", "z", "x", "nu", "gamma", "x_hat", "action", "P", "trace", "digests", "links", "do")
-LINK = st.dictionaries(st.sampled_from(["delivered", "lost"]), st.one_of(st.just(1), st.binary(max_size=9)))
+FIELDS = ("k", "c", "z", "x", "nu", "gamma", "late", "x_hat", "action", "P", "trace", "digests", "links", "do", "absent",
+          "until", "link", "settings", "cut", "hold")  # fmt: skip
+LINK = st.dictionaries(
+    st.sampled_from(["delivered", "lost", "late", "bursts", "delays"]),
+    st.one_of(st.just(1), st.binary(max_size=9), st.dictionaries(st.sampled_from(REASONS), st.just(bytes(4)))),
+)
 VALUES = st.one_of(
     st.integers(-3, 2**63 - 1),
     st.sampled_from([None, True, 0.5, "", "start", [], {}, float("nan")]),
     st.sampled_from([0, 1, 4, 6, 8, 16, 24, 48, 80]).map(bytes),
     st.binary(max_size=9),
     st.dictionaries(st.sampled_from(["a", "b", 0]), st.one_of(LINK, st.just(bytes(96))), max_size=3),
+    st.lists(
+        st.dictionaries(st.sampled_from(["k", "gamma", "z"]), st.sampled_from([0, 1, b"\1", bytes(16)])), max_size=2
+    ),
 )
 
 
@@ -120,12 +224,12 @@ def test_anything_else_is_an_error_of_ours(name: str, raw: bytes | dict[str, obj
 def test_errors_say_what_was_found_where_and_what_to_do() -> None:
     """A malformed message shows key, found, expected and the bytes; a gap both slots; either ends with a remedy."""
     with pytest.raises(MalformedMessage) as malformed:
-        wire.read_uplink("evedrop/r/uplink", wire.uplink(0, np.zeros((2, 2))), 0, (2, 3))
+        wire.read_uplink(Reader("evedrop/r/uplink", wire.uplink(0, np.zeros((2, 2)))), 0, (2, 3))
     assert str(malformed.value).startswith(
         "malformed message on evedrop/r/uplink: z of 32 bytes; expected 48 bytes, <f8 of shape (2, 3). Its 40 bytes: 82 a1 6b"
     )
     with pytest.raises(Gap) as gap:
-        wire.read_uplink("evedrop/r/uplink", wire.uplink(7, np.zeros((2, 3))), 6, (2, 3))
+        wire.read_uplink(Reader("evedrop/r/uplink", wire.uplink(7, np.zeros((2, 3)))), 6, (2, 3))
     assert "gap on evedrop/r/uplink: slot 7 arrived where slot 6 was due" in str(gap.value)
     assert issubclass(Gap, RunError)
     assert issubclass(MalformedMessage, RunError)
@@ -136,15 +240,15 @@ def test_errors_say_what_was_found_where_and_what_to_do() -> None:
 def test_unknown_actions_are_refused(value: int) -> None:
     """An action beyond the documented four is malformed."""
     report = wire.Report(
-        0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2)), {}
+        0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2)), None, {}
     )
     with pytest.raises(MalformedMessage, match=f"action {value}; expected actions from 0 to 3"):
-        wire.read_report("key", report.pack(), 0, (1, 1), 1)
+        wire.read_report(Reader("key", report.pack()), 0, (1, 1), 1)
 
 
 def test_a_journal_without_a_receiver_is_refused() -> None:
     """Every receiver must be in every journal message."""
-    raw = wire.Journal(0, 1, {"a": np.ones((1, 3), bool)}, {"a": {"lost": np.zeros(1, np.uint32)}}).pack()
+    raw = wire.Journal(0, 1, {"a": account_of(np.ones((1, 3), bool))}).pack()
     with pytest.raises(MalformedMessage, match="b = None; expected a map b"):
         READERS["journal"](raw)
 
@@ -153,19 +257,19 @@ def test_a_journal_without_a_receiver_is_refused() -> None:
 def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
     """A journal gives every reason of the links and no other: columns of messages must fit together."""
     counts = {reason: np.zeros(1, np.uint32) for reason in reasons}
-    raw = wire.Journal(0, 1, dict.fromkeys("ab", np.ones((1, 3), bool)), dict.fromkeys("ab", counts)).pack()
-    with pytest.raises(MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['lost'\]"):
+    raw = wire.Journal(0, 1, dict.fromkeys("ab", account_of(np.ones((1, 3), bool), lost=counts))).pack()
+    with pytest.raises(
+        MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['corrupted', 'cut', 'down', "
+    ):
         READERS["journal"](raw)
 
 
 TELEMETRY = {
     "truth": lambda k: wire.Truth(k, np.zeros((2, 1, 3)), np.zeros((2, 3), bool)).pack(),
     "report": lambda k: wire.Report(
-        k, np.zeros((2, 1, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 1, 1, 1)), np.zeros((2, 2)), {}
+        k, np.zeros((2, 1, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 1, 1, 1)), np.zeros((2, 2)), None, {}
     ).pack(),
-    "journal": lambda k: wire.Journal(
-        k, 2, {"a": np.ones((2, 3), bool)}, {"a": {"lost": np.zeros(2, np.uint32)}}
-    ).pack(),
+    "journal": lambda k: wire.Journal(k, 2, {"a": account_of(np.ones((2, 3), bool))}).pack(),
 }
 
 
@@ -173,11 +277,11 @@ TELEMETRY = {
 @pytest.mark.parametrize("what", TELEMETRY)
 def test_observer_notices_gaps_and_doubles(what: str, second: int) -> None:
     """Truth, report or journal that does not begin where the last one ended is a gap."""
-    joiner = Joiner(("a",), (1, 3), 1)
+    joiner = Joiner({"a": 0}, (1, 3), 1)
     take = {
-        "truth": lambda raw: joiner.truth("key", raw),
-        "report": lambda raw: joiner.report("a", "key", raw),
-        "journal": lambda raw: joiner.journal("key", raw),
+        "truth": lambda raw: joiner.truth(Reader("key", raw)),
+        "report": lambda raw: joiner.report("a", Reader("key", raw)),
+        "journal": lambda raw: joiner.journal(Reader("key", raw)),
     }[what]
     take(TELEMETRY[what](0))
     with pytest.raises(Gap, match=f"gap on key: slot {second} arrived where slot 2 was due"):

@@ -182,7 +182,7 @@ class Estimator:
             for row in P:
                 self.hashes[r].update(struct.pack(f"<{self.n}d", *row))
         if k % 256 == 255 or k == self.slots - 1:
-            self.blocks[k // 256] = b"".join(one.digest() for one in self.hashes)
+            self.blocks[k - k % 256] = b"".join(one.digest() for one in self.hashes)
             self.hashes = [sha256() for _ in range(self.R)]
         self.rows.append((k, [x for x, _ in self.belief], actions, [P for _, P in self.belief]))
 
@@ -230,7 +230,7 @@ class Estimator:
             "action": bytes(a for _, _, actions, _ in rows for a in actions),
             "P": struct.pack(f"<{len(covariances)}d", *covariances),
             "trace": struct.pack(f"<{len(traces)}d", *traces),
-            "digests": {b: d for b, d in self.blocks.items() if 256 * b + 255 >= rows[0][0]},
+            "digests": {b: d for b, d in self.blocks.items() if b + 255 >= rows[0][0]},
         }
         return msgpack.packb(message)
 

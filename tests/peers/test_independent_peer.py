@@ -24,6 +24,7 @@ from emulator.runs.ports import free_port
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
 from emulator.streams import Batch
+from tests.conftest import LIMIT
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
 THREE_STATES = {
@@ -76,9 +77,9 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
         beliefs.append(belief)
         digests = log.add(k, belief)
         if digests is not None:
-            blocks[k // 256] = digests.copy()
+            blocks |= dict([digests])
         peer.receive(wire.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
-    report = wire.read_report("telemetry", peer.report(), 0, (model.n, 9), 2)
+    report = wire.read_report(wire.Reader("telemetry", peer.report()), 0, (model.n, 9), 2)
     assert np.array_equal(report.x_hat, [one.x_hat for one in beliefs])
     assert np.array_equal(report.action, [one.action for one in beliefs])
     assert np.array_equal(report.P, [one.P[:, :, :2] for one in beliefs])
@@ -117,7 +118,7 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
                 )
             )
             stack.callback(running[name].kill)
-        said = {name: process.communicate(timeout=40)[0] for name, process in running.items()}
+        said = {name: process.communicate(timeout=LIMIT)[0] for name, process in running.items()}
         statuses = {name: process.returncode for name, process in running.items()}
     assert set(statuses.values()) <= {0, 1}, (statuses, said)
     digest = montecarlo(scenario, trials=2, out=tmp_path / "memory").summary["peers"]["legitimate"]["digest"]

@@ -26,6 +26,7 @@ from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
 from peers.legitimate import estimate
 from peers.sensor import Window, sense
+from tests.conftest import LIMIT
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
 
@@ -65,7 +66,8 @@ class Stage:
     inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
     funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
-    commands: SimpleQueue[str] = field(default_factory=SimpleQueue)
+    commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
+    """Of the conductor, as `wire.control` makes them."""
 
     def session(self, brief: Brief) -> FakeSession:
         """In the place of `Session`."""
@@ -105,7 +107,7 @@ class FakeSession:
         queue = self._stage.inboxes.setdefault(key, SimpleQueue())
 
         def recv() -> Any:
-            payload = queue.get(timeout=20)
+            payload = queue.get(timeout=LIMIT)
             return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
 
         return SimpleNamespace(recv=recv)
@@ -123,8 +125,16 @@ class FakeSession:
 
     def wait_for(self, command: str) -> None:
         """Until the test commands it."""
-        while self._stage.commands.get(timeout=20) != command:
+        while self.command().text("do") != command:
             pass
+
+    def command(self) -> wire.Reader:
+        """The next command, which the test gives."""
+        return wire.Reader("control", self._stage.commands.get(timeout=LIMIT))
+
+    def commanded(self) -> wire.Reader | None:
+        """The next command if the test has given one."""
+        return None if self._stage.commands.empty() else self.command()
 
 
 @pytest.fixture
@@ -134,7 +144,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     monkeypatch.setattr(peers.following, "Session", one.session)
     monkeypatch.setattr(peers.sensor, "Session", one.session)
     yield one
-    one.commands.put("end")
+    one.commands.put(wire.control("end"))
 
 
 def deliveries(count: int = SLOTS) -> list[bytes]:
@@ -155,7 +165,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     brief = briefs()[name]
     keys = Keys(brief.run)
     stage.fill(keys.downlink(name), deliveries())
-    stage.commands.put("end")
+    stage.commands.put(wire.control("end"))
     RECEIVERS[name](brief)
     put = []
     while not stage.put.empty():
@@ -164,7 +174,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     end, blocks = 0, {}
     for key, payload in put:
         if key == keys.telemetry(name):
-            report = wire.read_report(key, payload, end, (2, 3), 1)
+            report = wire.read_report(wire.Reader(key, payload), end, (2, 3), 1)
             end, blocks = end + report.count, {**blocks, **report.digests}
             lost = (np.arange(end - report.count, end) % 3)[:, None] == np.arange(3)
             assert np.array_equal(report.action == 0, lost)
@@ -183,18 +193,18 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
     for flow in (Flow(1024, 7), Flow(1024, batch)):
         brief = replace(briefs(slots=600)[name], flow=flow, run="r")
         stage.fill(Keys("r").downlink(name), deliveries(600))
-        stage.commands.put("end")
+        stage.commands.put(wire.control("end"))
         RECEIVERS[name](brief)
         end, x_hat, P, blocks = 0, [], [], {}
         for payload in stage.all(Keys("r").telemetry(name)):
-            report = wire.read_report("", payload, end, (2, 3), 1)
+            report = wire.read_report(wire.Reader("", payload), end, (2, 3), 1)
             end += report.count
             x_hat.append(report.x_hat)
             P.append(report.P)
             blocks |= {block: digests.tobytes() for block, digests in report.digests.items()}
         found.append((end, np.concatenate(x_hat).tobytes(), np.concatenate(P).tobytes(), blocks))
     assert found[0] == found[1]
-    assert set(found[0][3]) == {0, 1, 2}
+    assert set(found[0][3]) == {0, 256, 512}
 
 
 GOOD = deliveries()
@@ -235,7 +245,7 @@ class Sensing:
 
     def next(self) -> tuple[str, bytes]:
         """What it puts next."""
-        return self.stage.put.get(timeout=20)
+        return self.stage.put.get(timeout=LIMIT)
 
     def packets(self, first: int, end: int) -> None:
         """It sends exactly these packets, with its telemetry at the ends of batches, and nothing more."""
@@ -243,11 +253,11 @@ class Sensing:
         for k in range(first, end):
             key, payload = self.next()
             assert key == self.keys.uplink
-            wire.read_uplink(key, payload, k, (2, 3))
+            wire.read_uplink(wire.Reader(key, payload), k, (2, 3))
             if (k + 1) % BATCH == 0 or k + 1 == SLOTS:
                 key, payload = self.next()
                 assert key == self.keys.telemetry("sensor")
-                told += wire.read_truth(key, payload, told, (2, 3)).count
+                told += wire.read_truth(wire.Reader(key, payload), told, (2, 3)).count
                 assert told == k + 1
 
     def progress(self, name: str, k: int) -> None:
@@ -260,7 +270,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     brief = briefs()["sensor"]
     sensing = Sensing(stage, brief)
     assert stage.put.empty()
-    stage.commands.put("start")
+    stage.commands.put(wire.control("start"))
     sensing.packets(0, WINDOW)
     everybody = [*brief.part["receivers"], "observer"]
     assert len(everybody) == 5
@@ -272,9 +282,9 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
         sensing.packets(sent, sent := done + WINDOW)
     sensing.progress("observer", SLOTS)
     sensing.packets(WINDOW + 20, SLOTS)
-    stage.commands.put("end")
-    sensing.thread.join(20)
-    assert stage.put.get(timeout=20) == ("closed", b"")
+    stage.commands.put(wire.control("end"))
+    sensing.thread.join(LIMIT)
+    assert stage.put.get(timeout=LIMIT) == ("closed", b"")
     assert stage.put.empty()
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from emulator.api import load_results, montecarlo
 from emulator.errors import UsageError
+from emulator.runs import workers
 from emulator.runs.montecarlo import Plan
 from emulator.runs.ports import free_port
 from tests.conftest import Evedrop, wait_until
@@ -58,6 +59,12 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         log.close()
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody answers: that is found out soon."""
+    monkeypatch.setattr(workers, "_REACH_SECONDS", 0.5)
+
+
 def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """Digests, tables and summary of `montecarlo --scheduler` are those of one worker here."""
     base = (
@@ -72,7 +79,7 @@ def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
         "--json",
         "--out",
     )
-    here, there = evedrop(*base, "here", "--workers", "1"), evedrop(*base, "there", "--scheduler", scheduler)
+    here, there = evedrop(*base, "here", "--workers", "1"), evedrop.process(*base, "there", "--scheduler", scheduler)
     assert (here.status, there.status, there.err) == (0, 0, "")
     for key in ("peers", "links", "secrecy", "surprising", "trials", "ended"):
         assert here.summary[key] == there.summary[key]
@@ -93,7 +100,7 @@ def test_a_sweep_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
         "--over",
         "encoding.state_probability=0.2:0.8:0.2",
     )
-    here, there = evedrop(*base, "--out", "here"), evedrop(*base, "--out", "there", "--scheduler", scheduler)
+    here, there = evedrop(*base, "--out", "here"), evedrop.process(*base, "--out", "there", "--scheduler", scheduler)
     assert (here.status, there.status, there.err) == (0, 0, "")
     ours, theirs = (pq.read_table(evedrop.folder / name / "sweep.parquet") for name in ("here", "there"))
     assert ours.num_rows == 4 * 4
@@ -104,14 +111,14 @@ def test_a_folder_that_is_not_empty_is_refused_there_too(evedrop: Evedrop, sched
     """One line, and the connection is closed."""
     (evedrop.folder / "full").mkdir()
     (evedrop.folder / "full" / "file").touch()
-    done = evedrop(
+    done = evedrop.process(
         "montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5", "--scheduler", scheduler, "--out", "full"
     )
     assert (done.status, done.err) == (2, "evedrop: full is not empty; give another --out, or empty it\n")
 
 
 @pytest.mark.parametrize("command", ["montecarlo", "sweep"])
-def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> None:
+def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, impatient: None, command: str) -> None:
     """Nobody listens: one line, exit 2, nothing left on disk."""
     over = ("--over", "seed=1,2") if command == "sweep" else ()
     address = f"tcp://127.0.0.1:{free_port()}"
@@ -125,14 +132,14 @@ def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> 
 
 
 @pytest.mark.parametrize("address", ["nonsense", "foo://127.0.0.1:8786"])
-def test_an_address_that_is_none_is_refused(tmp_path: Path, address: str) -> None:
+def test_an_address_that_is_none_is_refused(impatient: None, tmp_path: Path, address: str) -> None:
     """Without a port, of an unknown protocol."""
     with pytest.raises(UsageError, match="no Dask scheduler answers there"):
         montecarlo("eavesdroppers", slots=9, trials=5, plan=Plan(scheduler=address), out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_somebody_else_on_the_port_is_no_scheduler(tmp_path: Path) -> None:
+def test_somebody_else_on_the_port_is_no_scheduler(impatient: None, tmp_path: Path) -> None:
     """A listener that never speaks is given up on after a few seconds."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 from emulator.api import load_results, montecarlo
@@ -125,3 +129,49 @@ def test_recorded_trials_are_those_asked_for(runs: dict[str, Results]) -> None:
     assert sorted(pc.unique(runs["recorded"].trials["trial"]).to_pylist()) == list(range(6))
     assert sorted(pc.unique(runs["later trials"].trials["trial"]).to_pylist()) == [2]
     assert runs["recorded"].trials.num_rows == 6 * 600 * 4
+
+
+def rewritten(results: Results, folder: Path, table: str, change: Callable[[pa.Table], pa.Table]) -> Results:
+    """A copy of a results folder with one table changed."""
+    shutil.copytree(results.folder, folder)
+    path = folder / f"{table}.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+    return load_results(folder)
+
+
+OTHER = {
+    "a column less": ("trials", lambda table: table.drop_columns(["P"]), "differs in P"),
+    "another type": (
+        "trials",
+        lambda table: table.set_column(0, "slot", table["slot"].cast("int32")),
+        "differs in slot",
+    ),
+    "no lists": ("trials", lambda table: table.set_column(7, "x", table["slot"]), "differs in x"),
+    "other columns": ("digests", lambda _: pa.table({"a": [1]}), "differs in peer, trial, block, digest"),
+    "empty cells": (
+        "trials",
+        lambda table: table.set_column(0, "slot", pa.array([None] * table.num_rows, pa.int64())),
+        "has empty cells in slot",
+    ),
+}
+"""What was done to a table → which table, how, and what is said of it."""
+
+
+@pytest.mark.parametrize("what", OTHER)
+def test_a_table_of_another_version_is_refused(what: str, runs: dict[str, Results], tmp_path: Path) -> None:
+    """Other columns, other types and empty cells: one line with the table, what differs, and a remedy."""
+    table, change, said = OTHER[what]
+    other = rewritten(runs["recorded"], tmp_path / "other", table, change)
+    with pytest.raises(UsageError, match=said) as told:
+        difference(runs["recorded"], other)
+    assert str(told.value).startswith(f"{other.folder / table}.parquet ")
+    assert "\n" not in str(told.value)
+
+
+def test_runs_of_different_processes_differ(runs: dict[str, Results], tmp_path: Path) -> None:
+    """One state against two: the first row is different, and no more is made of it."""
+    one = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
+    other = montecarlo("eavesdroppers", slots=600, trials=6, out=tmp_path / "one", **one)
+    found = difference(runs["whole"], other)
+    assert not found.same
+    assert found.text.startswith("first difference: slot 0, trial 0, legitimate: ")

@@ -20,10 +20,23 @@ from tests.conftest import Evedrop
 
 LOSSES: dict[str, dict[str, Any]] = {
     "bernoulli": {"model": "bernoulli", "quality": 0.8},
+    "distance": {
+        "model": "distance",
+        "sender": [0, 0],
+        "receiver": [[0, 90.0, 5.0], [200, 10.0, 90.0]],
+        "reference_snr": 70.0,
+        "exponent": 3.0,
+        "threshold": 8.0,
+        "shadowing": 6.0,
+        "shadowing_block": 20,
+    },
     "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.05, "bad": 0.9},
     "markov": {"model": "markov", "transitions": [[0.8, 0.2], [0.5, 0.5]], "loss": [0, 1]},
     "pattern": {"model": "pattern", "outcomes": "1101"},
+    "trace": {"model": "trace", "outcomes": "110100111", "random_start": True},
 }
+UNKNOWN = ("distance", "pattern", "trace")
+"""Those for which there is no theory."""
 
 
 def scenario(**changes: Any) -> dict[str, Any]:
@@ -65,14 +78,19 @@ def memory(every_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Resul
     return montecarlo(every_model, trials=7, out=tmp_path_factory.mktemp("memory") / "run")
 
 
+@pytest.fixture(scope="module")
+def live(every_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """The same seven trials in processes."""
+    return run(every_model, trials=7, out=tmp_path_factory.mktemp("live") / "run")
+
+
 def test_every_model_is_in_the_scenario() -> None:
     """A new loss model must be added here."""
     assert set(LOSSES) == set(LOSS_MODELS)
 
 
-def test_live_and_memory_are_the_same_bits(every_model: Path, memory: Results, tmp_path: Path) -> None:
+def test_live_and_memory_are_the_same_bits(live: Results, memory: Results) -> None:
     """Every loss model gives one digest, in processes and in memory, and every packet is accounted for."""
-    live = run(every_model, trials=7, out=tmp_path / "live")
     assert {name: peer["digest"] for name, peer in live.summary["peers"].items()} == {
         name: peer["digest"] for name, peer in memory.summary["peers"].items()
     }
@@ -82,13 +100,13 @@ def test_live_and_memory_are_the_same_bits(every_model: Path, memory: Results, t
 
 
 def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
-    """A pattern has no expected trace: null in the summary and in the table, and no verdict of theory."""
+    """What follows no chain has no expected trace: null in the summary and in the table, and no verdict of theory."""
     peers = memory.summary["peers"]
-    assert [name for name, peer in peers.items() if peer["expected_trace_covariance"] is None] == ["pattern"]
+    assert [name for name, peer in peers.items() if peer["expected_trace_covariance"] is None] == [*UNKNOWN]
     assert json.loads((memory.folder / "summary.json").read_text())["peers"]["pattern"]["infinite_variance"] is False
     nulls = memory.slots.filter(pc.is_null(memory.slots["expected_trace_covariance"]))
-    assert set(nulls["peer"].to_pylist()) == {"pattern"}
-    assert nulls.num_rows == 300
+    assert set(nulls["peer"].to_pylist()) == set(UNKNOWN)
+    assert nulls.num_rows == 300 * len(UNKNOWN)
     verdict = memory.summary["secrecy"]["pattern"]
     assert (verdict["relative_by_theory"], verdict["perfect_by_theory"]) == (None, None)
     assert verdict["sentence"].endswith("there is no theory for these links")
@@ -110,7 +128,7 @@ def test_simulated_errors_agree_with_the_theory_of_bursts(every_model: Path, tmp
     table = montecarlo(every_model, slots=121, trials=600, seed=5, out=tmp_path / "many").slots.to_pydict()
     judged = 0
     for i, slot in enumerate(table["slot"]):
-        if slot % 20 == 0 and table["peer"][i] != "pattern":
+        if slot % 20 == 0 and table["peer"][i] not in UNKNOWN:
             deviation = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
             assert abs(deviation) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
             judged += 1
@@ -125,7 +143,7 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     assert "the link of legitimate has others" in line
     assert "--set 'legitimate.link={quality = 0.9}'" in line
     quality = {"quality": 0.9}
-    with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.gilbert-elliott\.link="):
+    with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.distance\.link="):
         design(every_model, changes={"legitimate.link": quality})
     links = {f"eavesdroppers.{name}.link": quality for name in scenario()["eavesdroppers"]}
     design(every_model, changes={"legitimate.link": quality, **links})
@@ -140,14 +158,13 @@ def test_bursts_that_last_too_long_are_a_warning() -> None:
     assert warnings_of(Scenario.model_validate(scenario())) == []
 
 
-def test_the_view_survives_where_there_is_no_theory(every_model: Path, tmp_path: Path) -> None:
-    """A recording and a replayed one of a run in which one receiver's expected trace is nowhere."""
+def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
+    """A replayed recording of a run in which one receiver's expected trace is nowhere."""
     from rerun.chunk import RrdReader
 
     from emulator.view.replay import replay
 
-    live = run(every_model, slots=40, out=tmp_path / "live")
     shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
     assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown
     assert "/theory/pattern" not in shown
-    assert live.slots["expected_trace_covariance"].null_count == 40
+    assert live.slots["expected_trace_covariance"].null_count == 300 * len(UNKNOWN)

@@ -128,7 +128,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
         keys = StreamKeys.of(of)
         secret = keys.secret(("schedule", "noise"))
         assert secret["schedule"] in drawn
-        assert all(keys.link(name) in drawn for name in of.receivers)
+        assert all(keys.link(name, of.course(name))[f"link/{name}"] in drawn for name in of.receivers)
         assert (keys.process in drawn) == (mode is Mode.ERROR_COORDINATES)
         assert (secret["noise"] in drawn) == (mode is Mode.ERROR_COORDINATES and misled)
 
@@ -230,6 +230,33 @@ def test_what_leaves_double_precision_is_refused(plan: Plan, tmp_path: Path) -> 
     assert results.summary["slots"] == slots
     with pytest.raises(ScenarioError, match="can be followed up to slot"):
         montecarlo("numerical", trials=2, out=tmp_path / "exact", **changes)
+
+
+@pytest.mark.parametrize("plan", [COVARIANCES, ERRORS], ids=["covariance-only", "error-coordinates"])
+@pytest.mark.parametrize("strategy", ["bayesian", "likelihood", "genie", "colluding", "replay-informed"])
+def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path) -> None:
+    """Named with strategy, reason and ways out; nothing on disk. What follows from losses alone is taken."""
+    more: dict[str, Any] = {
+        "colluding": {"links": [{"quality": 0.5}, {"quality": 0.6}], "reads_as": "genie"},
+        "replay-informed": {"link": {"quality": 0.5}, "reads_as": "smart", "learns_at": 3},
+    }.get(strategy, {"link": {"quality": 0.5}})
+    of = scenario(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
+    said = rf"--mode {plan.mode.value} follows .* what eve does \(strategy {strategy}\).*; give --mode exact, or take eve out"
+    with pytest.raises(UsageError, match=said):
+        montecarlo(of, trials=2, plan=plan, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_constant_one_and_a_pool_are_followed_in_every_mode() -> None:
+    """Their actions follow from what was lost: the three modes agree on actions and beliefs, to the bit."""
+    pool = {"strategy": "colluding", "links": [{"quality": 0.5}, {"quality": 0.6}], "reads_as": "smart"}
+    of = scenario(MARGINAL, 80, pool=pool, deaf={"strategy": "constant", "link": {"quality": 0.9}})
+    exact, *others = (played(of, mode, 30) for mode in Mode)
+    for name in of.receivers:
+        for other in others:
+            assert np.array_equal(exact[name]["action"], other[name]["action"])
+            assert np.array_equal(exact[name]["trace"], other[name]["trace"])
+    assert (exact["pool"]["action"] > 0).mean() == pytest.approx(0.8, abs=0.05)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from emulator.api import load_results, montecarlo, run
+from emulator.api import load_results, montecarlo
 from emulator.errors import UsageError
 from emulator.runs.montecarlo import Plan
 from emulator.runs.results import Results
@@ -125,15 +125,6 @@ def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -
     errors = [row["squared_error"] for row in live.trials.to_pylist() if row["peer"] == surprising["receiver"]]
     assert np.mean(errors) == pytest.approx(surprising["mean_error"], rel=1e-12)
     assert re.search(rf"most surprising: trial {surprising['trial']}, {surprising['receiver']}", done.out)
-
-
-def test_a_live_run_has_the_same_digests_and_figures(tmp_path: Path, study: Study) -> None:
-    """The first two trials of the study, live."""
-    live = run("eavesdroppers", slots=150, trials=2, out=tmp_path / "live")
-    whole = study("two blocks and a part", 1).digests
-    first = whole.filter(pc.less(whole["trial"], 2))
-    key = lambda row: (row["peer"], row["trial"], row["block"])  # noqa: E731 - once
-    assert sorted(live.digests.to_pylist(), key=key) == sorted(first.to_pylist(), key=key)
 
 
 def test_a_scenario_of_ones_own_runs_with_changes(tmp_path: Path) -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from pydantic import BaseModel
 
 from emulator import scenario
 from emulator.api import montecarlo
-from emulator.runs.results import ACTIONS, DIGESTS, JOURNAL, Results, load_results
+from emulator.runs import results as module
+from emulator.runs.results import _BYTES, ACTIONS, DIGESTS, JOURNAL, Results, _Table, load_results
 from emulator.scenario import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -67,6 +70,40 @@ def test_tables_have_a_row_for_everything(results: Results) -> None:
         assert row["squared_error"] == pytest.approx(error, rel=1e-12)
         assert row["trace_covariance"] == pytest.approx(row["P"][0] + row["P"][3], rel=1e-12)
         assert (row["action"] == "misled") <= (row["sent"] == "innovation" and row["peer"] != "legitimate")
+
+
+def masks(rows: int, width: int) -> list[np.ndarray]:
+    """Columns of a journal whose masks count up."""
+    mask = (np.arange(rows * width) % 251).astype(np.uint8).reshape(rows, width)
+    return [np.arange(rows), np.zeros(rows, np.int8), *(np.full(rows, 8 * width) for _ in JOURNAL.names[2:-1]), mask]
+
+
+def test_wide_rows_are_not_held_back_by_their_number(tmp_path: Path) -> None:
+    """A journal of 300 000 trials: no row group is larger than it should be, nor is what waits in memory."""
+    table = _Table(tmp_path / "journal.parquet", JOURNAL, {"link": ("legitimate",)})
+    waiting = 0
+    for _ in range(20):
+        table.add(masks(100, 37_500))
+        waiting = max(waiting, sum(array.nbytes for held in table._held for array in held))
+    table.close()
+    assert waiting < _BYTES
+    file = pq.ParquetFile(tmp_path / "journal.parquet")
+    sizes = [file.metadata.row_group(i).num_rows * 37_500 for i in range(file.num_row_groups)]
+    assert sum(sizes) == 2000 * 37_500
+    assert max(sizes) <= _BYTES
+
+
+def test_rows_that_come_at_once_are_parted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """More bytes than a row group's offsets can count are several row groups, and read back as they were."""
+    monkeypatch.setattr(module, "_BYTES", 1000)
+    table = _Table(tmp_path / "journal.parquet", JOURNAL, {"link": ("legitimate",)})
+    columns = masks(10, 400)
+    table.add(columns)
+    table.close()
+    assert pq.ParquetFile(tmp_path / "journal.parquet").num_row_groups >= 5
+    found = pq.read_table(tmp_path / "journal.parquet")
+    assert found["slot"].to_pylist() == list(range(10))
+    assert found["delivered_mask"].to_pylist() == [row.tobytes() for row in columns[-1]]
 
 
 def test_a_summary_is_replaced_as_a_whole(results: Results) -> None:

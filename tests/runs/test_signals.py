@@ -1,10 +1,22 @@
+from __future__ import annotations
+
 import signal
 import subprocess
 import sys
 
+import pytest
+
+from emulator.errors import Interrupted
+from emulator.runs.conductor import Stop
+from emulator.runs.signals import stop_on_signals
+
 
 def test_what_is_ignored_from_birth_stays_ignored() -> None:
-    """Under nohup a hang-up does not stop a study; Ctrl-C and SIGTERM do."""
+    """Under nohup a hang-up does not stop a study; Ctrl-C, SIGTERM and otherwise a hang-up do."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        with stop_on_signals() as stop:
+            signal.raise_signal(number)
+            assert stop.is_set()
     code = (
         "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "from emulator.runs.signals import stop_on_signals\n"
@@ -15,3 +27,33 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.split() == ["False", "True"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:
+    """The other end of standard input is looked at, open with something to read in it, then closed."""
+    code = (
+        "from emulator.launched import launcher_is_gone\n"
+        "print(launcher_is_gone(), flush=True)\ninput()\nprint(launcher_is_gone(), flush=True)\n"
+        "while not launcher_is_gone():\n    pass\nprint('gone')\n"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == "False\n"
+        process.stdin.write("\nmore\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "False\n"
+        process.stdin.close()
+        assert process.stdout.readline() == "gone\n"
+
+
+def test_a_run_without_its_launcher_is_interrupted_and_not_at_fault() -> None:
+    """The others leave together with the launcher: who misses them looks for it, and for a signal, before it blames them."""
+    Stop().check(0.01)
+    with pytest.raises(Interrupted):
+        Stop(orphaned=lambda: True).check()
+    asked = Stop()
+    asked.wanted = True
+    with pytest.raises(Interrupted):
+        asked.check()

@@ -170,7 +170,10 @@ BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
     ("more", "said"),
     [
         (("--over", "sluts=1,2", "--trials", "5"), "sluts: is no entry of this table; did you mean slots?"),
-        (("--over", "encoding.foo=1,2", "--trials", "5"), "encoding.foo: is no entry of this table"),
+        (
+            ("--over", "encoding.foo=1,2", "--trials", "5"),
+            "encoding.foo: is set, but the scheme innovation has no such parameter",
+        ),
         (("--over", "seed=1,2", "--trials", "0"), "trials: is 0; expected a number at least 1"),
         (("--over", "seed=1,2", "--trials", "-4"), "trials: is -4; expected a number at least 1"),
         (("--over", "seed=5:1:1", "--trials", "5"), "--over seed=5:1:1: the range is empty"),

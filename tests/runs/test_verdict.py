@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.model.links import loss_of
+from emulator.model.link import Course
+from emulator.model.link_law import law_of
 from emulator.model.process import Floats, Process
 from emulator.model.theory import Outcomes
 from emulator.runs.expectation import Expectation
@@ -40,7 +41,7 @@ def expectation(link: dict[str, Any], mu_d: float, uses: tuple[float, float] | N
     def outcomes_at(quality: float) -> Outcomes:
         return Outcomes.legitimate(quality, mu_d) if uses is None else Outcomes.eavesdropper(quality, mu_d, *uses)
 
-    return Expectation(STABLE, loss_of(link).chain, outcomes_at)
+    return Expectation(STABLE, law_of(Course({"loss": link})), outcomes_at)
 
 
 def good(quality: float) -> dict[str, Any]:
@@ -49,7 +50,7 @@ def good(quality: float) -> dict[str, Any]:
 
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.01, "r": 0.1}
-ROTE = {"model": "pattern", "outcomes": "110"}
+ROTE = {"model": "trace", "outcomes": "110", "random_start": True}
 
 
 def judged(user: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> Secrecy:
@@ -184,11 +185,42 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     assert nothing.sentence == "eve: nothing was measured; there is no theory for these links"
 
 
+def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
+    """Of who has no closed form the genie is a bound: what holds against it holds; what does not is left open."""
+    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+
+    def found(process: Process, mu: float, mu_e: float) -> Secrecy:
+        ours = Expectation(
+            process, law_of(Course({"loss": good(mu)})), lambda quality: Outcomes.legitimate(quality, 0.6)
+        )
+        chain = law_of(Course({"loss": good(mu_e)}))
+        theirs = Expectation(process, chain, None, lambda quality: Outcomes.genie(quality, 0.6))
+        assert np.isnan(theirs.traces(3)).all()
+        return secrecy((user, ours), ("eve", other, theirs))
+
+    unstable = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))
+    for process, mu_e, relative, perfect in (
+        (STABLE, 0.9, True, None), (STABLE, 1.0, None, None), (unstable, 0.8, True, True), (unstable, 0.9, True, None),
+    ):  # fmt: skip
+        one = found(process, 0.9, mu_e)
+        assert (one.relative_by_theory, one.perfect_by_theory) == (relative, perfect)
+        assert one.judged_by == ("median" if process is unstable else "mean")
+        promise = (
+            "perfect secrecy" if perfect else "relative secrecy" if relative else "relative secrecy from slot 7 on"
+        )
+        assert one.sentence.endswith(f"theory promises {promise}")
+    nothing = Expectation(STABLE, law_of(Course({"loss": good(0.9)})), None)
+    one = secrecy((user, expectation(good(0.9), 0.5)), ("eve", other, nothing))
+    assert one.sentence.endswith("no closed form of its error is known")
+
+
 def test_rounding_on_a_perfect_link_is_no_failure() -> None:
     """With μ = 1 the legitimate bound is exactly 0; what rounding leaves of the error does not break perfect secrecy."""
     growing = around(np.geomspace(1.0, 1e6, WINDOWS))
     user, other = tally(around(1e-20)), tally(growing)
-    perfect = Expectation(STABLE, loss_of(good(1.0)).chain, lambda quality: Outcomes.legitimate(quality, 0.5))
+    perfect = Expectation(
+        STABLE, law_of(Course({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
+    )
     misled = expectation(good(0.5), 0.5, (1.0, 1.0))
     assert secrecy((user, perfect), ("eve", other, misled)).perfect is Verdict.HELD
 

@@ -3,60 +3,54 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from emulator.errors import RunError
 from emulator.runs.results import load_results
 from emulator.runs.simulation import Mode
-from emulator.runs.trials import tasks_of
+from emulator.runs.trials import BLOCK_TRIALS, tasks_of
 from emulator.runs.workers import in_processes
 from emulator.scenario import load
-from tests.conftest import Done, Evedrop, Live, processor_seconds, wait_until, with_mark
+from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 
-ENDLESS = ("--slots", "100000", "--trials", "6000")
+ENDLESS = ("--slots", "400000", "--trials", "1000")
+SCENARIO = load("eavesdroppers", {"slots": 10})
 
 
-def started(evedrop: Evedrop, command: str, workers: int, *more: str) -> tuple[Live, list[int]]:
+def started(evedrop: Evedrop, workers: int) -> tuple[Live, list[int]]:
     """A study that would take minutes, under way, and its worker processes."""
-    arguments = (command, "eavesdroppers", *ENDLESS, "--workers", str(workers), "--out", "run", *more)
-    live = Live(evedrop._start(arguments, {}), evedrop.temporary, evedrop.folder / "run")
-    crew = wait_until(lambda: at_work(live, workers), "workers at work")
+    live = evedrop.started("montecarlo", "eavesdroppers", *ENDLESS, "--workers", str(workers))
+    live.running()
+    crew = crew_of(live)
+    assert len(crew) == (workers if workers > 1 else 0)
     return live, crew
 
 
-def at_work(live: Live, workers: int) -> list[int]:
-    """The processes that simulate, once all of them have computed for a while."""
-    if workers == 1:
-        crew = [live.process.pid] if (live.folder / "slots.parquet").exists() else []
-    else:
-        crew = [pid for pid, command in with_mark(str(live.temporary)).items() if "runs.workers import work" in command]
-    try:
-        enough = len(crew) == workers and all(processor_seconds(pid) > 1.2 for pid in crew)
-    except OSError:
-        return []
-    return crew if enough else []
+def crew_of(live: Live) -> list[int]:
+    """Its worker processes."""
+    return [pid for pid, command in with_mark(str(live.temporary)).items() if "runs.workers import work" in command]
 
 
 def no_process_left(live: Live) -> None:
     """Neither a worker nor one of Python's own."""
-    wait_until(lambda: not live.left(), "no process left", 10.0)
+    wait_until(lambda: not live.left(), "no process left")
 
 
 @pytest.mark.parametrize(
     ("workers", "number"),
-    [(1, signal.SIGINT), (2, signal.SIGINT), (2, signal.SIGTERM)],
-    ids=["Ctrl-C, alone", "Ctrl-C, two", "SIGTERM, two"],
+    [(1, signal.SIGTERM), (2, signal.SIGINT)],
+    ids=["SIGTERM, alone", "Ctrl-C, two"],
 )
 def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number: signal.Signals) -> None:
     """Exit 130, a summary that says interrupted, tables with the slots that were done, no process left."""
-    live, _ = started(evedrop, "montecarlo", workers)
+    live, _ = started(evedrop, workers)
     live.process.send_signal(number)
     done = live.end()
     assert done.status == 130
@@ -65,7 +59,7 @@ def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number:
     no_process_left(live)
     summary = live.results.summary
     assert summary["ended"] == "interrupted"
-    assert 0 < summary["slots"] < 100_000
+    assert 0 < summary["slots"] < 400_000
     assert {peer["digest"] for peer in summary["peers"].values()} == {None}
     slots = live.results.slots.to_pydict()
     assert max(slots["slot"]) + 1 >= summary["slots"]
@@ -76,9 +70,8 @@ def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number:
 
 def test_a_ctrl_c_in_the_terminal_reaches_the_workers_too(evedrop: Evedrop) -> None:
     """The whole group gets the signal, workers that have just been born among them; nobody prints a traceback."""
-    arguments = ("montecarlo", "eavesdroppers", *ENDLESS, "--workers", "2", "--out", "run")
-    live = Live(evedrop._start(arguments, {"start_new_session": True}), evedrop.temporary, evedrop.folder / "run")
-    wait_until(lambda: any("runs.workers import work" in command for command in live.left().values()), "a worker")
+    live = evedrop.started("montecarlo", "eavesdroppers", *ENDLESS, "--workers", "2", start_new_session=True)
+    wait_until(lambda: crew_of(live), "a worker")
     os.killpg(live.process.pid, signal.SIGINT)
     done = live.end()
     assert done.status == 130
@@ -95,7 +88,7 @@ def ended_by_fault(live: Live, done: Done) -> None:
 
 def test_a_killed_worker_is_said(evedrop: Evedrop) -> None:
     """Exit 3 and one line with the signal and a remedy; no process left, and no folder that pretends to be a study."""
-    live, crew = started(evedrop, "montecarlo", 2)
+    live, crew = started(evedrop, 2)
     os.kill(crew[-1], signal.SIGKILL)
     done = live.end()
     no_process_left(live)
@@ -107,10 +100,21 @@ def test_a_killed_worker_is_said(evedrop: Evedrop) -> None:
 
 def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
     """Kill -9 of the command itself: the workers notice that nobody listens."""
-    live, _ = started(evedrop, "montecarlo", 2)
+    live, _ = started(evedrop, 2)
     live.process.kill()
     live.process.communicate()
     no_process_left(live)
+
+
+def test_a_worker_is_given_no_tokens(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the environment of the command it gets what it needs to run, and nothing else."""
+    monkeypatch.setenv("ACCESS_TOKEN", "only the command has this")
+    live, crew = started(evedrop, 2)
+    given = [Path(f"/proc/{pid}/environ").read_bytes() for pid in crew]
+    live.process.terminate()
+    live.end()
+    assert not [one for one in given if b"ACCESS_TOKEN" in one]
+    assert all(b"PATH=" in one for one in given)
 
 
 def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -133,6 +137,19 @@ def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch,
     assert results.digests.num_rows == 1000 * 4
 
 
+@given(st.integers(1, 40_000), st.integers(1, 9), st.integers(0, 10**9))
+def test_workers_end_together(trials: int, workers: int, first: int) -> None:
+    """Tasks are whole blocks, all trials once and in order; none is a block longer than another, and all have as many."""
+    tasks = tasks_of(SCENARIO.model_copy(update={"trials": trials, "first_trial": first}), Mode.EXACT, workers)
+    assert [task.start for task in tasks] == [first, *(task.stop for task in tasks[:-1])]
+    assert tasks[-1].stop == first + trials
+    blocks = [-(-(task.stop - task.start) // BLOCK_TRIALS) for task in tasks]
+    assert sum(blocks) == -(-trials // BLOCK_TRIALS)
+    assert max(blocks) - min(blocks) <= 1
+    assert max(blocks) <= 4
+    assert len(tasks) % workers == 0 or set(blocks) == {1}
+
+
 def test_a_failing_worker_says_what_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     """An error inside a worker comes back as one line with its kind."""
     scenario = load("eavesdroppers", {"slots": 10, "trials": 1500})
@@ -143,16 +160,10 @@ def test_a_failing_worker_says_what_failed(monkeypatch: pytest.MonkeyPatch) -> N
         next(results)
 
 
-def small_files() -> None:
-    """Files beyond 200 kB fail to be written, as on a full disk."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
-
-
 def test_a_full_disk_is_said(evedrop: Evedrop) -> None:
-    """Exit 3 and one line that names the folder, no traceback."""
-    limits: Callable[[], None] = small_files
-    done = evedrop("montecarlo", "eavesdroppers", "--slots", "3000", "--trials", "3", "--out", "run", preexec_fn=limits)
+    """Files can grow no further: exit 3 and one line that names the folder, no traceback."""
+    study = ("montecarlo", "eavesdroppers", "--slots", "3000", "--trials", "3")
+    done = evedrop.started(*study, largest_file=200_000).end()
     assert done.status == 3
     (line,) = done.err.splitlines()
     assert line.startswith("evedrop: run cannot be written (")
@@ -160,20 +171,9 @@ def test_a_full_disk_is_said(evedrop: Evedrop) -> None:
 
 def test_an_interrupted_sweep_keeps_finished_points(evedrop: Evedrop) -> None:
     """The points that were done are in the table, the plot is drawn, exit 130."""
-    arguments = (
-        "sweep",
-        "eavesdroppers",
-        "--over",
-        "slots=20,100000",
-        "--trials",
-        "1500",
-        "--workers",
-        "2",
-        "--out",
-        "run",
-    )
-    live = Live(evedrop._start(arguments, {}), evedrop.temporary, evedrop.folder / "run")
-    wait_until(lambda: at_work(live, 2), "workers at work on the second point")
+    points = ("--over", "slots=20,400000")
+    live = evedrop.started("sweep", "eavesdroppers", *points, "--trials", "1000", "--workers", "2")
+    live.running(more_than=20 * 1000)  # that is, when the second point is under way
     live.process.send_signal(signal.SIGINT)
     done = live.end()
     assert done.status == 130

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from unittest.mock import patch
 
 import pytest
 from simulated_run import Simulated, orbit, simulate
+
+from emulator.view import recording
+from tests.conftest import LIMIT
+
+
+@pytest.fixture(scope="session", autouse=True)
+def unhurried() -> Iterator[None]:
+    """However busy the machine is, it gets the time to finish the file of a recording."""
+    with patch.object(recording, "_FILE_TIMEOUT", LIMIT):
+        yield
 
 
 @pytest.fixture(scope="session")

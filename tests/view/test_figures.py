@@ -1,26 +1,37 @@
+import io
 import re
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from emulator import cli
+from emulator.view import figures
 from emulator.view import figures_microgrid as microgrid
-from emulator.view.figures import Size, figures
+from emulator.view.figures import Size
 
 NAMES = ("numerical", "microgrid", "strategies", "chain")
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """figures.md of a small set of figures, made in a directory that did not exist."""
-    lines: list[str] = []
-    path = figures(
-        tmp_path_factory.mktemp("figures") / "new" / "folder",
-        lines.append,
-        Size(microgrid_trials=20, microgrid_slots=1000, strategy_trials=2000, chain_trials=50, chain_slots=300),
-    )
-    assert lines, "progress was never reported"
-    return path
+    """figures.md of a small set of figures, made by the command in a directory that did not exist."""
+    small = Size(microgrid_trials=20, microgrid_slots=1000, strategy_trials=2000, chain_trials=50, chain_slots=300)
+    folder = tmp_path_factory.mktemp("figures") / "new" / "folder"
+    out, err = io.StringIO(), io.StringIO()
+    with patch.object(figures, "Size", lambda **_: small), redirect_stdout(out), redirect_stderr(err):
+        assert cli.main(["figures", str(folder)]) == 0
+    assert out.getvalue() == f"{folder / 'figures.md'}\n"
+    assert "numerical illustration" in err.getvalue(), "progress was never reported"
+    return folder / "figures.md"
+
+
+def test_nothing_else_is_written(report: Path) -> None:
+    """A picture for the screen and one for print of each figure, and the report."""
+    pictures = {f"{name}.{kind}" for name in NAMES for kind in ("png", "pdf")}
+    assert {path.name for path in report.parent.iterdir()} == {"figures.md", *pictures}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -28,7 +28,7 @@ def filled(png: bytes) -> float:
     return float(np.mean(inside != np.bincount(inside.ravel()).argmax()))
 
 
-@pytest.mark.parametrize(("n", "growth"), [(2, 1.0), (1, 1.0), (2, 1.12), (4, 1.0)])
+@pytest.mark.parametrize(("n", "growth"), [(1, 1.0), (2, 1.12), (4, 1.0)])
 def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """Whatever the process, each panel draws something, in more than one colour, and complains of nothing."""
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
@@ -67,6 +67,28 @@ def test_missing_driver_is_named(
     rrd = recorded(simulated(20), tmp_path / "r.rrd")
     with pytest.raises(UsageError, match="mesa-vulkan-drivers"):
         picture(rrd, tmp_path / "r.png")
+
+
+BROKEN: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda _: b"",
+    "not a recording": lambda _: b"nonsense" * 100,
+    "cut short": lambda whole: whole[: len(whole) // 2],
+    "damaged": lambda whole: whole[:2000] + bytes(500) + whole[2500:],
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_recording_is_said_before_a_viewer_is_started(
+    what: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line with the file, what is wrong and a remedy; the viewer would wait for ever."""
+    monkeypatch.setattr("emulator.view.picture.spawn", lambda *_, **__: pytest.fail("a viewer was started"))
+    rrd = recorded(simulated(60), tmp_path / "r.rrd")
+    rrd.write_bytes(BROKEN[what](rrd.read_bytes()))
+    with pytest.raises(UsageError, match="is broken") as told:
+        picture(rrd, tmp_path / "r.png")
+    assert str(told.value).startswith(f"{rrd} is broken (")
+    assert "\n" not in str(told.value)
 
 
 def test_missing_recording_is_named(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from simulated_run import Simulated
 
 from emulator.view import plane
 from emulator.view.recording import Recording, Scene
+from tests.conftest import LIMIT
 
 SLOTS = 400
 
@@ -153,6 +155,17 @@ def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) ->
     assert "No such file" in recording.failure
 
 
+def test_slots_that_cannot_be_drawn_end_the_recording_and_not_the_run(
+    run: Simulated, simulated: Callable[..., Simulated], tmp_path: Path
+) -> None:
+    """Slots of another process than the scene's: adding and closing end, and the reason is kept."""
+    recording = Recording(tmp_path / "r.rrd", simulated(50, n=1).scene, None)
+    smart = run.slots.peers["smart"]
+    recording.add(replace(run.slots, peers={name: replace(smart, x_hat=smart.x_hat[:3]) for name in run.slots.peers}))
+    recording.close()
+    assert recording.failure is not None
+
+
 FULL_DISK = """
 import os, resource, signal, sys
 sys.path.insert(0, sys.argv[1])
@@ -174,7 +187,7 @@ os._exit(0)
 def test_full_disk_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
     """When the file can grow no more, adding and closing still end in time, and the reason is kept."""
     command = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent), str(tmp_path / "r.rrd")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=True)
     assert done.stdout.startswith("unsafe the recording is incomplete")
 
 

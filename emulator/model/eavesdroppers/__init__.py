@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from emulator.model.eavesdroppers.colluding import Colluding
 from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
-from emulator.model.eavesdroppers.naive import Naive
-from emulator.model.eavesdroppers.smart import Smart
-from emulator.model.eavesdroppers.suspicious import Suspicious
+from emulator.model.eavesdroppers.readers import READERS
+from emulator.model.eavesdroppers.replay_informed import ReplayInformed
 
-STRATEGIES: Mapping[str, type[Eavesdropper]] = {"naive": Naive, "suspicious": Suspicious, "smart": Smart}
+STRATEGIES: Mapping[str, type[Eavesdropper]] = {
+    **READERS,
+    "colluding": Colluding,
+    "replay-informed": ReplayInformed,
+}
+
+__all__ = ["READERS", "STRATEGIES"]

@@ -1,14 +1,18 @@
-"""What an eavesdropper of the paper's class may be handed, and how it is made."""
+"""What an eavesdropper may be handed, what it must say of itself, and how it is made."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
+
+import numpy as np
 
 from emulator.model.packet_user import PacketUser
-from emulator.model.process import Process
+from emulator.model.process import Floats, Process
+from emulator.model.receiver import Belief, Codes, Flags, Receiver
+from emulator.model.theory import Outcomes, OutcomesAt
 from emulator.streams import Batch
 
 
@@ -19,21 +23,87 @@ class Knowledge:
     process: Process
     state_probability: float
     """μ_d."""
-    parameters: Mapping[str, float]
+    parameters: Mapping[str, Any]
     keys: Mapping[str, bytes]
-    """Of the strategy's `streams`: `schedule`, and `coin` for its own random numbers."""
+    """Of the strategy's streams: `schedule`, and `coin` for its own random numbers."""
 
 
-class Eavesdropper(PacketUser):
-    """A strategy: which packets it takes for the state. `streams` and `parameters` name what it must be given."""
+class Eavesdropper(Receiver):
+    """A strategy: how an eavesdropper reads packets. `parameters` are the entries that a scenario must give it."""
 
-    streams: ClassVar[tuple[str, ...]] = ()
     parameters: ClassVar[tuple[str, ...]] = ()
+    pools_links: ClassVar[bool] = False
+    """Whether it has several links in place of one: what any of them delivers, it hears."""
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge.process, batch.trials)
 
     @classmethod
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
+        """The streams whose keys it must be given: of the secret, or `coin`, its own."""
+        del parameters
+        return ()
+
+    @classmethod
     @abstractmethod
-    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
+        """What it does with a slot behind a link of any quality μ_e, for the theory; None: no closed form is known."""
+
+    @classmethod
+    @abstractmethod
+    def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
+        """Whether γ alone tells its actions, and these, by the table of `model.update`, its covariances."""
+
+    @classmethod
+    def betrayed(cls, parameters: Mapping[str, Any]) -> int | None:
+        """The slot whose true state must be handed to it, as `Heard.truth`; None for almost everybody."""
+        del parameters
+        return None
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:  # noqa: ARG002 - who remembers slots wants theirs
+        """Belief of who, besides what it believes after slot k, is told that slot's state x (n, R)."""
+        n, trials = x.shape
+        return Belief(x, np.zeros((n, n, trials)), belief.action)
+
+
+class PacketTaker(PacketUser, Eavesdropper):
+    """The paper's class: takes a packet for the state, or ignores it.
+
+    Source: docs/mathematics.md, eavesdroppers.
+    """
+
+    @classmethod
+    @abstractmethod
+    def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:
         """P(b = 1 given ν = 0) and P(b = 1 given ν = 1), for the theory."""
+
+    @classmethod
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
+        """By its two probabilities."""
+        use_state, use_innovation = cls.use_probabilities(parameters)
+        return lambda mu_e: Outcomes.eavesdropper(mu_e, mu_d, use_state, use_innovation)
+
+    @classmethod
+    def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:  # noqa: ARG003 - alike for all
+        """By definition."""
+        return True
+
+
+class PacketReader(Eavesdropper):
+    """Looks into the packets, or uses more of them than the state: its covariance is its own affair."""
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """Not known. Raises NotImplementedError; studies that ask for it refuse the strategy before."""
+        raise NotImplementedError(
+            f"{type(self).__name__} reads the packet of slot {k}: γ alone does not tell its action"
+        )
+
+    @classmethod
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:  # noqa: ARG003 - alike for all
+        """No closed form."""
+        return None
+
+    @classmethod
+    def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:  # noqa: ARG003 - alike for all
+        """By definition not."""
+        return False

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
+from emulator.model.eavesdroppers.eavesdropper import PacketTaker
 from emulator.model.receiver import Flags
 
 
-class Naive(Eavesdropper):
+class Naive(PacketTaker):
     """b_k = 1 always; it is given nothing.
 
     Source: the paper, naive eavesdropper.
     """
 
     @classmethod
-    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:  # noqa: ARG003 - it has none
+    def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:  # noqa: ARG003 - it has none
         """Certain for either type."""
         return 1.0, 1.0
 

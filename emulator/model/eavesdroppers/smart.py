@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
 from emulator.model.receiver import Flags
 from emulator.model.schedule import Schedule
 from emulator.streams import Batch
 
 
-class Smart(Eavesdropper):
+class Smart(PacketTaker):
     """b_k = 1 − ν_k; it is given the schedule. Its believed covariance is the true one.
 
     Source: the paper, smart eavesdropper.
     """
-
-    streams = ("schedule",)
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
 
     @classmethod
-    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:  # noqa: ARG003 - it has none
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
+        """The schedule."""
+        return ("schedule",)
+
+    @classmethod
+    def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:  # noqa: ARG003 - it has none
         """Every state, no innovation."""
         return 1.0, 0.0
 

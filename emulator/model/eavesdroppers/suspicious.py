@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
 from emulator.model.receiver import Flags
 from emulator.model.schedule import Schedule
 from emulator.streams import Batch, BlockReader
 
 
-class Suspicious(Eavesdropper):
+class Suspicious(PacketTaker):
     """Uses a state with probability `use_state` (μ_b), an innovation with `use_innovation` (μ̄_b), by its own coin.
 
     Source: the paper, suspicious eavesdropper.
     """
 
-    streams = ("schedule", "coin")
     parameters = ("use_state", "use_innovation")
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
@@ -29,7 +29,12 @@ class Suspicious(Eavesdropper):
         self._slots = range(0)
 
     @classmethod
-    def use_probabilities(cls, parameters: Mapping[str, float]) -> tuple[float, float]:
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
+        """The schedule, which it tests imperfectly, and its own coin."""
+        return "schedule", "coin"
+
+    @classmethod
+    def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:
         """μ_b and μ̄_b."""
         return parameters["use_state"], parameters["use_innovation"]
 

@@ -6,26 +6,27 @@ from collections.abc import Mapping
 from typing import Any
 
 from emulator.model.links.bernoulli import Bernoulli
+from emulator.model.links.distance import Distance
 from emulator.model.links.gilbert_elliott import GilbertElliott
-from emulator.model.links.link import Link, LossModel
+from emulator.model.links.link import LossModel
 from emulator.model.links.markov import Markov
 from emulator.model.links.pattern import Pattern
-from emulator.streams import Batch
+from emulator.model.links.pooled import Pooled
+from emulator.model.links.trace import Trace
 
 LOSS_MODELS: Mapping[str, type[LossModel]] = {
     "bernoulli": Bernoulli,
+    "distance": Distance,
     "gilbert-elliott": GilbertElliott,
     "markov": Markov,
     "pattern": Pattern,
+    "trace": Trace,
 }
 
 
 def loss_of(spec: Mapping[str, Any]) -> LossModel:
-    """The loss model that a scenario describes: `{"model": …, …parameters}`."""
+    """The loss model that a scenario describes: `{"model": …, …parameters}`, or `{"model": "pooled", "links": […]}`."""
+    if spec["model"] == "pooled":
+        return Pooled([loss_of(one) for one in spec["links"]])
     parameters = {name: value for name, value in spec.items() if name != "model"}
     return LOSS_MODELS[spec["model"]](**parameters)
-
-
-def link_of(spec: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
-    """The link that a scenario describes, with its own random stream."""
-    return Link(loss_of(spec), key, batch)

@@ -1,20 +1,67 @@
-"""Checks that loss models share."""
+"""Checks that loss models share, and how a message writes the value it complains of."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
 from typing import Any
+
+_SHOWN = 60  # characters of a value that a message repeats
+
+
+def toml_of(value: Any) -> str:
+    """A value as a scenario writes it, in one line."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml_of(inner)}" for key, inner in value.items()) + " }" if value else "{}"
+    if isinstance(value, list):
+        return f"[{', '.join(toml_of(inner) for inner in value)}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
+
+
+def as_toml(value: Any) -> str:
+    """The same for a message: cut where it is long."""
+    text = toml_of(value[: _SHOWN + 1] if isinstance(value, (str, list)) else value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> bool:
+    """Whether a value is a finite number from `least` to `most`."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and least <= value <= most and abs(value) < math.inf
 
 
 def is_probability(value: Any) -> bool:
     """Whether a value is a number from 0 to 1."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0.0 <= value <= 1.0
+    return is_number(value, 0.0, 1.0)
+
+
+def number_mistakes(given: Mapping[str, Any], name: str, least: float, most: float) -> list[tuple[str, str]]:
+    """A mistake if the entry is there and no number from `least` to `most`."""
+    if name not in given or is_number(given[name], least, most):
+        return []
+    return [(name, f"is {as_toml(given[name])}; expected a number from {least:g} to {most:g}")]
 
 
 def probability_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
     """A mistake for every one of the names that is given and no probability."""
+    return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, 1.0)]
+
+
+def flag_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
+    """A mistake for every one of the names that is given and neither true nor false."""
     return [
-        (name, f"is {given[name]!r}; expected a number from 0 to 1")
+        (name, f"is {as_toml(given[name])}; expected true or false")
         for name in names
-        if name in given and not is_probability(given[name])
+        if name in given and not isinstance(given[name], bool)
     ]
+
+
+def word_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
+    """A mistake if the entry is there and no word of zeros and ones."""
+    word = given.get(name, "1")
+    if isinstance(word, str) and word and not set(word) - {"0", "1"}:
+        return []
+    return [(name, f'is {as_toml(word)}; expected a word of 0 (lost) and 1 (delivered), such as "1101"')]

@@ -60,31 +60,25 @@ class GilbertElliott(LossModel):
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
         """By the state of every slot and a second uniform number."""
-        bad = self._states(uniforms[:, 0, :])
-        loss = np.where(bad, self._bad, self._good)
-        return fates_of(uniforms[:, 1, :] < loss)
+        bad, v = self._states(uniforms[:, 0, :]), uniforms[:, 1, :]
+        in_good, in_bad = v < self._good, v < self._bad
+        return fates_of(in_good ^ (bad & (in_good ^ in_bad)))
 
     def _states(self, u: Floats) -> Flags:
-        """Bad or not, (slots, R): each u maps the state before to the next; the maps are composed for all slots at once.
+        """Bad or not, (slots, R): a u below p turns good into bad, one below r turns bad into good.
 
-        A u below p turns good into bad, one below r turns bad into good. Where both maps agree the past is forgotten; in
-        between, what is left are slots that keep the state and slots that swap it.
+        Slot by slot in two operations on truth values: what comes of good, and whether bad comes to something else.
         """
+        states = u < self._p
+        differs = states ^ (u >= self._r)
         if self._state is None:
-            self._state = np.empty(u.shape[1], np.bool_)
-            opening = u[0] < self._stationary_bad
+            states[0] = u[0] < self._stationary_bad
         else:
-            opening = np.where(self._state, u[0] >= self._r, u[0] < self._p)
-        from_good, from_bad = u < self._p, u >= self._r
-        forgets = from_good == from_bad
-        forgets[0] = True
-        values = from_good.copy()
-        values[0] = opening
-        swaps = from_good & ~from_bad
-        swaps[0] = False
-        slots = np.arange(len(u))[:, None]
-        last = np.maximum.accumulate(np.where(forgets, slots, 0), axis=0)
-        odd = np.logical_xor.accumulate(swaps, axis=0)
-        states: Flags = np.take_along_axis(values ^ odd, last, axis=0) ^ odd
+            states[0] ^= self._state & differs[0]
+        before = states[0]
+        for after, differ in zip(states[1:], differs[1:], strict=True):
+            np.bitwise_and(differ, before, out=differ)
+            np.bitwise_xor(after, differ, out=after)
+            before = after
         self._state = states[-1].copy()
         return states

@@ -1,4 +1,4 @@
-"""What a link model is: from random numbers to the fate of every packet. The router only carries fates out."""
+"""What a loss model is: from random numbers to which packets are lost. The rest of a link is in `emulator.model.link`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.model.links.counting import count_variance
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
-from emulator.streams import Batch, BlockReader
 
 
 class Fate(IntEnum):
@@ -22,12 +22,31 @@ class Fate(IntEnum):
     DELIVERED = 0
     LOST = 1
     """Erased by the link's loss model."""
+    CORRUPTED = 2
+    """Damaged on the way, which its checksum tells."""
+    OVERFLOW = 3
+    """The queue before a link of limited rate was full."""
+    CUT = 4
+    """Sent while the link was cut."""
+    LATE = 5
+    """Delayed by more slots than the receiver can still make use of."""
+    DOWN = 6
+    """Its receiver was down on the way."""
+    PAUSED = 7
+    """Its receiver was paused on the way."""
+    UNDERWAY = 8
+    """Still under way when the run ended."""
+    UNSENT = 9
+    """There was no packet: the scheme stayed silent."""
+
+
+REASONS = tuple(fate.name.lower() for fate in Fate if fate not in (Fate.DELIVERED, Fate.UNSENT))
+"""Why a packet is lost, in the order of `Fate`."""
 
 
 def losses(fates: Codes) -> dict[str, NDArray[np.uint32]]:
     """Reason → packets lost for it in each slot, (slots,), from fates (slots, R)."""
-    reasons = [reason for reason in Fate if reason is not Fate.DELIVERED]
-    return {reason.name.lower(): np.asarray((fates == reason).sum(axis=1), np.uint32) for reason in reasons}
+    return {reason: np.asarray((fates == code).sum(axis=1), np.uint32) for code, reason in enumerate(REASONS, 1)}
 
 
 def fates_of(lost: Flags) -> Codes:
@@ -62,7 +81,7 @@ class LossModel(ABC):
 
     parameters: ClassVar[Mapping[str, Any]]
     optional: ClassVar[frozenset[str]] = frozenset()
-    uniforms_per_slot: ClassVar[int] = 1
+    uniforms_per_slot: int = 1
 
     @classmethod
     @abstractmethod
@@ -74,6 +93,31 @@ class LossModel(ABC):
     def quality(self) -> float:
         """Mean probability that a packet is delivered."""
 
+    def quality_at(self, slots: range) -> Floats:
+        """Probability that the packet of each of these slots is delivered, (slots,): not given the past."""
+        return np.full(len(slots), self.quality)
+
+    def rate_variance(self, slots: range) -> float:
+        """Variance, over trials, of one trial's fraction of delivered packets over these slots.
+
+        From the chain, or from independence; a model with neither has its own.
+        """
+        chain, count = self.chain, len(slots)
+        if chain is not None:
+            return count_variance(chain.transitions, chain.law, chain.quality, count) / count**2
+        quality = self.quality_at(slots)
+        return float((quality * (1.0 - quality)).sum()) / count**2
+
+    @property
+    def memoryless(self) -> bool:
+        """Whether the fates of different slots are independent of each other, be they alike, different, or certain."""
+        return self.chain is not None and self.chain.independent
+
+    @property
+    def settles(self) -> bool:
+        """Whether the probability of a delivery is the same from some slot on, so that an error can have a limit."""
+        return self.chain is not None
+
     @property
     def chain(self) -> Chain | None:
         """The Markov chain that the losses follow, from which theory can reckon; None if there is none."""
@@ -83,20 +127,6 @@ class LossModel(ABC):
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """`Fate` of each packet of the next slots, (slots, R), from uniforms (slots, uniforms_per_slot, R).
 
-        first: the first of the slots, which follow on those of the call before.
+        first: the first of the slots, which follow on those of the call before. What a model remembers it replaces and
+        never changes in place, so that a shallow copy of it can go on from where it was.
         """
-
-
-class Link:
-    """The way from the router to one receiver: a loss model and its own random stream.
-
-    Final. Must be read in order, any number of slots at a time.
-    """
-
-    def __init__(self, loss: LossModel, key: bytes, batch: Batch) -> None:
-        self._loss = loss
-        self._reader = BlockReader(key, batch, loss.uniforms_per_slot)
-
-    def fates(self, slots: range) -> Codes:
-        """`Fate` of the packets of the next slots in every trial, (slots, R)."""
-        return self._loss.fates(slots.start, self._reader.uniforms(slots))

@@ -9,14 +9,16 @@ from types import MappingProxyType
 from typing import Any, TypeGuard
 
 import numpy as np
+from numpy.typing import NDArray
 
-from emulator.model.links.checks import is_probability
+from emulator.model.links.checks import as_toml, is_probability
 from emulator.model.links.link import Chain, LossModel, fates_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
 
 _SUM = 1e-9  # how far a row may be from summing to 1
 _MOST_STATES = 64
+_FEW = 24  # marks up to which it is quicker to compare with each than to search
 
 
 class Markov(LossModel):
@@ -32,10 +34,14 @@ class Markov(LossModel):
 
     def __init__(self, transitions: list[list[float]], loss: list[float]) -> None:
         matrix = self._transitions = np.array(transitions, np.float64)
-        self._cumulative = np.cumsum(matrix, axis=1)[:, :-1]
         self._loss = np.array(loss, np.float64)
         self._stationary = stationary(matrix)
-        self._state: np.ndarray[tuple[int, ...], np.dtype[np.intp]] | None = None
+        self._opening = _bounds(self._stationary[None])[0]
+        bounds = _bounds(matrix)
+        self._marks = np.unique(bounds)
+        # Row j: the state that each state goes to for a u that j of the marks do not exceed.
+        self._next = np.array([(u >= bounds).sum(axis=1) for u in (-1.0, *self._marks)], np.intp)
+        self._state: NDArray[np.intp] | None = None  # in the slot before, (R,)
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -48,7 +54,7 @@ class Markov(LossModel):
             right = isinstance(loss, list) and all(is_probability(value) for value in loss)
             if not right or (_square(rows) and len(loss) != len(rows)):
                 count = f"{len(rows)} numbers" if _square(rows) else "numbers"
-                found.append(("loss", f"is {loss!r}; expected {count} from 0 to 1, one for each state"))
+                found.append(("loss", f"is {as_toml(loss)}; expected {count} from 0 to 1, one for each state"))
         return found
 
     @property
@@ -64,15 +70,47 @@ class Markov(LossModel):
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
         """By the state of every slot and a second uniform number."""
-        loss = np.empty(uniforms[:, 0, :].shape)
-        for row, u in enumerate(uniforms[:, 0, :]):
-            if self._state is None:
-                bounds = np.broadcast_to(np.cumsum(self._stationary)[:-1], (u.size, len(self._loss) - 1))
+        return fates_of(uniforms[:, 1, :] < self._loss[self._states(uniforms[:, 0, :])])
+
+    def _states(self, u: Floats) -> NDArray[np.intp]:
+        """The state of every slot, (slots, R): where u is among all states' bounds, and then what that makes of the state.
+
+        The first is done for all slots at once; the rest is a look into a table for each slot.
+        """
+        places = _rank(self._marks, u)
+        places *= len(self._loss)
+        table = self._next.reshape(-1)
+        before = self._state
+        for row, place in enumerate(places):
+            if before is None:
+                place[:] = (u[row] >= self._opening[:, None]).sum(axis=0)
             else:
-                bounds = self._cumulative[self._state]
-            self._state = (u[:, None] >= bounds).sum(axis=1)
-            loss[row] = self._loss[self._state]
-        return fates_of(uniforms[:, 1, :] < loss)
+                np.add(place, before, out=place)
+                place[:] = np.take(table, place, mode="clip")
+            before = place
+        self._state = places[-1].copy()
+        return places
+
+
+def _bounds(rows: Floats) -> Floats:
+    """Where the uniform numbers of each state but the last end, (rows, states − 1).
+
+    Sums of rows are rounded: the last state that a row can lead to takes what is left.
+    """
+    bounds: Floats = np.cumsum(rows, axis=1)
+    last = rows.shape[1] - 1 - np.argmax(rows[:, ::-1] > 0.0, axis=1)
+    bounds[np.arange(rows.shape[1]) >= last[:, None]] = 1.0
+    return bounds[:, :-1]
+
+
+def _rank(marks: Floats, u: Floats) -> NDArray[np.intp]:
+    """How many of the marks, which ascend, each u is not below; the shape of u."""
+    if len(marks) > _FEW:
+        return np.searchsorted(marks, u.reshape(-1), side="right").reshape(u.shape)
+    rank = np.zeros(u.shape, np.intp)
+    for mark in marks:
+        rank += u >= mark
+    return rank
 
 
 def _square(rows: Any) -> TypeGuard[list[list[Any]]]:
@@ -91,7 +129,7 @@ def _matrix_mistakes(rows: Any) -> list[str]:
     found = []
     for i, row in enumerate(rows):
         if not all(is_probability(value) for value in row):
-            found.append(f"row {i} is {row}; expected numbers from 0 to 1")
+            found.append(f"row {i} is {as_toml(row)}; expected numbers from 0 to 1")
         elif abs(sum(row) - 1.0) > _SUM:
             found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
     if not found and not _common(rows):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from emulator.model.links.checks import word_mistakes
 from emulator.model.links.link import LossModel, fates_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
@@ -25,15 +26,25 @@ class Pattern(LossModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A word of zeros and ones."""
-        outcomes = given.get("outcomes", "1")
-        if not isinstance(outcomes, str) or not outcomes or set(outcomes) - {"0", "1"}:
-            return [("outcomes", f'is {outcomes!r}; expected a word of 0 (lost) and 1 (delivered), such as "1101"')]
-        return []
+        return word_mistakes(given, "outcomes")
 
     @property
     def quality(self) -> float:
         """The fraction of ones."""
         return float(1.0 - self._lost.mean())
+
+    @property
+    def memoryless(self) -> bool:
+        """Everything is certain."""
+        return True
+
+    def quality_at(self, slots: range) -> Floats:
+        """0 or 1."""
+        return np.asarray(~self._lost[np.arange(slots.start, slots.stop) % len(self._lost)], np.float64)
+
+    def rate_variance(self, slots: range) -> float:  # noqa: ARG002 - no trial differs from another
+        """None."""
+        return 0.0
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """By the slot alone."""

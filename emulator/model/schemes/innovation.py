@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +12,9 @@ from emulator.model import update
 from emulator.model.process import Floats, Process, StateFactors, product
 from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
 from emulator.model.schedule import Schedule
+from emulator.model.schemes.checks import probability_mistakes
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
 from emulator.streams import Batch, BlockReader
 
 
@@ -96,11 +100,29 @@ class InnovationEstimator(Receiver):
 
 
 class Innovation(Scheme):
-    """The paper's scheme; needs no acknowledgements."""
+    """The paper's scheme; needs no acknowledgements. `state_probability` is μ_d."""
 
+    parameters = MappingProxyType({"state_probability": 0.6})
     secret_streams = ("schedule", "noise")
-    mixes = True
+    estimator_streams = ("schedule", "noise")
+    secret_words = (1, 1)
+
+    def __init__(self, process: Process, state_probability: float) -> None:
+        super().__init__(process, state_probability)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """μ_d is a probability."""
+        return probability_mistakes(given, "state_probability")
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """Schedule and noise."""
         return SharedSecret(self.process, self.state_probability, keys, batch)
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """Theorem IV.1."""
+        return Outcomes.legitimate(mu, self.state_probability)
+
+    def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
+        """Lemma V.1."""
+        return Outcomes.eavesdropper(mu_e, self.state_probability, use_state, use_innovation)

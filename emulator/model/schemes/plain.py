@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from emulator.model.packet_user import PacketUser
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Flags, Receiver
-from emulator.model.schemes.scheme import Encoder, Packet, Scheme, Shared
+from emulator.model.process import Floats
+from emulator.model.receiver import Flags
+from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
 from emulator.streams import Batch
 
 
@@ -29,36 +30,18 @@ class PlainEstimator(PacketUser):
         return None
 
 
-class NothingShared(Shared):
-    """ν = 0 and χ = 0 always."""
-
-    def __init__(self, process: Process, trials: int) -> None:
-        self._process = process
-        self._trials = trials
-
-    def nu(self, k: int) -> Flags:  # noqa: ARG002 - every slot alike
-        """No innovations, (R,)."""
-        return np.zeros(self._trials, np.bool_)
-
-    def chi(self, k: int) -> Floats:  # noqa: ARG002 - every slot alike
-        """No noise, (n, R)."""
-        return np.zeros((self._process.n, self._trials))
-
-    def encoder(self) -> Encoder:
-        """The sensor's side."""
-        return PlainEncoder()
-
-    def estimator(self) -> Receiver:
-        """The legitimate estimator's side."""
-        return PlainEstimator(self._process, self._trials)
-
-
 class Plain(Scheme):
     """Every packet is the state, μ_d = 1; there is no secret."""
 
-    secret_streams = ()
-    mixes = False
-
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:  # noqa: ARG002 - there is no secret
         """Nothing."""
-        return NothingShared(self.process, batch.trials)
+        trials = batch.trials
+        return NoInnovations(self.process, trials, PlainEncoder, lambda: PlainEstimator(self.process, trials))
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet."""
+        return Outcomes.plain(mu)
+
+    def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
+        """As in the paper, with μ_d = 1."""
+        return Outcomes.eavesdropper(mu_e, 1.0, use_state, use_innovation)

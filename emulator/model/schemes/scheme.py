@@ -1,17 +1,21 @@
-"""What a scheme is: an encoder for the sensor and the estimator that can read it."""
+"""What a scheme is: an encoder for the sensor, the estimator that can read it, and what the two of them need and cost."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.process import Floats, Process
 from emulator.model.receiver import Flags, Receiver
+from emulator.model.theory import Outcomes
 from emulator.streams import Batch
+
+_WORD_BITS = 64
 
 
 class Packet(NamedTuple):
@@ -58,16 +62,70 @@ class Shared(ABC):
         """The legitimate estimator's side."""
 
 
+class NoInnovations(Shared):
+    """What the two sides of a scheme without innovations share: ν = 0 and χ = 0 always. Final."""
+
+    def __init__(
+        self, process: Process, trials: int, encoder: Callable[[], Encoder], estimator: Callable[[], Receiver]
+    ) -> None:
+        self._process = process
+        self._trials = trials
+        self._encoder = encoder
+        self._estimator = estimator
+
+    def nu(self, k: int) -> Flags:  # noqa: ARG002 - every slot alike
+        """No innovations, (R,)."""
+        return np.zeros(self._trials, np.bool_)
+
+    def chi(self, k: int) -> Floats:  # noqa: ARG002 - every slot alike
+        """No noise, (n, R)."""
+        return np.zeros((self._process.n, self._trials))
+
+    def encoder(self) -> Encoder:
+        """The sensor's side."""
+        return self._encoder()
+
+    def estimator(self) -> Receiver:
+        """The legitimate estimator's side."""
+        return self._estimator()
+
+
 class Scheme(ABC):
-    """One way to fill packets. `state_probability` is μ_d, public; the keys of `secret_streams` are the secret."""
+    """One way to fill packets. The keys of `secret_streams` are the secret; all else about a scheme is public.
 
-    secret_streams: ClassVar[tuple[str, ...]]
-    mixes: ClassVar[bool]
-    """Whether packets are of two types, so that μ_d must be given."""
+    A file of this folder holds one scheme, and its name in a scenario is that of the file with - for _. `parameters` are
+    the entries that the scenario's `[encoding]` gives it, each with an example; they are the constructor's arguments.
 
-    def __init__(self, process: Process, state_probability: float) -> None:
+    Source: docs/schemes.md.
+    """
+
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    secret_streams: ClassVar[tuple[str, ...]] = ()
+    """The streams that the sensor draws from."""
+    estimator_streams: ClassVar[tuple[str, ...]] = ()
+    """Those of them whose keys the legitimate estimator holds as well."""
+    needs_acknowledgements: ClassVar[bool] = False
+    """Whether the encoder depends on `Encoder.acknowledged`."""
+    reads_packets: ClassVar[bool] = False
+    """Whether what the estimator does with a slot depends on more than γ and the secret, so that `Receiver.act` cannot
+    tell it and only a simulation of packets can follow it."""
+    may_be_silent: ClassVar[bool] = False
+    """Whether there are slots in which it sends nothing, so that its packets have `Packet.sent`."""
+    header: ClassVar[tuple[str, ...]] = ()
+    """What each number of the header means."""
+    secret_words: ClassVar[tuple[int, int]] = (0, 0)
+    """64-bit words of shared secret that a slot uses: so many, and so many more for each state."""
+
+    def __init__(self, process: Process, state_probability: float = 1.0) -> None:
         self.process = process
         self.state_probability = state_probability
+        """Probability that a slot k ≥ 1 holds the state, public: μ_d; 1 for a scheme that has no such parameter."""
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        del given
+        return []
 
     @abstractmethod
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
@@ -78,5 +136,33 @@ class Scheme(ABC):
         return self.shared(keys, batch).encoder()
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
-        """The legitimate estimator's side alone."""
+        """The legitimate estimator's side alone; keys holds those of `estimator_streams`."""
         return self.shared(keys, batch).estimator()
+
+    def initial_state(self, keys: Mapping[str, bytes], batch: Batch) -> Floats | None:
+        """x_0 (n, R), if the secret decides it; None where the process alone does."""
+        del keys, batch
+        return None
+
+    @property
+    def packet_bits(self) -> int:
+        """Size of a packet's payload and header."""
+        return _WORD_BITS * (self.process.n + len(self.header))
+
+    @property
+    def secret_bits(self) -> int:
+        """Shared secret that a slot uses up: bits of the streams' words, all of them expanded from 256-bit keys."""
+        fixed, per_state = self.secret_words
+        return _WORD_BITS * (fixed + per_state * self.process.n)
+
+    @abstractmethod
+    def outcomes(self, mu: float) -> Outcomes | None:
+        """What the legitimate estimator does with a slot, behind a link of quality μ; None: its slots are not alike.
+
+        Acknowledgements, where they are needed, may be lost or blocked at will, but not forged.
+        """
+
+    def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes | None:
+        """What a user of packets, with P(b=1 | ν), does with a slot; None: no such closed form."""
+        del mu_e, use_state, use_innovation
+        return None

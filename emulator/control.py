@@ -1,0 +1,66 @@
+"""How the user who started a run gets at it while it goes on: `control.json` in its results folder, mode 0600.
+
+It is written when the run starts and removed when it ends, whatever ends it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from emulator.errors import UsageError
+
+_NAME = "control.json"
+
+
+@dataclass(frozen=True)
+class Control:
+    """Where the router of a run is, and the operator's credentials, made for this run alone."""
+
+    run: str
+    router: str
+    """Zenoh endpoint."""
+    user: str
+    password: str
+
+    def write(self, folder: Path) -> None:
+        """Write it into a results folder, readable by nobody else."""
+        unfinished = folder / f"{_NAME}.new"
+        with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump(asdict(self), file, indent=1)
+        os.replace(unfinished, folder / _NAME)
+
+
+def remove_control(folder: Path) -> None:
+    """The run is over: nobody can get at it any more."""
+    with suppress(OSError):  # of a disk that cannot be written any more: the password is of no run then
+        (folder / _NAME).unlink()
+
+
+def no_run(folder: Path, why: str) -> UsageError:
+    """The error of who would steer a run that does not go on."""
+    return UsageError(
+        f"no run is going on in {folder}; {why}; give the results folder of a run between its start and its end"
+    )
+
+
+def read_control(folder: Path) -> Control:
+    """The control file of a run that goes on. Raises UsageError if there is none, or it is none."""
+    path = folder / _NAME
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        control = Control(**found)
+    except FileNotFoundError as error:
+        over = (folder / "summary.json").is_file()
+        why = "it is over" if over else f"it has no {_NAME} (yet)" if folder.is_dir() else "there is no such folder"
+        raise no_run(folder, why) from error
+    except OSError as error:
+        raise no_run(folder, f"{path.name} cannot be read ({error.strerror})") from error
+    except (ValueError, TypeError, RecursionError) as error:
+        raise no_run(folder, f"{path.name} is not one ({error})") from error
+    if not all(isinstance(value, str) for value in asdict(control).values()):
+        raise no_run(folder, f"{path.name} is not one (an entry is no string)")
+    return control

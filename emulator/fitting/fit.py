@@ -1,0 +1,194 @@
+"""The whole of it: a recording's candidates, the one to take, how well it fits, and the line for the scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.errors import TraceError
+from emulator.fitting import losses
+from emulator.fitting.candidate import Candidate, wilson
+from emulator.fitting.delays import delay_candidates
+from emulator.fitting.runs import RunLaw, lengths_of, p_value
+from emulator.model.links.checks import toml_of
+from emulator.traces import Outcomes, Recording
+
+FEWEST = 100
+"""Outcomes from which something can be estimated."""
+_FEWEST_DELAYS = 10
+_LEVEL = 0.01
+DELAY = "delay"
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Bursts, or gaps: runs of lost, or delivered, packets that begin and end within the recording."""
+
+    count: int
+    mean: float | None
+    """Slots, found; None if there are none."""
+    fitted: float
+    """Slots, under the model chosen."""
+    p_value: float | None
+    """None: too few to tell."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What was found in a recording."""
+
+    trace: str
+    count: int
+    lost: int
+    candidates: Sequence[Candidate]
+    bursts: Runs
+    gaps: Runs
+    delays: int
+    """Packets whose delay was measured."""
+    delay_candidates: Sequence[Candidate]
+
+    @property
+    def chosen(self) -> Candidate:
+        """The loss model with the least BIC."""
+        return min(self.candidates, key=lambda one: one.bic(self.count))
+
+    @property
+    def chosen_delay(self) -> Candidate | None:
+        """The delay model with the least BIC; None if no delays were measured."""
+        return min(self.delay_candidates, key=lambda one: one.bic(self.delays), default=None)
+
+    @property
+    def link(self) -> dict[str, Any]:
+        """The link as a scenario has it."""
+        delay = self.chosen_delay
+        return {"loss": dict(self.chosen.spec)} | ({} if delay is None else {"delay": dict(delay.spec)})
+
+    @property
+    def toml(self) -> str:
+        """The line for the scenario."""
+        return f"link = {toml_of(self.link)}"
+
+    @property
+    def goodness(self) -> str:
+        """How well the model chosen explains the lengths of bursts and gaps, in a sentence."""
+        told = {"bursts": self.bursts.p_value, "gaps": self.gaps.p_value}
+        judged = {name: value for name, value in told.items() if value is not None}
+        shown = " and ".join(f"{value:.2g} for {name}" for name, value in judged.items())
+        if not judged:
+            return f"too few bursts ({self.bursts.count}) to tell how well it fits"
+        # Each of two tests at half the level: both together are wrong about a right model once in a hundred recordings.
+        if min(judged.values()) < _LEVEL / 2.0:
+            return (
+                f"it does NOT explain how long bursts and gaps last (chi-square, p = {shown}): the link has habits that none "
+                'of these models has; use the recording itself, model = "trace"'
+            )
+        return f"bursts and gaps last as long as it would have them (chi-square, p = {shown})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For programs."""
+        delay = self.chosen_delay
+        return {
+            "trace": self.trace,
+            "outcomes": self.count,
+            "lost": self.lost,
+            "candidates": [one.as_dict(self.count) for one in self.candidates],
+            "chosen": self.chosen.name,
+            "bursts": vars(self.bursts),
+            "gaps": vars(self.gaps),
+            "goodness": self.goodness,
+            "delays": self.delays,
+            "delay_candidates": [one.as_dict(self.delays) for one in self.delay_candidates],
+            "chosen_delay": None if delay is None else delay.name,
+            "link": self.link,
+            "toml": self.toml,
+        }
+
+
+def fit(path: Path, column: str | None = None, delay_column: str | None = None) -> Fit:
+    """The models that may have made a recording.
+
+    column: of the outcomes, for a file of several; delay_column: of delays in slots, by default `delay` if there is one.
+
+    Raises TraceError if the file is no recording, or nothing can be estimated from it.
+    """
+    recording = Recording(path)
+    names = recording.columns()
+    if column is None and len(names) == 2 and DELAY in names:
+        column = next(name for name in names if name != DELAY)
+    outcomes = recording.outcomes(column)
+    _check(path, outcomes)
+    wanted = delay_column or (DELAY if DELAY in names and column != DELAY else None)
+    delays = np.empty(0) if wanted is None else recording.delays(wanted)
+    delays = delays[~np.isnan(delays)]
+    if wanted is not None and len(delays) < _FEWEST_DELAYS:
+        what = f"{wanted} has {len(delays)} delays; expected {_FEWEST_DELAYS} or more, such as a longer recording"
+        raise TraceError(str(path), "file", what)
+    candidates = [losses.bernoulli(outcomes), losses.gilbert(outcomes), losses.gilbert_elliott(outcomes)]
+    chosen = min(candidates, key=lambda one: one.bic(len(outcomes)))
+    return Fit(
+        str(path),
+        len(outcomes),
+        int((outcomes == 0).sum()),
+        candidates,
+        _runs(outcomes, chosen, True),
+        _runs(outcomes, chosen, False),
+        len(delays),
+        delay_candidates(delays) if len(delays) else (),
+    )
+
+
+def _check(path: Path, outcomes: Outcomes) -> None:
+    """Raise TraceError for a recording from which nothing can be estimated."""
+    count, delivered = len(outcomes), int(outcomes.sum())
+    if count < FEWEST:
+        raise TraceError(
+            str(path), "file", f"has {count} outcomes; expected {FEWEST} or more, such as a longer recording"
+        )
+    if delivered in {0, count}:
+        low, high = wilson(delivered, count)
+        all_or_none, bound = ("delivered", f"at least {low:.4g}") if delivered else ("lost", f"at most {high:.4g}")
+        raise TraceError(
+            str(path),
+            "file",
+            f"has {count} outcomes, all {all_or_none}: the quality is {bound} with 95 % confidence if losses are independent, "
+            "and nothing can be told of bursts; expected a recording with both, such as a longer one",
+        )
+
+
+def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> Runs:
+    lengths = lengths_of(outcomes == 0 if lost else outcomes == 1)
+    law = RunLaw.of(chosen.spec, lost)
+    return Runs(
+        len(lengths),
+        float(lengths.mean()) if len(lengths) else None,
+        law.mean,
+        p_value(lengths, law, 3 if chosen.parameters == 4 else 1),
+    )
+
+
+def lines(found: Fit) -> list[str]:
+    """What is printed."""
+    share = 100.0 * found.lost / found.count
+    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots in the mean"
+    told = [
+        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}"
+    ]
+    told += _table(found.candidates, found.chosen, found.count)
+    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots in the mean")
+    told.append(f"fit: {found.goodness}")
+    if found.chosen_delay is not None:
+        told.append(f"{found.delays} delays")
+        told += _table(found.delay_candidates, found.chosen_delay, found.delays)
+    return [*told, found.toml]
+
+
+def _table(candidates: Sequence[Candidate], chosen: Candidate, count: int) -> list[str]:
+    rows = [f"  {'model':<16} {'log-likelihood':>16} {'BIC':>14}  parameters"]
+    for one in candidates:
+        mark = "*" if one is chosen else " "
+        rows.append(f"{mark} {one.name:<16} {one.log_likelihood:>16.2f} {one.bic(count):>14.2f}  {one.text}")
+    return rows

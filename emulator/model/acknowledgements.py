@@ -1,0 +1,104 @@
+"""Which acknowledgements reach the sensor: over a way back that loses some, and past a jammer that hears the packets too.
+
+Source: docs/mathematics.md, attacks on acknowledgements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from emulator.model.receiver import Flags
+from emulator.streams import Batch, BlockReader
+
+Attack = Callable[[Flags, Flags], Flags]
+"""(γ of the user, γᵉ of the jammer) → the acknowledgements on the air, all (R,)."""
+
+
+def _none(gamma: Flags, gamma_e: Flags) -> Flags:  # noqa: ARG001 - what the jammer hears does not matter
+    return gamma
+
+
+def _block_all(gamma: Flags, gamma_e: Flags) -> Flags:  # noqa: ARG001 - the same
+    return np.zeros_like(gamma)
+
+
+def _block_critical(gamma: Flags, gamma_e: Flags) -> Flags:
+    return gamma & gamma_e
+
+
+def _forge(gamma: Flags, gamma_e: Flags) -> Flags:  # noqa: ARG001 - the same
+    return np.ones_like(gamma)
+
+
+ATTACKS: Mapping[str, Attack] = {
+    "none": _none,
+    "all": _block_all,
+    "critical": _block_critical,
+    "forge": _forge,
+}
+"""critical blocks where γ = 1 and γᵉ = 0; forge sends one, in the user's name, where γ = 0."""
+
+
+class WayBack:
+    """Acknowledgements from user to sensor: each arrives with probability `quality`, if it is on the air. Final.
+
+    spans: slots [from, to) in which the attack is on; None is always.
+    """
+
+    def __init__(
+        self,
+        attack: str,
+        quality: float,
+        key: bytes,
+        batch: Batch,
+        spans: Sequence[Sequence[int]] | None = None,
+    ) -> None:
+        self._attack = ATTACKS[attack]
+        self._spans = spans
+        self._quality = quality
+        self._reader = BlockReader(key, batch, 1)
+        self._slots = range(0)
+        self._through: Flags
+
+    def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
+        """The acknowledgements of slot k that reach the sensor, (R,).
+
+        sent: `Packet.sent`; what was not sent is not acknowledged, whatever is forged. gamma: what the user received.
+        gamma_e: what the jammer received.
+        """
+        if k not in self._slots:
+            self._slots = self._reader.block(k)
+            self._through = self._reader.uniforms(self._slots)[:, 0, :] < self._quality
+        attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
+        on_the_air = self._attack(gamma, gamma_e) if attacked else gamma
+        arrived: Flags = on_the_air & self._through[k - self._slots.start]
+        return arrived if sent is None else arrived & sent
+
+
+class AcknowledgementRates(NamedTuple):
+    """Probabilities, for a packet that is sent."""
+
+    arrives: float
+    """That an acknowledgement of it reaches the sensor."""
+    user: tuple[float, float]
+    """That one does and the user received the packet, and that one does and it did not: forged."""
+    eavesdropper: tuple[float, float]
+    """That one does and the jammer received the packet, and that one does and it did not: critical, or forged."""
+
+
+def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0) -> AcknowledgementRates:
+    """The rates under an attack, for independent links of qualities μ, μ_e and a way back of its own.
+
+    Source: docs/mathematics.md, attacks on acknowledgements.
+    """
+    gamma, gamma_e = np.array([True, True, False, False]), np.array([True, False, True, False])
+    chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e)
+    arrives = quality * chances * ATTACKS[attack](gamma, gamma_e)
+
+    def split(heard: Flags) -> tuple[float, float]:
+        return float(arrives[heard].sum()), float(arrives[~heard].sum())
+
+    return AcknowledgementRates(float(arrives.sum()), split(gamma), split(gamma_e))

@@ -1,0 +1,25 @@
+"""Delay models of links by their name in a scenario: one file each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from emulator.model.delays.constant import Constant
+from emulator.model.delays.delay import DelayModel
+from emulator.model.delays.normal import Normal
+from emulator.model.delays.pareto import Pareto
+from emulator.model.delays.trace import Trace
+
+DELAY_MODELS: Mapping[str, type[DelayModel]] = {
+    "constant": Constant,
+    "normal": Normal,
+    "pareto": Pareto,
+    "trace": Trace,
+}
+
+
+def delay_of(spec: Mapping[str, Any]) -> DelayModel:
+    """The delay model that a link's specification describes: `{"model": …, …parameters}`, lengths in slots."""
+    parameters = {name: value for name, value in spec.items() if name != "model"}
+    return DELAY_MODELS[spec["model"]](**parameters)

@@ -1,0 +1,39 @@
+"""Every packet takes equally long."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from emulator.model.delays.checks import length_mistakes
+from emulator.model.delays.delay import DelayModel
+from emulator.model.process import Floats
+
+
+class Constant(DelayModel):
+    """A delay of `value`.
+
+    Source: docs/mathematics.md, late packets.
+    """
+
+    parameters = MappingProxyType({"value": 2.0})
+    lengths = ("value",)
+
+    def __init__(self, value: float) -> None:
+        self._value = float(value)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """The length is not negative."""
+        return length_mistakes(given, "value")
+
+    def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
+        """As given."""
+        return np.full(numbers.shape, self._value)
+
+    def arrived(self, lag: int) -> float | None:
+        """All or nothing."""
+        return float(self._value < lag + 1)

@@ -1,0 +1,44 @@
+"""Delays that scatter about a mean, as netem's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from emulator.model.delays.checks import length_mistakes
+from emulator.model.delays.delay import DelayModel
+from emulator.model.process import Floats
+
+
+class Normal(DelayModel):
+    """Delays max(0, mean + deviation · N(0, 1)), independent: packets overtake each other where they fall so.
+
+    Source: docs/mathematics.md, late packets.
+    """
+
+    parameters = MappingProxyType({"mean": 2.0, "deviation": 0.5})
+    lengths = ("mean", "deviation")
+    normal = True
+
+    def __init__(self, mean: float, deviation: float) -> None:
+        self._mean, self._deviation = float(mean), float(deviation)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Neither length is negative."""
+        return length_mistakes(given, "mean", "deviation")
+
+    def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
+        """From a standard normal number each."""
+        scattered: Floats = self._mean + self._deviation * numbers
+        return np.maximum(0.0, scattered)
+
+    def arrived(self, lag: int) -> float | None:
+        """Φ((lag + 1 − mean) / deviation)."""
+        if self._deviation == 0.0:
+            return float(self._mean < lag + 1)
+        return 0.5 * math.erfc(-(lag + 1 - self._mean) / (self._deviation * math.sqrt(2.0)))

@@ -1,0 +1,48 @@
+"""Delays as they were recorded on a real link, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from emulator.model.delays.checks import is_number
+from emulator.model.delays.delay import LONGEST, DelayModel
+from emulator.model.process import Floats
+
+MOST_DELAYS = 10_000_000
+
+
+class Trace(DelayModel):
+    """The packet of slot k takes `values[k]`, repeated without end; the same in every trial.
+
+    A scenario names a `file`, whose numbers are put in the place of `values` when it is loaded.
+    """
+
+    parameters = MappingProxyType({"values": [0.5, 2.0, 1.25]})
+    lengths = ("values",)
+
+    def __init__(self, values: list[float]) -> None:
+        self._values = np.array(values, np.float64)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Delays, and at least one."""
+        values = given.get("values", [0.0])
+        if not isinstance(values, list) or not 1 <= len(values) <= MOST_DELAYS:
+            return [("values", f"is no list of 1 to {MOST_DELAYS} delays; expected values = [0.5, 2.0]")]
+        wrong = next((i for i, one in enumerate(values) if not (is_number(one) and 0.0 <= one <= LONGEST)), None)
+        if wrong is not None:
+            return [(f"values.{wrong}", f"is no delay; expected a number from 0 to {LONGEST:.0f}")]
+        return []
+
+    def delays(self, first: int, numbers: Floats) -> Floats:
+        """By the slot alone."""
+        places = np.arange(first, first + len(numbers)) % len(self._values)
+        return np.repeat(self._values[places][:, None], numbers.shape[1], axis=1)
+
+    def arrived(self, lag: int) -> float | None:  # noqa: ARG002 - slots differ
+        """Not alike for all slots."""
+        return None

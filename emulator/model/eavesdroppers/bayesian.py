@@ -1,0 +1,222 @@
+"""The Bayesian eavesdropper: knows the mechanism and not the secret, and weighs every history that is left.
+
+Its posterior is a mixture with a component for each slot j that may have brought the last state packet it received: x_j was
+that packet, and all that came after were innovations. A packet either opens a new component, of itself, or was one more
+innovation for all others.
+
+Source: docs/mathematics.md, bayesian eavesdropper.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from emulator.model.elementary import cholesky, exp
+from emulator.model.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from emulator.model.leak import Leak, Leaks
+from emulator.model.process import Floats
+from emulator.model.receiver import Action, Belief, Flags, Heard
+from emulator.streams import Batch
+
+CAPACITY = 12
+"""Components a trial may have; beyond it the two least probable ones become one of the same mean and covariance."""
+NEGLIGIBLE = 1e-12
+"""Probability up to which a component is dropped."""
+_CERTAIN = 300.0  # an exponent at which a packet is the state beyond all doubt, and still far from overflow
+_SURE = 1e300  # odds of any greater amount
+_IMPOSSIBLE = -700.0  # one at which it is not, and still far from underflow
+
+
+class Mixture(NamedTuple):
+    """Up to C components for every trial; what has the weight 0 is none. A component keeps its place."""
+
+    weight: Floats
+    """(C, R); sums to 1 in every trial."""
+    mean: Floats
+    """(n, C, R)."""
+    lower: Floats
+    """Of the covariances' factors, (n (n−1)/2, C, R)."""
+    diagonal: Floats
+    """(n, C, R)."""
+
+    @property
+    def spread(self) -> Factors:
+        """The covariances."""
+        return Factors(self.lower, self.diagonal)
+
+
+class Bayesian(PacketReader):
+    """Minimum mean square error, but for what is lost where too many components must be told apart.
+
+    `Belief.memory` is its `Mixture`.
+    """
+
+    def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
+        super().__init__(knowledge, batch)
+        self._mu_d = knowledge.state_probability
+        self._capacity = capacity
+        self._leaks = Leaks(knowledge.process)
+        self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
+
+    def prior(self, first: int = 0) -> Belief:
+        """One component: nothing was received."""
+        belief = super().prior(first)
+        n, trials = belief.x_hat.shape
+        spread = Factors.alike(Factor.of_triangular(cholesky(belief.P[:, :, 0]).tolist()), (1, trials))
+        return belief._replace(memory=Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *spread))
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """One component without spread."""
+        belief, (n, trials) = super().knowing(k, x, belief), x.shape
+        nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
+        return belief._replace(memory=Mixture(np.ones((1, trials)), x[:, None, :], *nothing))
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """Predict every component, weigh it by the packet, add that of the packet itself: the mean and covariance of all."""
+        gamma, z = heard.gamma, np.where(heard.gamma, heard.z, 0.0)
+        mixture = Mixture(*belief.memory)
+        if k == 0:
+            state = gamma.astype(np.float64)
+            mixture = Mixture(np.where(gamma, 0.0, mixture.weight), *(part.copy() for part in mixture[1:]))
+        else:
+            leak = self._leaks.at(k)
+            mixture, state = self._weighed(mixture, gamma, z, leak)
+        mixture = opened(pruned(mixture), state, z, self._capacity)
+        x_hat, P = moments(mixture)
+        action = np.where(
+            gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
+        )
+        return Belief(x_hat, P, action, mixture)
+
+    def _weighed(self, of: Mixture, gamma: Flags, z: Floats, leak: Leak) -> tuple[Mixture, Floats]:
+        """The components a slot later, and the probability that the packet is the state, (R,)."""
+        A, white = self.process.A, leak.white(z)
+        mean = self.process.predict(of.mean.reshape(len(z), -1)).reshape(of.mean.shape)
+        predicted, informed = grown(A, of.spread, self._noise, leak.remaining_factor)
+        apart = [row - m for row, m in zip(z, mean, strict=True)]
+        squared = squared_length(predicted, apart)
+        ratio = summed(_weighed_ratios(gamma, of.weight, squared, predicted.diagonal, white, leak))
+        state, other = self._type_probabilities(ratio, gamma)
+        return (
+            Mixture(
+                of.weight * other,
+                mean + np.where(gamma, leak.innovation(white), 0.0)[:, None, :],
+                *(np.where(gamma, *pair) for pair in zip(informed, predicted, strict=True)),
+            ),
+            state,
+        )
+
+    def _type_probabilities(self, ratio: Floats, gamma: Flags) -> tuple[Floats, Floats]:
+        """Probabilities that the packet is the state, and that it is not, (R,); 0 and 1 where nothing was received.
+
+        ratio: of the packet's densities as the one and as the other, (R,).
+        """
+        if self._mu_d == 1.0:
+            state = gamma.astype(np.float64)
+            return state, 1.0 - state
+        odds = np.minimum(self._mu_d / (1.0 - self._mu_d) * ratio, _SURE)
+        return np.where(gamma, odds / (1.0 + odds), 0.0), np.where(gamma, 1.0 / (1.0 + odds), 1.0)
+
+
+def _weighed_ratios(
+    gamma: Flags, weight: Floats, squared: Floats, diagonal: Floats, white: Floats, leak: Leak
+) -> Floats:
+    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) where z was received, (C, R).
+
+    weight: π, (C, R); squared: (z − m)ᵀ P⁻¹ (z − m), (C, R); diagonal: D of P's factors, (n, C, R); white: L_k⁻¹ z, (n, R).
+    """
+    alone = white[0] * white[0]
+    for row in white[1:]:
+        alone += row * row
+    exponent = 0.5 * (alone - squared)
+    # Most are told apart by far, and need no exponential.
+    some = np.flatnonzero((weight > 0.0) & (exponent > _IMPOSSIBLE) & gamma)
+    determinant = np.ones(len(some))
+    for D, state in zip(diagonal, leak.state_diagonal, strict=True):
+        determinant *= D.reshape(-1)[some] / state
+    likely = exp(np.minimum(exponent.reshape(-1)[some], _CERTAIN))
+    ratios = np.zeros(weight.shape)
+    ratios.reshape(-1)[some] = weight.reshape(-1)[some] * likely / np.sqrt(determinant)
+    return ratios
+
+
+def summed(values: Floats) -> Floats:
+    """Sum over components: (C, R) → (R,), one after the other, so that places that are empty in a trial change no bit."""
+    total = np.zeros(values.shape[1:])
+    for row in values:
+        total += row
+    return total
+
+
+def pruned(of: Mixture) -> Mixture:
+    """Without what is negligible, and without places that no trial needs."""
+    weight = np.where(of.weight > NEGLIGIBLE, of.weight, 0.0)
+    used = np.flatnonzero(weight.any(axis=1))
+    count = int(used[-1]) + 1 if used.size else 0
+    return Mixture(weight[:count], *(part[:, :count] for part in of[1:]))
+
+
+def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
+    """With a component of each packet z (n, R) in its trial's first empty place, by its probability `state` (R,).
+
+    Takes the arrays of `of` over: they are not to be used any more.
+    """
+    new = np.flatnonzero(state > NEGLIGIBLE)
+    free = of.weight[:, new] == 0.0
+    full = new[~free.any(axis=0)]
+    if full.size:
+        if len(of.weight) < capacity:
+            of = Mixture(*(_with_a_place(part, part.ndim - 2) for part in of))
+        else:
+            merge(of, full)
+        free = of.weight[:, new] == 0.0
+    if new.size:
+        place = np.argmax(free, axis=0)
+        of.weight[place, new] = state[new]
+        of.mean[:, place, new] = z[:, new]
+        of.lower[:, place, new] = 0.0
+        of.diagonal[:, place, new] = 0.0
+    return of._replace(weight=of.weight / summed(of.weight))
+
+
+def _with_a_place(part: Floats, axis: int) -> Floats:
+    shape = list(part.shape)
+    shape[axis] = 1
+    return np.concatenate([part, np.zeros(shape)], axis=axis)
+
+
+def merge(of: Mixture, trials: NDArray[np.intp]) -> None:
+    """Make one of the two least probable components of some trials, in place; the other place is empty then."""
+    weight = of.weight[:, trials]
+    columns = np.arange(len(trials))
+    first = np.argmin(weight, axis=0)
+    without = weight.copy()
+    without[first, columns] = np.inf
+    second = np.argmin(without, axis=0)
+    one, two = ((place, trials) for place in (first, second))
+    total = of.weight[one] + of.weight[two]
+    a, b = of.weight[one] / total, of.weight[two] / total
+    apart = [m[two] - m[one] for m in of.mean]
+    U, V = ([[*row] for row in Factors(of.lower[:, p, t], of.diagonal[:, p, t]).unit()] for p, t in (one, two))
+    weights = [*(a * of.diagonal[(slice(None), *one)]), *(b * of.diagonal[(slice(None), *two)]), a * b]
+    lower, diagonal = orthogonalised([u + v + [d] for u, v, d in zip(U, V, apart, strict=True)], weights)
+    for m, d in zip(of.mean, apart, strict=True):
+        m[one] += b * d
+    of.lower[(slice(None), *one)], of.diagonal[(slice(None), *one)] = lower, diagonal
+    of.weight[one], of.weight[two] = total, 0.0
+
+
+def moments(of: Mixture) -> tuple[Floats, Floats]:
+    """Mean and covariance of every trial's mixture, (n, R) and (n, n, R)."""
+    n = len(of.mean)
+    x_hat = np.stack([summed(of.weight * row) for row in of.mean])
+    away, within = of.mean - x_hat[:, None, :], covariance(of.spread)
+    P = np.empty((n, n, x_hat.shape[1]))
+    for i in range(n):
+        for j in range(i + 1):
+            P[i, j] = P[j, i] = summed(of.weight * (within[i, j] + away[i] * away[j]))
+    return x_hat, P

@@ -1,0 +1,49 @@
+"""Eavesdroppers that have something besides a way to read packets, and read them as another strategy does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from emulator.model.eavesdroppers.readers import READERS
+from emulator.model.receiver import Belief, Codes, Flags, Heard
+from emulator.model.theory import OutcomesAt
+from emulator.streams import Batch
+
+
+class Delegate(Eavesdropper):
+    """Reads as `reads_as` does, and is given what that strategy must be given."""
+
+    parameters: ClassVar[tuple[str, ...]] = ("reads_as",)
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self.reader = READERS[knowledge.parameters["reads_as"]](knowledge, batch)
+
+    @classmethod
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
+        """The reader's."""
+        return READERS[parameters["reads_as"]].streams(parameters)
+
+    @classmethod
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
+        """The reader's."""
+        return READERS[parameters["reads_as"]].outcomes(parameters, mu_d)
+
+    @classmethod
+    def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
+        """As the reader."""
+        return READERS[parameters["reads_as"]].follows_gamma(parameters)
+
+    def prior(self, first: int = 0) -> Belief:
+        """The reader's."""
+        return self.reader.prior(first)
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """The reader's action."""
+        return self.reader.act(k, gamma)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """As the reader."""
+        return self.reader.step(k, belief, heard)

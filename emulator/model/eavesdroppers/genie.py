@@ -1,0 +1,60 @@
+"""The genie: knows the type of every packet and uses all that it tells. No eavesdropper without the secret does better."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from emulator.model.leak import Leaks
+from emulator.model.receiver import Belief, Codes, Flags, Heard, cleared, select
+from emulator.model.schedule import Schedule
+from emulator.model.theory import Outcomes, OutcomesAt
+from emulator.streams import Batch
+
+
+class Genie(PacketReader):
+    """Exact MMSE given the schedule: an innovation shrinks the noise it hides from Q to Q − QΣ_k⁻¹Q.
+
+    Its belief is true, and its mean error a bound from below on every eavesdropper behind the same link.
+
+    Source: docs/mathematics.md, genie.
+    """
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
+        self._leaks = Leaks(knowledge.process)
+
+    @classmethod
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
+        """The schedule."""
+        return ("schedule",)
+
+    @classmethod
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:  # noqa: ARG003 - it has none
+        """States used, innovations read for what they leak."""
+        return lambda mu_e: Outcomes.genie(mu_e, mu_d)
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """Lost, used as the state, or read as an innovation."""
+        return gamma.view(np.uint8) + (gamma & self._schedule.at(k)).view(np.uint8)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + QΣ⁻¹z, A P Aᵀ + Q − QΣ⁻¹Q) for an innovation."""
+        gamma, nu = heard.gamma, self._schedule.at(k)
+        state, innovation = gamma & ~nu, gamma & nu
+        x_hat, P = belief.x_hat, belief.P
+        if k:
+            leak, carried, predicted = self._leaks.at(k), self.process.carry(P), self.process.predict(x_hat)
+            x_hat = select(innovation, lambda: predicted + leak.innovation(leak.white(heard.z)), lambda: predicted)
+            P = select(
+                innovation,
+                lambda: carried + leak.remaining[:, :, None],
+                lambda: self.process.diffuse(carried),
+            )
+        return Belief(
+            select(state, lambda: heard.z, lambda: x_hat), cleared(state, P.shape, lambda: P), self.act(k, gamma)
+        )

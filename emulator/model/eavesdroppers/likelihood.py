@@ -1,0 +1,70 @@
+"""The likelihood eavesdropper: settles every packet's type at once by a likelihood ratio, and never looks back.
+
+It is easily fooled: an innovation taken for the state starts a false track, next to which true states look like
+innovations for ever after. It is here to show that a cheap detector is no stand-in for the Bayesian one.
+
+Source: docs/mathematics.md, bayesian eavesdropper.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from emulator.model.elementary import cholesky, log
+from emulator.model.factored import Factor, Factors, covariance, grown, squared_length
+from emulator.model.leak import Leak, Leaks
+from emulator.model.process import Floats
+from emulator.model.receiver import Action, Belief, Flags, Heard
+from emulator.streams import Batch
+
+
+class Likelihood(PacketReader):
+    """A packet is the state if μ_d N(z; A x̂, A P Aᵀ + Q) > (1−μ_d) N(z; 0, Σ_k), else an innovation.
+
+    `Belief.memory` is P's factors, (n (n−1)/2, R) and (n, R).
+    """
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._mu_d = knowledge.state_probability
+        self._leaks = Leaks(knowledge.process)
+        self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
+
+    def prior(self, first: int = 0) -> Belief:
+        """Nothing was received."""
+        belief = super().prior(first)
+        factor = Factor.of_triangular(cholesky(belief.P[:, :, 0]).tolist())
+        return belief._replace(memory=Factors.alike(factor, (self.trials,)))
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """A track of no error."""
+        n, trials = x.shape
+        nothing = np.zeros((n * (n - 1) // 2, trials)), np.zeros((n, trials))
+        return super().knowing(k, x, belief)._replace(memory=nothing)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for a state, (A x̂ + QΣ⁻¹z, A P Aᵀ + Q − QΣ⁻¹Q) for an innovation."""
+        gamma, z = heard.gamma, np.where(heard.gamma, heard.z, 0.0)
+        x_hat, P, state = belief.x_hat, Factors(*belief.memory), gamma
+        if k:
+            leak = self._leaks.at(k)
+            white, x_hat = leak.white(z), self.process.predict(x_hat)
+            predicted, informed = grown(self.process.A, P, self._noise, leak.remaining_factor)
+            state = gamma & self._is_state(z - x_hat, predicted, white, leak)
+            innovation = gamma & ~state
+            x_hat = np.where(innovation, x_hat + leak.innovation(white), x_hat)
+            P = Factors(*(np.where(innovation, *pair) for pair in zip(informed, predicted, strict=True)))
+        P = Factors(np.where(state, 0.0, P.lower), np.where(state, 0.0, P.diagonal))
+        action = np.where(gamma, np.where(state, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0))
+        return Belief(np.where(state, z, x_hat), covariance(P), action, P)
+
+    def _is_state(self, d: Floats, P: Factors, white: Floats, leak: Leak) -> Flags:
+        if self._mu_d in {0.0, 1.0}:
+            return np.full(self.trials, self._mu_d == 1.0)
+        odds = self._mu_d / (1.0 - self._mu_d)
+        evidence = -squared_length(P, list(d))
+        for row, D, state in zip(white, P.diagonal, leak.state_diagonal, strict=True):
+            evidence = evidence + row * row - log(D / state)
+        flags: Flags = evidence > -2.0 * float(log(np.array([odds]))[0])
+        return flags

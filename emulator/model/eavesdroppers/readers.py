@@ -1,0 +1,28 @@
+"""Strategies that read packets by themselves, by their name in a scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulator.model.eavesdroppers.bayesian import Bayesian
+from emulator.model.eavesdroppers.constant import Constant
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
+from emulator.model.eavesdroppers.genie import Genie
+from emulator.model.eavesdroppers.likelihood import Likelihood
+from emulator.model.eavesdroppers.naive import Naive
+from emulator.model.eavesdroppers.reference import Reference
+from emulator.model.eavesdroppers.selective import Selective
+from emulator.model.eavesdroppers.smart import Smart
+from emulator.model.eavesdroppers.suspicious import Suspicious
+
+READERS: Mapping[str, type[Eavesdropper]] = {
+    "naive": Naive,
+    "suspicious": Suspicious,
+    "smart": Smart,
+    "constant": Constant,
+    "likelihood": Likelihood,
+    "bayesian": Bayesian,
+    "genie": Genie,
+    "reference": Reference,
+    "selective": Selective,
+}

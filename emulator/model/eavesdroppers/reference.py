@@ -1,0 +1,39 @@
+"""The eavesdropper of references: reads state-secrecy codes with the references it heard itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from emulator.model.process import Floats
+from emulator.model.receiver import Belief, Heard
+from emulator.model.reference import ReferenceReceiver
+from emulator.streams import Batch
+
+
+class Reference(PacketReader):
+    """Follows the headers as the legitimate estimator does; it is given nothing, for the code has no secret.
+
+    Meant for the scheme `acknowledged` alone, against which it is the best there is for unstable A.
+
+    Source: docs/mathematics.md, acknowledged references.
+    """
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._reader = ReferenceReceiver(knowledge.process, batch.trials)
+
+    def prior(self, first: int = 0) -> Belief:
+        """With an empty memory of references."""
+        return self._reader.prior(first)
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """Whatever is sent with a reference to slot k can be read; the reference that it held is as good as before."""
+        _, _, kept, kept_spread, _, named = belief.memory
+        known = super().knowing(k, x, belief)
+        slot = np.full(self.trials, k, np.int64)
+        return known._replace(memory=(known.x_hat, known.P, kept, kept_spread, slot, named))
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """By the reference that the header names."""
+        return self._reader.step(k, belief, heard)

@@ -1,0 +1,49 @@
+"""The replay-informed eavesdropper: one true state is betrayed to it, whatever its link does in that slot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from emulator.model.eavesdroppers.delegate import Delegate
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.receiver import Belief, Heard
+from emulator.model.theory import OutcomesAt
+from emulator.streams import Batch
+
+
+class ReplayInformed(Delegate):
+    """Learns x_j in the slot j = `learns_at` from `Heard.truth`; reads as the strategy `reads_as` does before and after.
+
+    Source: docs/mathematics.md, further eavesdroppers.
+    """
+
+    parameters = ("learns_at", "reads_as")
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._learns_at = int(knowledge.parameters["learns_at"])
+
+    @classmethod
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:  # noqa: ARG003 - alike for all
+        """No closed form."""
+        return None
+
+    @classmethod
+    def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:  # noqa: ARG003 - alike for all readers
+        """In one slot it does not."""
+        return False
+
+    @classmethod
+    def betrayed(cls, parameters: Mapping[str, Any]) -> int | None:
+        """The slot j."""
+        return int(parameters["learns_at"])
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """As the reader; after slot j the state x_j and nothing else. Raises ValueError if it was not handed over there."""
+        belief = self.reader.step(k, belief, heard._replace(truth=None))
+        if k != self._learns_at:
+            return belief
+        if heard.truth is None:
+            raise ValueError(f"slot {k}: the state was to be betrayed in this slot, and was not")
+        return self.reader.knowing(k, heard.truth, belief)

@@ -1,0 +1,30 @@
+"""The selective eavesdropper: uses what is sent in clear, and leaves alone what the header says is encrypted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.model import update
+from emulator.model.eavesdroppers.eavesdropper import PacketReader
+from emulator.model.receiver import Action, Belief, Heard
+
+
+class Selective(PacketReader):
+    """b_k = 1 where the header is 0, or missing; it is given nothing.
+
+    Meant for the scheme `encrypted-schedule` alone, against which it is the best there is.
+
+    Source: docs/mathematics.md, schedules by holding time.
+    """
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is in clear."""
+        # The codes 0 and 1 of `Action` are γ itself: the state where anything arrives.
+        action = heard.gamma.astype(np.uint8)
+        if heard.header is not None:
+            action = np.where(heard.gamma & (heard.header[0] != 0), np.uint8(Action.DISCARDED), action)
+        return Belief(
+            update.estimate(self.process, k, belief.x_hat, action, heard.z),
+            update.believed_covariance(self.process, k, belief.P, action),
+            action,
+        )

@@ -1,0 +1,38 @@
+"""How much the number of delivered packets scatters from trial to trial, behind a link that remembers.
+
+Source: docs/mathematics.md, losses in bursts (rate of one trial).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.model.process import Floats
+
+
+def count_variance(transitions: Floats, law: Floats, quality: Floats, slots: int) -> float:
+    """Variance of the number of packets delivered in so many slots by a chain in its stationary law.
+
+    transitions (states, states), law (states,), quality (states,): as of `Chain`; slots ≥ 1. Exact, by doubling: a number
+    of products of matrices that grows with the logarithm of the slots.
+    """
+    mean = float(law @ quality)
+    centred = quality - mean
+    # Without its stationary part the chain's powers fade, and nothing large is subtracted from anything large.
+    fading = transitions - law
+    own = np.eye(len(law))
+    power, partial, total = own - np.outer(np.ones(len(law)), law), np.zeros_like(own), np.zeros_like(own)
+    count = 0
+    for bit in f"{slots:b}":
+        # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
+        total = total + count * partial + power @ total
+        partial = partial + power @ partial
+        power = power @ power
+        count *= 2
+        if bit == "1":
+            partial = partial + power
+            total = total + partial
+            power = power @ fading
+            count += 1
+    together = float((law * centred) @ (2.0 * total @ centred)) - slots * float(law @ (centred * centred))
+    return max(0.0, together) + slots * float(law @ (quality * (1.0 - quality)))

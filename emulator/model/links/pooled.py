@@ -1,0 +1,69 @@
+"""Several links that end at one receiver: a packet is lost if it is lost on all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any, ClassVar
+
+import numpy as np
+
+from emulator.model.links.link import Chain, Fate, LossModel
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes
+
+
+class Pooled(LossModel):
+    """Of independent loss models, each with its own random numbers. Not to be named in a scenario: see `colluding`."""
+
+    parameters: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, models: Sequence[LossModel]) -> None:
+        self._models = models
+        self.uniforms_per_slot = sum(model.uniforms_per_slot for model in models)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """None: each link is asked for its own."""
+        del given
+        return []
+
+    @property
+    def quality(self) -> float:
+        """1 − Π (1 − quality)."""
+        lost = 1.0
+        for model in self._models:
+            lost *= 1.0 - model.quality
+        return 1.0 - lost
+
+    @property
+    def chain(self) -> Chain | None:
+        """The states of all links side by side; None if the losses of one follow no chain."""
+        chains = [model.chain for model in self._models]
+        known = [chain for chain in chains if chain is not None]
+        return reduce(_both, known) if len(known) == len(chains) else None
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """Of each packet, by the links' own: `pooled`."""
+        each, start = [], 0
+        for model in self._models:
+            each.append(model.fates(first, uniforms[:, start : start + model.uniforms_per_slot]))
+            start += model.uniforms_per_slot
+        return pooled(each)
+
+
+def pooled(fates: Sequence[Codes]) -> Codes:
+    """`Fate` of the packets of several links, (slots, R) each, as one: delivered if by any, else lost as on the first."""
+    result = fates[0].copy()
+    for other in fates[1:]:
+        result[other == Fate.DELIVERED] = Fate.DELIVERED
+    return result
+
+
+def _both(one: Chain, other: Chain) -> Chain:
+    missed = _product(1.0 - one.quality, 1.0 - other.quality)
+    return Chain(_product(one.transitions, other.transitions), _product(one.law, other.law), 1.0 - missed)
+
+
+def _product(left: Floats, right: Floats) -> Floats:
+    return np.asarray(np.kron(left, right), np.float64)

@@ -1,0 +1,93 @@
+"""Losses as they were recorded: a trace of outcomes, read once or over and over, from its beginning or from anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.links.checks import flag_mistakes, word_mistakes
+from emulator.model.links.link import LossModel, fates_of
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes
+
+MOST_OUTCOMES = 10_000_000
+
+
+class Trace(LossModel):
+    """Delivered in slot k where `outcomes` has a 1 at place k, counted from a beginning and, unless `once`, round and round.
+
+    The beginning is place 0, alike in all trials; with `random_start` it is ⌊u · length⌋, of u the trial's uniform number of
+    the first slot that the link is asked for, so that trials see different parts of the recording. A scenario names a file,
+    which becomes `outcomes` when it is loaded.
+
+    Uniforms: column 0 is where the trial begins (first slot alone).
+
+    Source: docs/links.md, traces.
+    """
+
+    parameters = MappingProxyType({"outcomes": "1101", "once": True, "random_start": True})
+    optional = frozenset({"once", "random_start"})
+    uniforms_per_slot = 1
+
+    def __init__(self, outcomes: str, once: bool = False, random_start: bool = False) -> None:
+        self._lost = np.frombuffer(outcomes.encode(), np.uint8) == ord("0")
+        self._once, self._random = once, random_start
+        self._ring = np.concatenate((self._lost, self._lost)) if random_start else self._lost
+        self._begin: NDArray[np.intp] | None = None
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A word of zeros and ones, not too long, and flags that do not contradict each other."""
+        found = word_mistakes(given, "outcomes") + flag_mistakes(given, "once", "random_start")
+        if not found and len(given.get("outcomes", "")) > MOST_OUTCOMES:
+            found.append(("outcomes", f"are {len(given['outcomes'])}; expected at most {MOST_OUTCOMES}"))
+        if given.get("once") is True and given.get("random_start") is True:
+            what = "is there beside once, so that trials would run out of the recording; expected one of the two"
+            found.append(("random_start", what))
+        return found
+
+    @property
+    def quality(self) -> float:
+        """The fraction of ones."""
+        return float(1.0 - self._lost.mean())
+
+    @property
+    def memoryless(self) -> bool:
+        """Everything is certain, unless trials begin anywhere."""
+        return not self._random
+
+    def quality_at(self, slots: range) -> Floats:
+        """0 or 1, or for a random start the fraction of ones: every place is as likely as any other."""
+        if self._random:
+            return np.full(len(slots), self.quality)
+        return np.asarray(~self._lost[self._places(slots.start, slots.stop)], np.float64)
+
+    def rate_variance(self, slots: range) -> float:
+        """For a random start that of the count in a window that lies anywhere on the ring; else 0."""
+        if not self._random:
+            return 0.0
+        length = len(self._lost)
+        delivered = np.concatenate(([0], np.cumsum(~self._ring)))
+        rest = len(slots) % length  # whole rounds bring every trial the same
+        return float(np.var(delivered[rest : rest + length] - delivered[:length])) / len(slots) ** 2
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """By the slot, and by where the trial began."""
+        slots, _, trials = uniforms.shape
+        places = self._places(first, first + slots)
+        if not self._random:
+            return fates_of(np.repeat(self._lost[places][:, None], trials, axis=1))
+        if self._begin is None:
+            # u is at most 1 − 2⁻⁵³, and the product then rounds to less than the length.
+            self._begin = (uniforms[0, 0] * float(len(self._lost))).astype(np.intp)
+        return fates_of(self._ring[places[:, None] + self._begin])
+
+    def _places(self, first: int, stop: int) -> NDArray[np.intp]:
+        """Where in the recording these slots are. Raises ValueError if it is read once, and over."""
+        if self._once and stop > len(self._lost):
+            raise ValueError(f"the recording has {len(self._lost)} outcomes and slot {stop - 1} was asked for")
+        return np.arange(first, stop) % len(self._lost)

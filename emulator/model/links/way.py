@@ -1,0 +1,73 @@
+"""Where a sender or a receiver is in every slot: at one place, or on straight lines between waypoints."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from emulator.model.links.checks import as_toml, is_number
+from emulator.model.process import Floats
+
+FARTHEST = 1e9
+"""Metres."""
+_MOST_WAYPOINTS = 10_000
+_EXPECTED = "expected a position [x, y] in metres, or waypoints [[slot, x, y], …]"
+
+
+class Way:
+    """Positions by slot. Final.
+
+    given: [x, y], or [[slot, x, y], …] with slots increasing. Before its first waypoint it stands there, after its last one
+    too; between two it goes straight and evenly.
+    """
+
+    def __init__(self, given: list[Any]) -> None:
+        rows = given if isinstance(given[0], list) else [[0, *given]]
+        self._slots, self._x, self._y = np.array(rows, np.float64).T
+        self.slots = [int(row[0]) for row in rows]
+        """Of the waypoints."""
+
+    def at(self, slots: Floats) -> tuple[Floats, Floats]:
+        """Its place, x and y in metres, each (slots,). The same bits on every machine."""
+        last = len(self._slots) - 1
+        leg = np.searchsorted(self._slots, slots, side="right") - 1
+        here, there = np.clip(leg, 0, last), np.clip(leg + 1, 0, last)
+        span = self._slots[there] - self._slots[here]
+        part = np.where(span > 0.0, (slots - self._slots[here]) / np.where(span > 0.0, span, 1.0), 0.0)
+        x, y = (axis[here] + (axis[there] - axis[here]) * part for axis in (self._x, self._y))
+        return x, y
+
+
+def way_mistakes(given: Any) -> list[str]:
+    """What is wrong with a position or waypoints."""
+    if not isinstance(given, list) or not given:
+        return [f"is {as_toml(given)}; {_EXPECTED}"]
+    if not isinstance(given[0], list):
+        right = len(given) == 2 and all(is_number(value, -FARTHEST, FARTHEST) for value in given)
+        return [] if right else [f"is {as_toml(given)}; {_EXPECTED}"]
+    if len(given) > _MOST_WAYPOINTS:
+        return [f"has {len(given)} waypoints; expected at most {_MOST_WAYPOINTS}"]
+    found = [
+        f"waypoint {i} is {as_toml(row)}; expected [slot, x, y], a whole number from 0 on and a position in metres"
+        for i, row in enumerate(given)
+        if not _is_waypoint(row)
+    ]
+    if not found:
+        found = [
+            f"waypoint {i} is of slot {after[0]}, not after slot {before[0]}; expected slots that increase"
+            for i, (before, after) in enumerate(pairwise(given), 1)
+            if after[0] <= before[0]
+        ]
+    return found
+
+
+def _is_waypoint(row: Any) -> bool:
+    return (
+        isinstance(row, list)
+        and len(row) == 3
+        and type(row[0]) is int
+        and 0 <= row[0] <= 10**9
+        and all(is_number(value, -FARTHEST, FARTHEST) for value in row[1:])
+    )

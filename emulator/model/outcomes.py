@@ -1,0 +1,62 @@
+"""What a receiver does with a slot, by scheme and strategy, as far as the outcomes of one slot tell it.
+
+Source: docs/mathematics.md, eavesdroppers; docs/schemes.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from emulator.model.eavesdroppers import READERS, STRATEGIES
+from emulator.model.eavesdroppers.constant import Constant
+from emulator.model.eavesdroppers.eavesdropper import PacketTaker
+from emulator.model.schemes.innovation import Innovation
+from emulator.model.schemes.scheme import Scheme
+from emulator.model.theory import Outcomes, OutcomesAt
+
+GENIE_SCHEMES = ("innovation", "plain")
+"""Schemes whose packets are states and innovations, so that nobody without the secret outdoes the genie."""
+
+
+_CLOSED = {
+    ("acknowledged", "reference"): "reference",
+    ("encrypted-schedule", "selective"): "selective",
+    **{("scheduled", reader): "scheduled" for reader in ("legitimate", "naive", "reference", "selective")},
+}
+
+
+def closed_form(scheme: str, receiver: str) -> str | None:
+    """Which of `closed_forms` is a receiver's, whose slots are not alike; receiver: a strategy, or `legitimate`."""
+    return _CLOSED.get((scheme, receiver))
+
+
+def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
+    """From the quality of its link to what the legitimate estimator does with a slot; None: no such closed form."""
+
+    def at(quality: float) -> Outcomes:
+        found = scheme.outcomes(quality)
+        assert found is not None  # noqa: S101 - asked below
+        return found
+
+    return None if scheme.outcomes(0.5) is None else at
+
+
+def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> OutcomesAt | None:
+    """The same of an eavesdropper's strategy with its parameters."""
+    kind = STRATEGIES[strategy]
+    if kind.outcomes(parameters, scheme.state_probability) is None:
+        return None
+    reader = READERS[parameters["reads_as"]] if kind.parameters and "reads_as" in kind.parameters else kind
+    if isinstance(scheme, Innovation) or reader is Constant:
+        return kind.outcomes(parameters, scheme.state_probability)
+    if not issubclass(reader, PacketTaker):
+        return None
+    uses = reader.use_probabilities(parameters)
+
+    def at(quality: float) -> Outcomes:
+        found = scheme.eavesdropper_outcomes(quality, *uses)
+        assert found is not None  # noqa: S101 - asked below
+        return found
+
+    return None if scheme.eavesdropper_outcomes(0.5, *uses) is None else at

@@ -1,0 +1,171 @@
+"""Packets that hold the state less a reference, and whoever reads them with what it knows of that reference.
+
+A packet is z = x_k − L^{k−t} x_t, with t in the header, or x_k itself with t = −1. What a receiver knows of x_t decides
+what it makes of the packet.
+
+Source: docs/mathematics.md, acknowledged references.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.elementary import inverse
+from emulator.model.horizon import TOLERANCE, UNIT_ROUNDOFF
+from emulator.model.process import Dynamics, Floats, Process, product
+from emulator.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver, trace_of
+from emulator.model.theory import radius
+
+Slots = NDArray[np.int64]
+
+NONE = -1
+"""The reference slot of a packet that holds the state itself."""
+_DOUBLINGS = 60
+_MOST_SLOTS = 2**62
+
+
+class ReferenceCode:
+    """How a reference is carried from slot to slot: by L = A, or, for stable A, by L = Σ A⁻ᵀ Σ⁻¹. Final."""
+
+    def __init__(self, process: Process) -> None:
+        self._process = process
+        self.decorrelates = radius(process) < 1.0 and np.linalg.matrix_rank(process.A) == process.n
+        """Whether A is stable, and a packet therefore made independent of the state it leads to."""
+
+    @cached_property
+    def L(self) -> Floats:
+        """(n, n)."""
+        A = self._process.A
+        if not self.decorrelates:
+            return A
+        sigma = stationary_covariance(self._process)
+        return product(product(sigma, inverse(A).T.copy()), inverse(sigma))
+
+    @cached_property
+    def longest(self) -> int:
+        """How many slots a reference may be old: then L^m x_t of a stable A is so large that x_k is lost in rounding."""
+        if not self.decorrelates:
+            return _MOST_SLOTS
+        sigma = stationary_covariance(self._process)
+        n = self._process.n
+        least = min(float(self._process.Q[i, i]) for i in range(n))
+        limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * least
+        slots = 0
+        grown = sigma
+        while slots < _MOST_SLOTS:
+            grown = product(product(self.L, grown), self.L.T.copy())
+            if not sum(float(grown[i, i]) for i in range(n)) <= limit:
+                break
+            slots += 1
+        return slots
+
+    @cached_property
+    def _dynamics(self) -> Dynamics:
+        return Dynamics(self.L)
+
+    def carry(self, reference: Floats) -> Floats:
+        """L times a reference, (n, R)."""
+        return self._dynamics.product(reference)
+
+
+def stationary_covariance(process: Process) -> Floats:
+    """Σ = A Σ Aᵀ + Q of a stable process, (n, n), by doubling; the same bits everywhere."""
+    sigma, power = process.Q, process.A
+    for _ in range(_DOUBLINGS):
+        added = product(product(power, sigma), power.T.copy())
+        if not np.any(np.abs(added) > 0.0):
+            break
+        sigma = sigma + added
+        power = product(power, power)
+    return sigma
+
+
+class ReferenceReceiver(Receiver):
+    """The exact MMSE reader for L = A; for a decorrelating code one that decodes what it can and else predicts.
+
+    x_k = z + L^{k−t} x_t, so x̂_k = z + L^{k−t} x̂_t, with the error of x̂_t and no other. For L = A nothing heard after
+    slot t says more about x_t, and this is the best there is. Its memory, each carried to the slot at hand: the estimate
+    of the last slot it read a packet in, and its covariance; the same of that packet's reference; and both slots. An
+    acknowledged slot in between, in which it heard nothing, is predicted from the former.
+
+    Without forged acknowledgements the legitimate estimator never lacks a reference: it acknowledged it.
+    """
+
+    def __init__(self, process: Process, trials: int) -> None:
+        super().__init__(process, trials)
+        self._code = ReferenceCode(process)
+        self._terms: list[Floats] = [process.Q[:, :, None]]
+
+    def prior(self, first: int = 0) -> Belief:
+        """x̂ = 0, P = Σ, known of the slot before, and before slot 0 of that; no reference."""
+        belief = super().prior(first)
+        none = np.full(self.trials, NONE, np.int64)
+        last = np.full(self.trials, max(0, first - 1), np.int64)
+        return belief._replace(memory=(belief.x_hat, belief.P, belief.x_hat, np.zeros_like(belief.P), last, none))
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """Not to be told: it depends on the packet's header."""
+        raise NotImplementedError("what becomes of a slot depends on the header; only packets themselves can tell")
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if nothing is read; else (z, 0), or z and what is known of the reference.
+
+        A packet without a header has no reference: it is taken for the state.
+        """
+        latest, spread, kept, kept_spread, last, named = self._carried(k, belief)
+        t = np.full(self.trials, NONE, np.int64) if heard.header is None else heard.header[0]
+        state = heard.gamma & (t == NONE)
+        old = heard.gamma & (t >= 0) & (t == named)
+        new = heard.gamma & ~old & (t >= last) & (t < k)
+        reference = np.where(old, kept, latest)
+        certainty = np.where(old, kept_spread, spread + self._diffused_since(k, last, t, new))
+        exact = trace_of(certainty) == 0.0
+        if self._code.decorrelates:
+            young = (t >= 0) & (k - np.where(new | old, t, 0) <= self._code.longest)
+            old, new = old & exact & young, new & exact & young
+        decoded = old | new
+        action = np.where(heard.gamma, np.uint8(Action.DISCARDED), np.uint8(Action.LOST))
+        action[decoded] = Action.INNOVATION
+        action[state | (decoded & exact)] = Action.STATE
+        predicted = self.process.predict(belief.x_hat) if k else belief.x_hat
+        x_hat = np.where(state, heard.z, np.where(decoded, np.where(decoded, heard.z, 0.0) + reference, predicted))
+        unread = self.process.diffuse(self.process.carry(belief.P)) if k else belief.P
+        P = np.where(state, 0.0, np.where(decoded, certainty, unread))
+        read = state | decoded
+        memory = (
+            np.where(read, x_hat, latest),
+            np.where(read, P, spread),
+            np.where(new, reference, kept),
+            np.where(new, certainty, kept_spread),
+            np.where(read, k, last),
+            np.where(state, NONE, np.where(decoded, t, named)),
+        )
+        return Belief(x_hat, P, action, memory)
+
+    def _carried(self, k: int, belief: Belief) -> tuple[Floats, Floats, Floats, Floats, Slots, Slots]:
+        """The memory, carried from slot k − 1 to k."""
+        latest, spread, kept, kept_spread, last, named = belief.memory
+        if k == 0:
+            return latest, spread, kept, kept_spread, last, named
+        if self._code.decorrelates:
+            # What is too old to be named again is let go, before it grows beyond all numbers.
+            latest = np.where(k - last <= self._code.longest, latest, 0.0)
+            kept = np.where(k - named <= self._code.longest, kept, 0.0)
+        carry, widen = self._code.carry, self.process.carry
+        return carry(latest), widen(spread), carry(kept), widen(kept_spread), last, named
+
+    def _diffused_since(self, k: int, last: Slots, t: Slots, where: Flags) -> Floats:
+        """Σ A^j Q A^jᵀ over k−t ≤ j < k−last, (n, n, R): process noise up to slot t, carried to k; 0 where not asked."""
+        n = self.process.n
+        total = np.zeros((n, n, self.trials))
+        if not np.any(where & (t > last)):
+            return total
+        nearest, farthest = k - np.where(where, t, k), np.where(where, k - last, 0)
+        for j in range(int(nearest[where].min()), int(farthest.max())):
+            while len(self._terms) <= j:
+                self._terms.append(self.process.carry(self._terms[-1]))
+            total += np.where(where & (nearest <= j) & (j < farthest), self._terms[j], 0.0)
+        return total

@@ -1,0 +1,71 @@
+"""State-secrecy code: the state less what the user is known to have, by its acknowledgements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from emulator.model.process import Floats, Process
+from emulator.model.receiver import Flags, Receiver
+from emulator.model.reference import NONE, ReferenceCode, ReferenceReceiver
+from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
+from emulator.streams import Batch
+
+
+class AcknowledgedEncoder(Encoder):
+    """z_k = x_k − L^{k−t} x_t, t the last acknowledged slot; x_k itself before the first acknowledgement."""
+
+    def __init__(self, process: Process, trials: int) -> None:
+        self._code = ReferenceCode(process)
+        self._reference = np.zeros((process.n, trials))
+        self._slot = np.full(trials, NONE, np.int64)
+        self._k = NONE
+        self._x: Floats
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - references say more
+        """The packet of slot k, which must follow the one before."""
+        self._slot = np.where(k - self._slot <= self._code.longest, self._slot, NONE)
+        self._reference = self._code.carry(np.where(self._slot == NONE, 0.0, self._reference))
+        self._k, self._x = k, x.copy()
+        # A reference of 0 is subtracted where there is none: x − 0 is x.
+        return Packet(x - self._reference, np.zeros(x.shape[1], np.bool_), self._slot[None].copy())
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Make x_k the reference where slot k is acknowledged. Raises ValueError if k is not the slot just sent."""
+        if k != self._k:
+            raise ValueError(f"acknowledgements of slot {k} after slot {self._k} was sent; expected those of that slot")
+        self._reference = np.where(acknowledged, self._x, self._reference)
+        self._slot = np.where(acknowledged, k, self._slot)
+
+
+class Acknowledged(Scheme):
+    """Subtracts a reference that the user holds; an eavesdropper that missed it once has lost it for good.
+
+    There is no secret: what tells the receivers apart is which packets they heard, and that the sensor knows it of one of
+    them. So it stands and falls with acknowledgements that are neither blocked nor forged.
+
+    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
+    """
+
+    needs_acknowledgements = True
+    reads_packets = True
+    header = ("slot t of the reference; −1: none, z is the state",)
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """Nothing."""
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: AcknowledgedEncoder(self.process, batch.trials),
+            lambda: self.estimator(keys, batch),
+        )
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
+        """Keeps the references that it may have acknowledged."""
+        return ReferenceReceiver(self.process, batch.trials)
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet, whichever acknowledgements arrive."""
+        return Outcomes.plain(mu)

@@ -1,0 +1,73 @@
+"""Stream cipher: every packet is the state under a one-time pad that only sensor and estimator can draw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from emulator.model import update
+from emulator.model.masking import Mask
+from emulator.model.process import Floats, Process
+from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver
+from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
+from emulator.streams import Batch
+
+
+class CipherEncoder(Encoder):
+    """z_k = x_k, masked."""
+
+    def __init__(self, mask: Mask) -> None:
+        self._mask = mask
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
+        """The packet of slot k."""
+        return Packet(self._mask.hide(k, x), np.zeros(x.shape[1], np.bool_))
+
+
+class CipherEstimator(Receiver):
+    """Takes the mask off every packet it receives, and has the state."""
+
+    def __init__(self, process: Process, trials: int, mask: Mask) -> None:
+        super().__init__(process, trials)
+        self._mask = mask
+
+    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
+        """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
+        return gamma.astype(np.uint8)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, else (the state, 0)."""
+        action = self.act(k, heard.gamma)
+        state = self._mask.reveal(k, np.where(heard.gamma, heard.z, 0.0))
+        return Belief(
+            update.estimate(self.process, k, belief.x_hat, action, state),
+            update.believed_covariance(self.process, k, belief.P, action),
+            action,
+        )
+
+
+class Cipher(Scheme):
+    """Masks every packet. What an eavesdropper hears is independent of the state, so the best it can do is not to listen.
+
+    Source: docs/mathematics.md, stream cipher.
+    """
+
+    secret_streams = ("mask",)
+    estimator_streams = ("mask",)
+    secret_words = (0, 1)
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The pads."""
+        mask = Mask(self.process, keys["mask"], batch)
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: CipherEncoder(mask),
+            lambda: CipherEstimator(self.process, batch.trials, mask),
+        )
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet."""
+        return Outcomes.plain(mu)

@@ -1,0 +1,102 @@
+"""Encryption scheduling: packets in clear while the user keeps up, encrypted when it has fallen behind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from emulator.model import update
+from emulator.model.holding_time import HoldingTime
+from emulator.model.masking import Mask
+from emulator.model.process import Floats, Process
+from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from emulator.model.schemes.checks import count_mistakes
+from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
+from emulator.streams import Batch
+
+
+class EncryptedScheduleEncoder(Encoder):
+    """z_k = x_k, masked from `threshold` slots after the last acknowledged one on; the header says which."""
+
+    def __init__(self, threshold: int, trials: int, mask: Mask) -> None:
+        self._threshold = threshold
+        self._held = HoldingTime(trials)
+        self._mask = mask
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
+        """The packet of slot k."""
+        encrypted = self._held.reached(k, self._threshold)
+        z = select(encrypted, lambda: self._mask.hide(k, x), lambda: x)
+        return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Go on in clear where slot k is acknowledged."""
+        self._held.acknowledged(k, acknowledged)
+
+
+class EncryptedScheduleEstimator(Receiver):
+    """Takes the mask off the packets that have one, and has the state from any."""
+
+    def __init__(self, process: Process, trials: int, mask: Mask) -> None:
+        super().__init__(process, trials)
+        self._mask = mask
+
+    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
+        """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
+        return gamma.astype(np.uint8)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, else (the state, 0)."""
+        action = self.act(k, heard.gamma)
+        encrypted = heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
+        masked = np.where(encrypted, heard.z, 0.0)
+        z = select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)
+        return Belief(
+            update.estimate(self.process, k, belief.x_hat, action, z),
+            update.believed_covariance(self.process, k, belief.P, action),
+            action,
+        )
+
+
+class EncryptedSchedule(Scheme):
+    """Encrypts from `threshold` slots after the last acknowledged one until the next acknowledgement; 1 is always.
+
+    For a sensor that can afford to encrypt some packets. Where acknowledgements are blocked it encrypts them all: more
+    than it wanted to pay for, but secret.
+
+    Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, schedules by holding time.
+    """
+
+    parameters = MappingProxyType({"threshold": 2})
+    secret_streams = ("mask",)
+    estimator_streams = ("mask",)
+    needs_acknowledgements = True
+    header = ("1 if encrypted, 0 if in clear",)
+    secret_words = (0, 1)
+
+    def __init__(self, process: Process, threshold: int) -> None:
+        super().__init__(process)
+        self.threshold = threshold
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A threshold is a number of slots."""
+        return count_mistakes(given, "threshold")
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The pads."""
+        mask = Mask(self.process, keys["mask"], batch)
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: EncryptedScheduleEncoder(self.threshold, batch.trials, mask),
+            lambda: EncryptedScheduleEstimator(self.process, batch.trials, mask),
+        )
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet."""
+        return Outcomes.plain(mu)

@@ -1,0 +1,125 @@
+"""Twin track: the state, or the state that the process would have had from another, equally likely start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from emulator.model import update
+from emulator.model.elementary import cholesky
+from emulator.model.process import Floats, Process, product
+from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
+from emulator.streams import Batch, BlockReader
+
+
+class Tracks:
+    """x_0 and y_0 ~ N(0, Σ0) from the stream `start`, their distance d_k = A^k (y_0 − x_0), and the coins from `track`.
+
+    Final. Slots in order are quick; any other order is correct.
+    """
+
+    def __init__(self, process: Process, keys: Mapping[str, bytes], batch: Batch) -> None:
+        normals = BlockReader(keys["start"], batch, 2 * process.n).normals(range(1))[0]
+        factor = cholesky(process.initial_covariance)
+        self.initial: Floats = product(factor, normals[: process.n])
+        """x_0, (n, R)."""
+        self._process = process
+        self._apart: Floats = product(factor, normals[process.n :]) - self.initial
+        self._k, self._distance = 0, self._apart
+        self._reader = BlockReader(keys["track"], batch, 1)
+        self._slots = range(0)
+        self._coins: Flags
+
+    def distance(self, k: int) -> Floats:
+        """d_k, (n, R): from the process's track to its twin's."""
+        if k < self._k:
+            self._k, self._distance = 0, self._apart
+        while self._k < k:
+            self._distance = self._process.predict(self._distance)
+            self._k += 1
+        return self._distance
+
+    def on_twin(self, k: int) -> Flags:
+        """Whether the packet of slot k is on the twin's track, (R,): a fair coin."""
+        if k not in self._slots:
+            self._slots = self._reader.block(k)
+            self._coins = self._reader.uniforms(self._slots)[:, 0, :] < 0.5
+        coins: Flags = self._coins[k - self._slots.start]
+        return coins
+
+
+class TwinTrackEncoder(Encoder):
+    """z_k = x_k, or x_k + d_k, slot 0 included."""
+
+    def __init__(self, tracks: Tracks) -> None:
+        self._tracks = tracks
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
+        """The packet of slot k."""
+        z = select(self._tracks.on_twin(k), lambda: x + self._tracks.distance(k), lambda: x)
+        return Packet(z, np.zeros(x.shape[1], np.bool_))
+
+
+class TwinTrackEstimator(Receiver):
+    """Knows x_0 before anything is sent, and the track of every packet."""
+
+    def __init__(self, process: Process, trials: int, tracks: Tracks) -> None:
+        super().__init__(process, trials)
+        self._tracks = tracks
+
+    def prior(self, first: int = 0) -> Belief:
+        """x̂ = x_0, P = 0, carried on to the slot before `first`."""
+        n = self.process.n
+        x_hat, P = self._tracks.initial, np.zeros((n, n, self.trials))
+        for _ in range(first - 1):
+            x_hat, P = self.process.predict(x_hat), self.process.diffuse(self.process.carry(P))
+        return Belief(x_hat, P, np.zeros(self.trials, np.uint8))
+
+    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
+        """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
+        return gamma.astype(np.uint8)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, else (z, 0) or (z − d_k, 0)."""
+        action = self.act(k, heard.gamma)
+        z = select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
+        return Belief(
+            update.estimate(self.process, k, belief.x_hat, action, z),
+            update.believed_covariance(self.process, k, belief.P, action),
+            action,
+        )
+
+
+class TwinTrack(Scheme):
+    """Two tracks, of which only who shares the secret knows which is the process's own.
+
+    x_0 is part of the secret, so the process must start from `initial_state`. No strategy that is told the schedule of
+    states and innovations is meant for it; none holds the key of `track` or `start`.
+
+    Source: docs/mathematics.md, twin track.
+    """
+
+    secret_streams = ("start", "track")
+    estimator_streams = ("start", "track")
+    secret_words = (1, 0)
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The two starts and the coins."""
+        tracks = Tracks(self.process, keys, batch)
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: TwinTrackEncoder(tracks),
+            lambda: TwinTrackEstimator(self.process, batch.trials, tracks),
+        )
+
+    def initial_state(self, keys: Mapping[str, bytes], batch: Batch) -> Floats:
+        """x_0, (n, R), by the stream `start`."""
+        return Tracks(self.process, keys, batch).initial
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet, and x_0 without any."""
+        return Outcomes(predicted=1.0 - mu, state=mu, misled=0.0, decoded=0.0, initial=0.0)

@@ -1,0 +1,71 @@
+"""Withholding: send the state with probability p, else nothing at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from emulator.model.process import Floats, Process
+from emulator.model.receiver import Receiver
+from emulator.model.schedule import Schedule
+from emulator.model.schemes.checks import probability_mistakes
+from emulator.model.schemes.plain import PlainEstimator
+from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from emulator.model.theory import Outcomes
+from emulator.streams import Batch
+
+
+class WithholdingEncoder(Encoder):
+    """z_k = x_k where the schedule says so; the other slots stay silent."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self._schedule = schedule
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
+        """The packet of slot k."""
+        return Packet(x, np.zeros(x.shape[1], np.bool_), sent=~self._schedule.at(k))
+
+
+class Withholding(Scheme):
+    """Sends in slot 0 and then with probability p = `state_probability`, by a coin that only the sensor has to toss.
+
+    Whoever receives a packet has the state; only the rates tell receivers apart. So there is no secret: the estimator
+    needs none, and an eavesdropper that knew the schedule would gain nothing.
+
+    Source: Tsiamis, Gatsis, Pappas (2017); docs/mathematics.md, withholding.
+    """
+
+    parameters = MappingProxyType({"state_probability": 0.6})
+    secret_streams = ("schedule",)
+    may_be_silent = True
+
+    def __init__(self, process: Process, state_probability: float) -> None:
+        super().__init__(process, state_probability)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """P is a probability."""
+        return probability_mistakes(given, "state_probability")
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The sensor's schedule, and nothing for the estimator."""
+        schedule = Schedule(keys["schedule"], self.state_probability, batch)
+        return NoInnovations(
+            self.process, batch.trials, lambda: WithholdingEncoder(schedule), lambda: self.estimator({}, batch)
+        )
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
+        """Uses whatever arrives."""
+        return PlainEstimator(self.process, batch.trials)
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with probability μp: E P → (1−μp) S(μp)."""
+        return self.eavesdropper_outcomes(mu, 1.0, 1.0)
+
+    def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
+        """Nobody can be misled by what is not sent."""
+        del use_innovation
+        return Outcomes.eavesdropper(mu_e, self.state_probability, use_state, 0.0)

@@ -1,0 +1,45 @@
+"""Deliveries that take a part of a slot in real time: put when they are due, in order, while the router goes on.
+
+Whole slots of delay are emulated time, the same in every run; this is only when a message really goes out.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import threading
+import time
+from collections.abc import Callable
+
+Put = Callable[[bytes], None]
+
+
+class Postman:
+    """Puts messages at their times, on a thread of its own. Final; daemonic, since a run ends when all have arrived."""
+
+    def __init__(self) -> None:
+        self._due: list[tuple[float, int, Put, bytes]] = []
+        self._numbers = itertools.count()
+        self._news = threading.Condition()
+        threading.Thread(target=self._go_round, name="postman", daemon=True).start()
+
+    def round(self, put: Put) -> Callable[[bytes, float], None]:
+        """An outlet for messages that go out some seconds later each, but never before the one before."""
+        last = 0.0
+
+        def send(payload: bytes, seconds: float) -> None:
+            nonlocal last
+            last = max(last, time.monotonic() + seconds)
+            with self._news:
+                heapq.heappush(self._due, (last, next(self._numbers), put, payload))
+                self._news.notify()
+
+        return send
+
+    def _go_round(self) -> None:
+        while True:
+            with self._news:
+                while not self._due or (wait := self._due[0][0] - time.monotonic()) > 0.0:
+                    self._news.wait(wait if self._due else None)
+                _, _, put, payload = heapq.heappop(self._due)
+            put(payload)

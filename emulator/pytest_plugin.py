@@ -1,0 +1,78 @@
+"""Scenario files as tests of pytest: `pytest scenarios/`, `pytest my.toml`. One file is one test and one run.
+
+pytest loads this in every project of an environment that has Evedrop in it, so it loads nothing of weight itself.
+
+Source: docs/testing.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from emulator.collect import is_scenario
+
+if TYPE_CHECKING:
+    from emulator.runs.testing import Finding
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The options; docs/testing.md has them."""
+    group = parser.getgroup("evedrop", "scenarios of Evedrop")
+    group.addoption("--evedrop-in-memory", action="store_true", help="run scenarios in memory instead of live")
+    group.addoption("--evedrop-trials", type=int, metavar="N", help="trials of every scenario; default its own number")
+    group.addoption("--evedrop-out", type=Path, metavar="DIR", help="where results go, a folder each; default runs/")
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """A collector for a file that is a scenario; None for any other."""
+    return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
+
+
+class ScenarioFile(pytest.File):
+    """A scenario file. Final."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        """Its one test."""
+        yield ScenarioItem.from_parent(self, name=self.path.stem)
+
+
+class ScenarioItem(pytest.Item):
+    """A scenario as a test. Final."""
+
+    def runtest(self) -> None:
+        """Run it. Raises ScenarioFailed if it does not pass."""
+        from emulator.errors import Interrupted  # noqa: PLC0415 - only where there is a scenario to run
+        from emulator.runs.testing import Manner, Outcome, carry_out  # noqa: PLC0415 - the same
+
+        options = self.config.option
+        manner = Manner(options.evedrop_in_memory, options.evedrop_trials, options.evedrop_out)
+        try:
+            tested = carry_out(str(self.path), manner)
+        except Interrupted:
+            raise KeyboardInterrupt from None
+        for name, value in (("evedrop_seed", tested.seed), ("evedrop_results", tested.folder)):
+            if value is not None:
+                self.user_properties.append((name, str(value)))
+        if tested.outcome is not Outcome.PASSED:
+            raise ScenarioFailed(tested)
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], *more: Any) -> Any:
+        """The reasons, a line each; a traceback only of what is a mistake of ours."""
+        if isinstance(excinfo.value, ScenarioFailed):
+            return str(excinfo.value)
+        return super().repr_failure(excinfo, *more)
+
+    def reportinfo(self) -> tuple[Path, int | None, str]:
+        """Where it is, and its heading in the report."""
+        return self.path, None, f"scenario {self.name}"
+
+
+class ScenarioFailed(Exception):
+    """A scenario that did not pass, with the reasons."""
+
+    def __init__(self, tested: Finding) -> None:
+        super().__init__("\n".join(tested.lines))

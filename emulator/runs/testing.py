@@ -1,0 +1,153 @@
+"""A scenario carried out as a test, for the pytest plugin and `evedrop test` alike.
+
+Source: docs/testing.md.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from emulator.api import default_folder
+from emulator.collect import scenarios_in
+from emulator.errors import RunError, ScenarioError, UsageError
+from emulator.runs.judge import told
+from emulator.runs.launcher import launch
+from emulator.runs.montecarlo import Plan, simulate
+from emulator.runs.results import load_results
+from emulator.scenario import Scenario, load, shipped
+
+
+class Outcome(Enum):
+    """What became of a test; its value is the exit status."""
+
+    PASSED = 0
+    FAILED = 1
+    """An expectation was not held, or the run could not tell."""
+    MISTAKES = 2
+    """The scenario has mistakes, or nothing could be started."""
+    BROKEN = 3
+    """The run itself failed."""
+
+    @property
+    def word(self) -> str:
+        """As it is printed."""
+        return self.name.lower() if self is Outcome.PASSED else self.name
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How tests are carried out."""
+
+    in_memory: bool = False
+    trials: int | None = None
+    """None: as many as the scenario says."""
+    out: Path | None = None
+    """The folder of all results folders; None: each is below runs/."""
+    workers: int | None = None
+    """Of a test in memory; None: as many as pay."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What became of one scenario."""
+
+    scenario: str
+    outcome: Outcome
+    seconds: float
+    reasons: tuple[str, ...] = ()
+    """Why it did not pass, a line each."""
+    seed: int | None = None
+    folder: Path | None = None
+    """The results."""
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What there is to say of one that did not pass."""
+        kept = () if self.folder is None or self.outcome is Outcome.PASSED else (f"results: {self.folder}",)
+        return (*self.reasons, *kept)
+
+
+def scenarios_of(places: Sequence[str]) -> list[str]:
+    """The scenarios that files, folders and shipped names stand for, each once. Raises UsageError if there is none."""
+    found: dict[Path, str] = {}
+    for place in places:
+        paths: Sequence[Path] = [Path(place)]
+        if place in shipped():
+            found.setdefault(shipped()[place].resolve(), place)
+            continue
+        if Path(place).is_dir():
+            paths = list(scenarios_in(Path(place)))
+        for path in paths:
+            found.setdefault(path.resolve(), str(path))
+    if not found:
+        raise UsageError(f"no scenario in {', '.join(places)}; a scenario is a TOML file with [process] and [encoding]")
+    return list(found.values())
+
+
+def carry_out(scenario: str, manner: Manner) -> Finding:
+    """Run a scenario, live and without a view or in memory, into a results folder of its own, which is kept.
+
+    Raises Interrupted on Ctrl-C.
+    """
+    started = time.monotonic()
+    changes = {} if manner.trials is None else {"trials": manner.trials}
+
+    def ended(outcome: Outcome, reasons: Sequence[str], **more: Any) -> Finding:
+        return Finding(scenario, outcome, time.monotonic() - started, tuple(reasons), **more)
+
+    try:
+        made = load(scenario, changes)
+        folder = _claimed(default_folder(scenario) if manner.out is None else manner.out / Path(scenario).stem)
+    except ScenarioError as error:
+        return ended(Outcome.MISTAKES, error.mistakes)
+    except UsageError as error:
+        return ended(Outcome.MISTAKES, [str(error)])
+    try:
+        _run(made, folder, manner)
+    except UsageError as error:
+        return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
+    except RunError as error:
+        return ended(Outcome.BROKEN, str(error).splitlines(), seed=made.seed, folder=folder)
+    reasons = list(_reasons(load_results(folder).summary))
+    return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, seed=made.seed, folder=folder)
+
+
+def _run(scenario: Scenario, folder: Path, manner: Manner) -> None:
+    if manner.in_memory:
+        simulate(scenario, folder, _silent, Plan(workers=manner.workers))
+    else:
+        launch(scenario, folder, "off", None, _silent)
+
+
+def _silent(news: Mapping[str, Any]) -> None:
+    del news
+
+
+def _claimed(wanted: Path) -> Path:
+    """A new folder of that name, or with a number after it: tests of the same name run at the same time."""
+    for number in itertools.count(1):
+        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise UsageError(
+                f"{folder} cannot be made ({error.strerror}); give another folder for the results"
+            ) from error
+        return folder
+    raise AssertionError  # there is always another number
+
+
+def _reasons(summary: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each expectation that did not hold, and for each that the run could not tell: a test must tell."""
+    for expectation in summary["expectations"]:
+        if expectation["held"] is not True:
+            replay = expectation.get("replay")
+            yield told(expectation) + (f"; see it again: {replay}" if replay is not None else "")

@@ -1,0 +1,295 @@
+"""`[[expect]]`: what must hold for a run to pass, of a figure, a link, secrecy, or a receiver that must be in step.
+
+Source: docs/scenario.md, expect.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from emulator.scenario.table import Found, Number, Table, expected, one_of
+from emulator.scenario.words import as_toml, listed
+
+FIGURES = (
+    "mean_squared_error",
+    "mean_trace_covariance",
+    "expected_trace_covariance",
+    "received_fraction",
+    "used_fraction",
+)
+"""Of a receiver."""
+TRIAL_FIGURES = ("mean_squared_error", "received_fraction", "used_fraction")
+"""Those that a run knows of every trial, and so has quantiles of."""
+LINK_FIGURES = ("offered", "delivered", "late", "lost", "unexplained", "rate")
+SECRECY = ("relative", "perfect")
+
+LINKS = "links"
+_LOST_BY = re.compile(r"lost_by\.[a-z][a-z0-9_-]*")
+_COMPARISONS = ("below", "above", "near", "within", "within_relative")
+_ENTRIES: Mapping[str, tuple[str, ...]] = {
+    "figure": (*_COMPARISONS, "slots", "quantile"),
+    "link": (),
+    "secrecy": ("against",),
+    "in_step": ("by", "since"),
+}
+"""What an expectation may be of → the entries that go with it."""
+_EXAMPLES: Mapping[str, str] = {
+    "figure": 'figure = "legitimate.mean_squared_error"',
+    "link": 'link = "legitimate"',
+    "secrecy": 'secrecy = "relative"',
+    "in_step": 'in_step = "legitimate"',
+}
+
+
+def _range(slots: list[int]) -> list[int]:
+    if len(slots) != 2 or not 0 <= slots[0] < slots[1]:
+        raise expected("two slots [from, to], 0 ≤ from < to")
+    return slots
+
+
+def _quantile(value: float) -> float:
+    if not 0.0 < value < 1.0:
+        raise expected("a number between 0 and 1, neither of them")
+    return value
+
+
+Secrecy = Annotated[str, AfterValidator(one_of(SECRECY))]
+Range = Annotated[list[Annotated[int, Field(strict=True)]], AfterValidator(_range)]
+Quantile = Annotated[float, Field(strict=True), AfterValidator(_quantile)]
+Distance = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+Slot = Annotated[int, Field(strict=True, ge=0)]
+
+
+class ExpectTable(Table):
+    """`[[expect]]`: one of `figure`, `link`, `secrecy` and `in_step`, and the entries that go with it."""
+
+    figure: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
+    below: Annotated[Number | None, Field(examples=[0.01])] = None
+    above: Annotated[Number | None, Field(examples=[0.01])] = None
+    near: Annotated[Number | None, Field(examples=[0.01])] = None
+    within: Annotated[Distance | None, Field(examples=[0.002])] = None
+    within_relative: Annotated[Distance | None, Field(examples=[0.1])] = None
+    slots: Annotated[Range | None, Field(examples=[[100, 200]])] = None
+    quantile: Annotated[Quantile | None, Field(examples=[0.9])] = None
+    link: Annotated[str | None, Field(examples=["legitimate"])] = None
+    secrecy: Annotated[Secrecy | None, Field(examples=["relative"])] = None
+    against: Annotated[str | None, Field(examples=["smart"])] = None
+    in_step: Annotated[str | None, Field(examples=["legitimate"])] = None
+    by: Annotated[Slot | None, Field(examples=[40])] = None
+    since: Annotated[Slot | None, Field(examples=[0])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Whether it is of one thing, and has what that needs and nothing else."""
+        given = [name for name, value in table.items() if value is not None]
+        kinds = [kind for kind in _ENTRIES if kind in given]
+        if not kinds:
+            meant = [kind for kind, entries in _ENTRIES.items() if any(name in given for name in entries)]
+            kind = meant[0] if meant else "figure"
+            others = ", or one of " + ", ".join(name for name in _ENTRIES if name != kind) if not meant else ""
+            return [(kind, f"is missing; expected {_EXAMPLES[kind]}{others}")]
+        if len(kinds) > 1:
+            one_each = f"expected one of {', '.join(_ENTRIES)} in a table"
+            return [(kind, f"is there beside {kinds[0]}; {one_each}") for kind in kinds[1:]]
+        (kind,) = kinds
+        found = [
+            (name, f"is set, but {kind} has no such entry; remove the line")
+            for other, entries in _ENTRIES.items()
+            for name in entries
+            if other != kind and name in given
+        ]
+        check = {"figure": _figure_mistakes, "link": _nothing, "secrecy": _secrecy_mistakes, "in_step": _step_mistakes}
+        return found + check[kind](table)
+
+    @property
+    def kind(self) -> str:
+        """`figure`, `link`, `secrecy` or `in_step`."""
+        return next(kind for kind in _ENTRIES if getattr(self, kind) is not None)
+
+    @property
+    def wanted(self) -> str:
+        """What must be found."""
+        match self.kind:
+            case "link":
+                return "within its confidence interval"
+            case "secrecy":
+                return "promised by theory and shown by the run"
+            case "in_step":
+                return f"by slot {self.by}" + ("" if self.since is None else f", since slot {self.since}")
+        bounds = [f"{name} {value:.10g}" for name in ("below", "above") if (value := getattr(self, name)) is not None]
+        if self.near is not None:
+            around = f"{self.within:.10g}" if self.within is not None else f"{self.within_relative:.10g} of it"
+            bounds.append(f"near {self.near:.10g} within {around}")
+        return " and ".join(bounds)
+
+    @property
+    def text(self) -> str:
+        """As a sentence."""
+        subject = {
+            "figure": self.figure,
+            "link": f"link {self.link}",
+            "secrecy": f"{self.secrecy} secrecy against {self.against}",
+            "in_step": f"{self.in_step} in step",
+        }[self.kind]
+        if self.quantile is not None:
+            subject = f"{self.quantile:.10g} quantile of {subject}"
+        if self.slots is not None:
+            subject = f"{subject} over slots {self.slots[0]} to {self.slots[1] - 1}"
+        return f"{subject} {self.wanted}"
+
+    def holds(self, found: float) -> bool:
+        """Whether a figure is as wanted."""
+        if (self.below is not None and not found < self.below) or (self.above is not None and not found > self.above):
+            return False
+        if self.near is None:
+            return True
+        relative = self.within_relative or 0.0
+        return abs(found - self.near) <= (self.within if self.within is not None else relative * abs(self.near))
+
+
+def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
+    """Receiver, and where in the account of its link the figure is; None of a receiver's own figure."""
+    parts = figure.split(".")
+    return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
+
+
+def _nothing(table: Mapping[str, Any]) -> list[Found]:
+    del table
+    return []
+
+
+def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """Comparisons that say something, and a range or a quantile only of what has one."""
+    below, above, near = (table.get(name) for name in ("below", "above", "near"))
+    distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
+    found: list[Found] = []
+    if near is None and distances:
+        found.append((distances[0], "is set without near; expected near = 0.01 beside it"))
+    elif near is None and below is None and above is None:
+        what = "and above are both missing; expected at least one, such as below = 0.01, or near and within"
+        found.append(("below", what))
+    elif near is not None and not distances:
+        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, beside near"))
+    elif len(distances) > 1:
+        found.append(("within_relative", "is there beside within; expected one of them"))
+    elif near == 0 and distances == ["within_relative"]:
+        found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
+    if below is not None and above is not None and _number(below) and _number(above) and not above < below:
+        found.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
+    figure = table["figure"]
+    if not isinstance(figure, str):
+        return found
+    link = link_figure(figure)
+    for name in ("slots", "quantile"):
+        if link is not None and table.get(name) is not None:
+            instead = f"expected none, or the figure {link[0]}.received_fraction"
+            found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
+    if (
+        link is None
+        and table.get("quantile") is not None
+        and figure.rpartition(".")[2] in set(FIGURES) - set(TRIAL_FIGURES)
+    ):
+        instead = f"expected a figure that every trial has: {listed(TRIAL_FIGURES)}"
+        found.append(("quantile", f"is set, but {figure} is not known trial by trial; {instead}"))
+    return found
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _secrecy_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """Whether it says against whom."""
+    if table.get("against") is None:
+        return [("against", "is missing; expected the name of an eavesdropper")]
+    return []
+
+
+def _step_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """Whether there is time."""
+    by, since = table.get("by"), table.get("since")
+    if by is None:
+        return [("by", "is missing; expected the last slot by which it must be in step, such as by = 40")]
+    if type(by) is int and type(since) is int and by < since:
+        return [("by", f"is {by}, before since, which is {since}; expected since ≤ by")]
+    return []
+
+
+@dataclass(frozen=True)
+class Around:
+    """What an expectation is seen against; None where the file has a mistake there."""
+
+    receivers: Sequence[str]
+    """The legitimate one first."""
+    slots: int | None
+    trials: int | None
+    no_theory: Callable[[str], str | None]
+    """Why there is no theory for a receiver; None if there is."""
+
+    def mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
+        """Whom or what there is not, slots beyond the run, too few trials."""
+        found: list[Found] = []
+        figure = expectation.get("figure")
+        if isinstance(figure, str):
+            found += self._figure_mistakes(figure)
+        names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
+        for entry, known in names.items():
+            name = expectation.get(entry)
+            if isinstance(name, str) and name not in known:
+                choice = f"expected {listed(known)}" if known else "there is no eavesdropper; add one"
+                found.append((entry, f"is {as_toml(name)}; {choice}{_near(name, known)}"))
+        return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.get("quantile"))
+
+    def _figure_mistakes(self, figure: str) -> list[Found]:
+        link = link_figure(figure)
+        if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
+            return []
+        own = [f"{receiver}.{name}" for receiver in self.receivers for name in FIGURES]
+        links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
+        if figure in links:
+            return []
+        if figure not in own:
+            names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(FIGURES)})"
+            of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
+            hint = _near(figure, [*own, *links])
+            return [("figure", f"is {as_toml(figure)}; expected {names} or {of_links}{hint}")]
+        receiver, _, name = figure.partition(".")
+        why = self.no_theory(receiver) if name == "expected_trace_covariance" else None
+        if why is not None:
+            return [("figure", f"is {as_toml(figure)}, but {why}; expected another figure")]
+        return []
+
+    def _slot_mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
+        if self.slots is None:
+            return []
+        found: list[Found] = []
+        span: Any = expectation.get("slots")
+        whole = isinstance(span, list) and [type(slot) for slot in span] == [int, int]
+        if whole and 0 <= span[0] < span[1] > self.slots:
+            found.append(("slots", f"is {as_toml(span)}; expected from < to ≤ slots, which is {self.slots}"))
+        for name in ("by", "since"):
+            slot = expectation.get(name)
+            if type(slot) is int and slot >= self.slots:
+                found.append((name, f"is {slot}; expected a slot of the run, 0 to {self.slots - 1}"))
+        return found
+
+    def _quantile_mistakes(self, quantile: Any) -> list[Found]:
+        if self.trials is None or not isinstance(quantile, float) or not 0.0 < quantile < 1.0:
+            return []
+        # So that a trial is expected beyond it; a little off 1/q, which decimals seldom hit exactly.
+        least = math.ceil(1.0 / min(quantile, 1.0 - quantile) - 1e-9)
+        if self.trials >= least:
+            return []
+        return [("quantile", f"is {quantile:g} of {self.trials} trials; expected trials = {least} or more")]
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean {near[0]}?" if near else ""

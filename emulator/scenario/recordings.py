@@ -1,0 +1,85 @@
+"""The recordings that a scenario names: read when it is loaded, so that whoever gets the scenario needs no file.
+
+Source: docs/links.md, traces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.errors import TraceError
+from emulator.scenario.words import as_toml
+from emulator.traces import Recording
+
+_STAND_IN = "1"  # for a recording that cannot be read: it is complained of once
+
+
+def beside(tables: Mapping[str, Any], folder: Path) -> None:
+    """Change the name of every recording to where it is, for a scenario in this folder."""
+    for _, trace in _traces(tables):
+        if isinstance(trace.get("file"), str):
+            trace["file"] = str(folder / trace["file"])
+
+
+def read_recordings(tables: Mapping[str, Any]) -> list[str]:
+    """Put what is recorded in the place of every recording's `file` and `column`; the mistakes, with their paths."""
+    mistakes = []
+    slots = tables.get("slots")
+    for path, loss in _traces(tables):
+        if path.endswith("delay"):
+            mistakes += [f"{path}.{entry}: {what}" for entry, what in _replace(loss, "values")]
+            continue
+        source = "outcomes" if "outcomes" in loss else "file"
+        wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(loss, "outcomes")]
+        mistakes += wrong
+        outcomes = loss["outcomes"]
+        if wrong:
+            loss.pop("once", None)
+        elif loss.get("once") is True and isinstance(outcomes, str) and type(slots) is int and len(outcomes) < slots:
+            few = f"has {len(outcomes)} outcomes and is read once; expected slots, which is {slots}, or more"
+            mistakes.append(f"{path}.{source}: {few}")
+    return mistakes
+
+
+def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Path and table of every loss or delay model that is a trace, wherever a link may be described."""
+    entries = tables.items() if isinstance(tables, dict) else enumerate(tables) if isinstance(tables, list) else ()
+    for name, inner in entries:
+        if name in ("loss", "delay") and isinstance(inner, dict) and inner.get("model") == "trace":
+            yield f"{path}{name}", inner
+        else:
+            yield from _traces(inner, f"{path}{name}.")
+
+
+def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
+    """One recording's, by `entry`: outcomes or values; what is wrong, as (entry, what)."""
+    file, column = trace.pop("file", None), trace.pop("column", None)
+    if entry in trace:
+        extra = "file" if file is not None else "column" if column is not None else None
+        return [(extra, f"is there beside {entry}; expected one of them")] if extra else []
+    trace[entry] = _STAND_IN if entry == "outcomes" else [0.0]
+    if file is None:
+        return [("file", 'is missing; expected file = "walk.csv"')]
+    wrong = [
+        (name, f"is {as_toml(value)}; expected a string")
+        for name, value in (("file", file), ("column", column))
+        if value is not None and not isinstance(value, str)
+    ]
+    if wrong:
+        return wrong
+    try:
+        recording = Recording(Path(file))
+        if entry == "outcomes":
+            trace[entry] = (recording.outcomes(column) + ord("0")).tobytes().decode()
+        else:
+            delays = recording.delays(column)
+            trace[entry] = delays[~np.isnan(delays)].tolist()
+            if not trace[entry]:
+                return [("file", f"{file} has no delay in it; expected one for some packet")]
+    except TraceError as error:
+        return [(error.entry, f"{file} {error.what}" if error.entry == "file" else error.what)]
+    return []

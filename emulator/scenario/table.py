@@ -1,0 +1,133 @@
+"""What all tables of a scenario file share: entries checked by themselves and together, all mistakes at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from emulator.network.access import RESERVED
+from emulator.scenario.words import as_toml, listed, near
+
+NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
+
+
+def expected(what: str, hint: str = "") -> PydanticCustomError:
+    """The error of one value: the line will say what was found, that this was expected, and what may have been meant."""
+    return PydanticCustomError("expected", "one value", {"expected": what, "hint": hint})
+
+
+def _probability(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise expected("a number from 0 to 1")
+    return value
+
+
+def one_of(names: Iterable[str]) -> Callable[[str], str]:
+    """A check that a value is one of the names."""
+
+    def check(value: str) -> str:
+        if value not in names:
+            raise expected(listed(sorted(names)), near(value, names))
+        return value
+
+    return check
+
+
+def _process_name(name: str) -> str:
+    if name in RESERVED:
+        raise expected(f"any name but {listed(RESERVED)}, which are reserved")
+    if not NAME.fullmatch(name):
+        raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
+    return name
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
+ProcessName = Annotated[str, AfterValidator(_process_name)]
+Matrix = list[list[Annotated[float, Field(strict=True)]]]
+Found = tuple[str, str]
+"""A mistake in a table: the entry, and what is wrong with it."""
+
+
+class Table(BaseModel):
+    """A table of a scenario file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, serialize_by_alias=True)
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """What only shows when entries are seen together; entries that are wrong by themselves may be in the table."""
+        del table
+        return []
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _all_at_once(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        """Entries by themselves and together, so that one mistake does not hide another."""
+        together = cls.mistakes(found) if isinstance(found, Mapping) else []
+        mistakes = PydanticCustomError("mistakes", "several", {"mistakes": together})
+        try:
+            table = check(found)
+        except ValidationError as error:
+            if not together:
+                raise
+            lines = [_again(detail) for detail in error.errors(include_url=False)]
+            lines.append(InitErrorDetails(type=mistakes, input=found))
+            raise ValidationError.from_exception_data(cls.__name__, lines) from None
+        if together:
+            raise mistakes
+        return table
+
+
+def _again(detail: ErrorDetails) -> InitErrorDetails:
+    """An error that was reported, to be reported once more with others."""
+    kind, context = detail["type"], detail.get("ctx", {})
+    own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
+    return InitErrorDetails(type=own, loc=detail["loc"], input=detail["input"], ctx=context)
+
+
+def numbers(rows: Any) -> bool:
+    """Whether these are rows of numbers, of any lengths."""
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_number, row)) for row in rows)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)
+
+
+def model_mistakes(entry: str, found: Any, models: Mapping[str, Any]) -> list[Found]:
+    """What is wrong with `{model = "…", …}`: an unknown model, parameters that are missing, unknown or wrong.
+
+    models: name → class with `parameters`, `optional` and `mistakes`.
+    """
+    if not isinstance(found, Mapping):
+        return []
+    model = models.get(str(found.get("model")))
+    if model is None:
+        name = found.get("model", "")
+        return [(f"{entry}.model", f"is {as_toml(name)}; expected {listed(sorted(models))}{near(name, models)}")]
+    given = {name: value for name, value in found.items() if name != "model"}
+    mistakes = [
+        (f"{entry}.{name}", f"is missing; expected {name} = {as_toml(example)}")
+        for name, example in model.parameters.items()
+        if name not in given and name not in model.optional
+    ]
+    mistakes += [
+        (f"{entry}.{name}", f"is no parameter of {found['model']}; expected {listed(sorted(model.parameters))}")
+        for name in given
+        if name not in model.parameters
+    ]
+    known = {name: value for name, value in given.items() if name in model.parameters}
+    return mistakes + [(f"{entry}.{name}", what) for name, what in model.mistakes(known)]

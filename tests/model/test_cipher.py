@@ -1,0 +1,106 @@
+"""The stream cipher: the user reads everything, nobody else anything."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, coins, play
+
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.masking import Mask
+from emulator.model.process import Process
+from emulator.model.schemes.cipher import Cipher
+from emulator.model.theory import expected_covariances, state_covariances
+from emulator.streams import Batch, Stream, stream_key
+
+KEY = stream_key(ROOT, "mask")
+
+
+def masked_in_words(process: Process, k: int, x: np.ndarray, trial: int) -> list[float]:
+    """What docs/mathematics.md says of one state, in Python's integers."""
+    words = Stream(KEY, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0].tolist()
+    found = []
+    for i, word in enumerate(words):
+        deviation = float(np.sqrt(state_covariances(process, k + 1)[k, i, i]))
+        H = 2.0**-200
+        while 16.0 * deviation >= H:
+            H *= 2.0
+        point = round(float(x[i]) * 2.0**52 / H)
+        found.append((((point + 2**52 + (word >> 11)) % 2**53) - 2**52) * H / 2.0**52)
+    return found
+
+
+@pytest.mark.parametrize("process", [STABLE, UNSTABLE, DRIFTING])
+@pytest.mark.parametrize("k", [0, 1, 7, 40])
+def test_masking_is_addition_on_the_grid(process: Process, k: int) -> None:
+    """State plus pad modulo the range, and the user's own state again within half a step of the grid."""
+    x = 3.0 * np.sqrt(np.diag(state_covariances(process, k + 1)[k]))[:, None] * np.linspace(-1, 1, 5)
+    mask = Mask(process, KEY, Batch(50, 5, 11))
+    z = mask.hide(k, x)
+    assert [masked_in_words(process, k, x[:, r], 11 + r) for r in range(5)] == z.T.tolist()
+    assert (np.abs(mask.reveal(k, z) - x) <= 0.5 * mask.steps(k)[:, None]).all()
+    assert (mask.steps(k) <= 2.0**-47 * np.sqrt(np.diag(state_covariances(process, k + 1)[k]))).all()
+
+
+@settings(deadline=None)
+@given(slots=st.lists(st.integers(0, 60), min_size=1, max_size=6))
+def test_any_slot_may_be_asked_for(slots: list[int]) -> None:
+    """Order does not matter: a lost packet desynchronises nothing."""
+    ahead = Mask(UNSTABLE, KEY, Batch(61, 2))
+    x = np.array([[0.3, -0.1], [0.2, 0.05]])
+    for k in slots:
+        assert ahead.hide(k, x).tobytes() == Mask(UNSTABLE, KEY, Batch(61, 2)).hide(k, x).tobytes()
+
+
+@pytest.mark.parametrize("value", [0.0, 1e300, -1e300, 1.0])
+def test_what_is_masked_is_finite_and_in_range(value: float) -> None:
+    """Whatever the number, the packet is one of the range, and a number beyond the range is read as its end."""
+    mask = Mask(STABLE, KEY, Batch(1, 4))
+    z = mask.hide(0, np.full((2, 4), value))
+    H = mask.steps(0)[:, None] * 2.0**52
+    assert (np.abs(z) <= H).all()
+    if abs(value) > 1e200:
+        assert (np.abs(mask.reveal(0, z)) >= H * (1.0 - 1e-12)).all()
+        assert (np.sign(mask.reveal(0, z)) == np.sign(value)).all()
+
+
+def test_packets_say_nothing_of_the_state() -> None:
+    """Packets are uniform over their range, and their rank correlation with the state is nil, at 1e-6 confidence."""
+    trials = 50_000
+    played = play(Cipher(STABLE), Batch(3, trials), {"legitimate": np.ones((3, trials), bool)})
+    mask = Mask(STABLE, KEY, Batch(3, 1))
+    for k, (x, packet) in enumerate(zip(played.x, played.packets, strict=True)):
+        H = mask.steps(k) * 2.0**52
+        for i in range(2):
+            assert stats.kstest(packet.z[i], stats.uniform(-H[i], 2.0 * H[i]).cdf).pvalue > 1e-6
+            assert stats.spearmanr(packet.z[i], x[i]).pvalue > 1e-6
+            assert stats.spearmanr(packet.z[i], np.abs(x[i])).pvalue > 1e-6
+
+
+def test_errors_are_the_closed_form() -> None:
+    """The user's mean squared error and mean P are the plain scheme's, at 5 standard errors."""
+    slots, trials = 25, 20_000
+    played = play(Cipher(DRIFTING), Batch(slots, trials), {"legitimate": coins(0.7, slots, trials)})
+    expected = np.trace(expected_covariances(DRIFTING, Cipher(DRIFTING).outcomes(0.7), slots), axis1=1, axis2=2)
+    for found in (played.squared_error("legitimate"), played.trace("legitimate")):
+        assert (np.abs(found.mean(1) - expected) < 5.0 * found.std(1) / np.sqrt(trials)).all()
+
+
+def test_taking_a_masked_packet_for_the_state_is_finite_nonsense() -> None:
+    """The naive eavesdropper's error is that of a uniform number: var x + H²/3, far above not listening at all."""
+    slots, trials = 6, 20_000
+    naive = STRATEGIES["naive"](Knowledge(STABLE, 1.0, {}, {}), Batch(slots, trials))
+    gamma = {"legitimate": coins(0.7, slots, trials), "naive": np.ones((slots, trials), bool)}
+    played = play(Cipher(STABLE), Batch(slots, trials), gamma, {"naive": naive})
+    mask, sigma = Mask(STABLE, KEY, Batch(slots, 1)), state_covariances(STABLE, slots)
+    found = played.squared_error("naive")
+    assert np.isfinite(found).all()
+    for k in range(slots):
+        H = mask.steps(k) * 2.0**52
+        expected = np.trace(sigma[k]) + (H * H).sum() / 3.0
+        assert abs(found[k].mean() - expected) < 5.0 * found[k].std() / np.sqrt(trials)
+        assert expected > 80.0 * np.trace(sigma[k])

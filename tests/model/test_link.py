@@ -1,0 +1,209 @@
+"""A link as a whole, against a slot-by-slot reference that is written here, and against the laws of its models."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.model.delays import DELAY_MODELS, delay_of
+from emulator.model.link import NEVER, Change, Course, Fates, Link, Outage, streams_of
+from emulator.model.links.link import Fate
+from emulator.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
+
+ROOT = root_of_seed(77)
+PLAIN = {"loss": {"model": "bernoulli", "quality": 0.8}}
+BURSTS = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.05, "bad": 0.9}}
+FULL = {
+    **PLAIN,
+    "delay": {"model": "normal", "mean": 2.0, "deviation": 1.5},
+    "reorder": 0.1,
+    "duplicate": 0.15,
+    "corrupt": 0.05,
+    "rate": 0.9,
+    "queue": 6,
+}
+COURSES = {
+    "plain": Course(PLAIN),
+    "bursts": Course(BURSTS),
+    "everything": Course(FULL, window=4),
+    "changes": Course(
+        PLAIN, changes=(Change(9, BURSTS), Change(20, cut=True), Change(31, cut=False), Change(40, FULL)), window=3
+    ),
+    "outages": Course(FULL, window=4, outages=(Outage(10, 17, Fate.DOWN), Outage(50, NEVER, Fate.PAUSED))),
+    "tied": Course(BURSTS, correlation=("other", 0.6)),
+}
+
+
+def link(course: Course, batch: Batch) -> Link:
+    """A link with the streams of a seed."""
+    return Link(course, "it", {name: stream_key(ROOT, name) for name in streams_of("it", course)}, batch)
+
+
+def drawn(name: str, width: int, batch: Batch) -> np.ndarray:
+    """Uniforms of a stream, (slots, width, R)."""
+    words = Stream(stream_key(ROOT, name), batch.trial_range, width).words(range(batch.slots))
+    return np.ascontiguousarray(uniforms(words).transpose(0, 2, 1))
+
+
+def whole_of(fates: Fates) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Codes, delays of what is delivered, and second copies: a link without delays is one whose delays are all 0."""
+    shape = fates.codes.shape
+    delays = np.zeros(shape, int) if fates.delays is None else fates.delays
+    again = np.zeros(shape, bool) if fates.again is None else fates.again
+    return fates.codes, np.where(fates.codes == Fate.DELIVERED, delays, 0), again
+
+
+def same(one: Fates, other: Fates) -> bool:
+    """Whether the fates are the same."""
+    return all(np.array_equal(a, b) for a, b in zip(whole_of(one), whole_of(other), strict=True))
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_bits_do_not_depend_on_pieces_or_on_the_batch(name: str) -> None:
+    """However slots are asked for, and alone or among others, a trial's packets have the same fates."""
+    course, batch = COURSES[name], Batch(70, 6, 3)
+    whole = link(course, batch).fates(range(70))
+    one = link(course, batch)
+    parts = [one.fates(range(a, b)) for a, b in ((0, 1), (1, 20), (20, 21), (21, 55), (55, 70))]
+    assert np.array_equal(np.concatenate([part.codes for part in parts]), whole.codes)
+    alone = link(course, Batch(70, 1, 5)).fates(range(70))
+    assert same(alone, whole.part(trials=slice(2, 3)))
+
+
+def reference(course: Course, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+    """Codes and delays of a link of independent losses, packet by packet from docs/mathematics.md, links."""
+    codes, delays = np.zeros((batch.slots, batch.trials), int), np.zeros((batch.slots, batch.trials), int)
+    losses, chances = drawn("link/it", 1, batch), drawn("fate/it", 3, batch)
+    words = Stream(stream_key(ROOT, "delay/it"), batch.trial_range, 1).words(range(batch.slots))
+    numbers = normals(words)[:, :, 0]
+    setting, cut, free = dict(course.settings), False, 0.0
+    for k in range(batch.slots):
+        for change in course.changes:
+            if change.at == k:
+                setting = dict(change.settings) if change.settings is not None else setting
+                cut = cut if change.cut is None else change.cut
+        wait, full = 0.0, False
+        if "rate" in setting:
+            wait = max(0.0, free - k)
+            full = wait * setting["rate"] > setting["queue"]
+            wait = 0.0 if full else wait
+            free = free if full else max(free, k) + 1.0 / setting["rate"]
+        for r in range(batch.trials):
+            delay = wait
+            if "delay" in setting and not chances[k, 1, r] < setting.get("reorder", 0.0):
+                delay += max(0.0, setting["delay"]["mean"] + setting["delay"]["deviation"] * numbers[k, r])
+            delays[k, r] = arrives = math.floor(delay)
+            away = [one.reason for one in course.outages if k < one.stop and k + arrives >= one.start]
+            stops = (
+                (full, Fate.OVERFLOW),
+                (cut, Fate.CUT),
+                (losses[k, 0, r] >= setting["loss"]["quality"], Fate.LOST),
+                (chances[k, 0, r] < setting.get("corrupt", 0.0), Fate.CORRUPTED),
+                (arrives > course.window, Fate.LATE),
+                (bool(away), away[0] if away else Fate.DOWN),
+                (k + arrives >= batch.slots, Fate.UNDERWAY),
+            )
+            codes[k, r] = next((fate for stopped, fate in stops if stopped), Fate.DELIVERED)
+    return codes, delays
+
+
+@pytest.mark.parametrize(
+    "course",
+    [
+        Course(PLAIN),
+        Course(FULL, window=4),
+        Course(FULL, window=0),
+        Course(FULL, 3, (Change(12, {**FULL, "rate": 0.3, "queue": 2}), Change(30, cut=True), Change(40, cut=False))),
+        Course(FULL, 4, (), (Outage(0, 4, Fate.PAUSED), Outage(20, 33, Fate.DOWN))),
+        Course(PLAIN, 0, (Change(5, {"loss": {"model": "bernoulli", "quality": 0.1}}), Change(6, PLAIN))),
+    ],
+)
+def test_fates_are_those_of_the_reference(course: Course) -> None:
+    """What befalls a packet, in the documented order, from the documented streams."""
+    batch = Batch(80, 7, 11)
+    fates = link(course, batch).fates(range(80))
+    codes, delays = reference(course, batch)
+    assert np.array_equal(fates.codes, codes)
+    if fates.delays is not None:
+        delivered = codes == Fate.DELIVERED
+        assert np.array_equal(fates.delays[delivered], delays[delivered])
+
+
+@settings(deadline=None, max_examples=30)
+@given(at=st.integers(1, 59), kind=st.sampled_from(["cut", "loss", "all"]), name=st.sampled_from(sorted(COURSES)))
+def test_a_change_known_late_is_one_known_early(at: int, kind: str, name: str) -> None:
+    """Amended in the middle of what was planned, a link goes on as one that knew of the change from the start."""
+    course, batch = COURSES[name], Batch(60, 3)
+    change = {"cut": Change(at, cut=True), "loss": Change(at, BURSTS), "all": Change(at, FULL)}[kind]
+    earlier = tuple(one for one in course.changes if one.at < at)
+    knowing = Course(course.settings, course.window, (*earlier, change), course.outages, course.correlation)
+    expected = link(knowing, batch).fates(range(60))
+    one = link(course, batch)
+    start = at - at % 7
+    before = one.fates(range(start)) if start else None
+    planned = one.planned(range(start, 60)).part(slice(0, at - start))
+    rest = one.amended(at, [change])
+    parts = [part.codes for part in (before, planned, rest) if part is not None]
+    assert np.array_equal(np.concatenate(parts), expected.codes)
+
+
+def test_correlation_ties_losses_and_leaves_each_link_alone() -> None:
+    """Of links alike the correlation of the losses is the strength, at 1 they are identical, and the rate stays."""
+    batch, q = Batch(400, 500), 0.7
+    settings_ = {"loss": {"model": "bernoulli", "quality": q}}
+    key = {"link/it": stream_key(ROOT, "link/other")}
+    other = Link(Course(settings_), "it", key, batch).fates(range(400)).in_time
+    for strength in (0.0, 0.35, 1.0):
+        course = Course(settings_, correlation=("other", strength))
+        found = link(course, batch).fates(range(400)).in_time
+        assert abs(found.mean() - q) < 5 * math.sqrt(q * (1 - q) / found.size)
+        correlation = np.corrcoef(found.ravel(), other.ravel())[0, 1]
+        assert abs(correlation - strength) < 5 / math.sqrt(found.size)
+    assert np.array_equal(found, other)
+
+
+SPECS: dict[str, dict[str, Any]] = {
+    "constant": {"model": "constant", "value": 1.5},
+    "normal": {"model": "normal", "mean": 2.0, "deviation": 1.0},
+    "pareto": {"model": "pareto", "least": 0.7, "shape": 1.8},
+    "trace": {"model": "trace", "values": [0.5, 2.0, 1.25]},
+}
+
+
+@pytest.mark.parametrize("name", DELAY_MODELS)
+def test_delays_have_the_law_they_say(name: str) -> None:
+    """The fraction of packets that are there after each lag is as the model says, within 5 standard errors."""
+    batch = Batch(300, 300)
+    course = Course({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": SPECS[name]}, window=20)
+    fates = link(course, batch).fates(range(300))
+    assert fates.delays is not None
+    model = delay_of(SPECS[name])
+    for lag in range(8):
+        expected, found = model.arrived(lag), float((fates.delays <= lag).mean())
+        if expected is None:
+            assert name == "trace"
+            assert found == pytest.approx([1 / 3, 2 / 3, 1, 1, 1, 1, 1, 1][lag], abs=1e-9)
+        else:
+            assert abs(found - expected) <= 5 * math.sqrt(expected * (1 - expected) / fates.delays.size) + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("model", "given_", "entries"),
+    [
+        ("constant", {"value": -1.0}, ["value"]),
+        ("normal", {"mean": math.nan, "deviation": "wide"}, ["mean", "deviation"]),
+        ("pareto", {"least": 1.0, "shape": 0.0}, ["shape"]),
+        ("trace", {"values": []}, ["values"]),
+        ("trace", {"values": [1.0, -2.0]}, ["values.1"]),
+    ],
+)
+def test_wrong_delays_are_named(model: str, given_: dict[str, Any], entries: list[str]) -> None:
+    """Each wrong parameter, with what was expected."""
+    found = DELAY_MODELS[model].mistakes(given_)
+    assert [entry for entry, _ in found] == entries
+    assert all("expected" in what for _, what in found)

@@ -1,0 +1,148 @@
+"""Theory behind links that change, delay packets or lose their receivers: against the law of the last packet's age."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.model.delays import delay_of
+from emulator.model.link import NEVER, Change, Course, Outage
+from emulator.model.link_law import law_of
+from emulator.model.links import loss_of
+from emulator.model.links.link import Fate
+from emulator.model.modulated import ModulatedCovariance, limit_of
+from emulator.model.process import Process
+from emulator.model.theory import Outcomes
+from emulator.runs.expectation import Expectation
+from emulator.scenario.timeline import Away
+
+WALK = Process(np.eye(1), np.array([[0.3]]), np.array([[2.0]]))
+SLOTS = 60
+
+
+def aged(quality: Callable[[int], float], there: Callable[[int], float], window: int) -> list[float]:
+    """E P_k of a random walk every packet of which is the state: noise since the newest packet that is there.
+
+    quality: of a slot; there: probability that a packet is there after so many slots, of those that come through.
+    """
+    Q, sigma = 0.3, 2.0
+    found = []
+    for k in range(SLOTS):
+        missing, total = 1.0, 0.0
+        for j in range(k, -1, -1):
+            arrived = quality(j) * there(min(k - j, window))
+            total += missing * arrived * Q * (k - j)
+            missing *= 1.0 - arrived
+        found.append(total + missing * (sigma + Q * k))
+    return found
+
+
+def traces(course: Course) -> np.ndarray:
+    """What theory says."""
+    return Expectation(WALK, law_of(course), Outcomes.plain).traces(SLOTS)
+
+
+PLAIN: dict[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.6}}
+DELAYS = (
+    {"model": "constant", "value": 2.0},
+    {"model": "normal", "mean": 1.5, "deviation": 1.0},
+    {"model": "pareto", "least": 0.4, "shape": 1.2},
+)
+
+
+@pytest.mark.parametrize("window", [0, 1, 5])
+@pytest.mark.parametrize("delay", DELAYS, ids=lambda delay: delay["model"])
+def test_late_packets(delay: dict[str, Any], window: int) -> None:
+    """With delays, reordering and corruption, the expectation and its limit, to 1e-12."""
+    course = Course({**PLAIN, "delay": delay, "reorder": 0.2, "corrupt": 0.1}, window)
+    model = delay_of(delay)
+    there = [0.2 + 0.8 * (model.arrived(lag) or 0.0) for lag in range(window + 1)]
+    expected = aged(lambda _: 0.6 * 0.9, lambda lag: there[lag], window)
+    np.testing.assert_allclose(traces(course), expected, rtol=1e-12)
+    law = law_of(course)
+    assert law is not None
+    settled = Expectation(WALK, law, Outcomes.plain).traces(900)[-1]
+    assert limit_of(WALK, law, Outcomes.plain) == pytest.approx(settled, rel=1e-9)
+
+
+def test_links_that_change() -> None:
+    """Other qualities and other delays from some slot on, and a cut in between."""
+    later = {"loss": {"model": "bernoulli", "quality": 0.9}}
+    course = Course(PLAIN, 0, (Change(15, later), Change(20, cut=True), Change(30, cut=False), Change(40, PLAIN)))
+
+    def quality(k: int) -> float:
+        return 0.0 if 20 <= k < 30 else 0.9 if 15 <= k < 40 else 0.6
+
+    np.testing.assert_allclose(traces(course), aged(quality, lambda _: 1.0, 0), rtol=1e-12)
+
+
+def test_a_quality_that_differs_from_slot_to_slot() -> None:
+    """A link whose ends move apart, by what the model says of every slot."""
+    moving = {
+        "model": "distance",
+        "sender": [0.0, 0.0],
+        "receiver": [[0, 30.0, 0.0], [50, 300.0, 0.0]],
+        "reference_snr": 80.0,
+        "exponent": 3.0,
+        "threshold": 10.0,
+    }
+    qualities = loss_of(moving).quality_at(range(SLOTS))
+    expected = aged(lambda k: float(qualities[k]), lambda _: 1.0, 0)
+    np.testing.assert_allclose(traces(Course({"loss": moving})), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+@pytest.mark.parametrize(("start", "stop"), [(0, 5), (10, 25), (30, NEVER)])
+def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
+    """Its last estimate is carried on, or it starts from 0 and Σ."""
+    course = Course(PLAIN, 0, (), (Away(start, stop, Fate.DOWN, keeps),))
+    if keeps:
+        expected = aged(lambda k: 0.0 if start <= k < stop else 0.6, lambda _: 1.0, 0)
+    else:
+        expected = aged(lambda _: 0.6, lambda _: 1.0, 0)[:start]
+        for k in range(start, SLOTS):
+            heard = max(0, k - stop + 1)
+            newest = sum(0.4**age * 0.6 * 0.3 * age for age in range(heard))
+            expected.append(newest + 0.4**heard * (2.0 + 0.3 * k))
+    np.testing.assert_allclose(traces(course), expected, rtol=1e-12)
+
+
+def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
+    """Bursts whose states are alike are no bursts, also with late packets; and a new chain begins in its own law."""
+    alike = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.4, "bad": 0.4}}
+    delay = {"delay": {"model": "normal", "mean": 1.5, "deviation": 1.0}}
+    np.testing.assert_allclose(traces(Course({**alike, **delay}, 4)), traces(Course({**PLAIN, **delay}, 4)), rtol=1e-12)
+    changed = Course(PLAIN, 0, (Change(20, alike), Change(30, PLAIN)))
+    np.testing.assert_allclose(traces(changed), traces(Course(PLAIN)), rtol=1e-12)
+
+
+def test_slots_may_be_asked_for_in_any_pieces() -> None:
+    """The same numbers."""
+    course = Course({**PLAIN, "delay": DELAYS[1]}, 3, (Change(17, {**PLAIN, "delay": DELAYS[0]}),))
+    law = law_of(course)
+    assert law is not None
+    stream = ModulatedCovariance(WALK, law, Outcomes.plain)
+    parts = [stream.next_traces(count) for count in (1, 16, 1, 1, 20, 21)]
+    assert np.array_equal(np.concatenate(parts), traces(course))
+
+
+@pytest.mark.parametrize(
+    "course",
+    [
+        Course({**PLAIN, "rate": 0.5, "queue": 5}),
+        Course({**PLAIN, "delay": {"model": "trace", "values": [1.0]}}, 2),
+        Course({**PLAIN, "delay": DELAYS[0]}, 2, (), (Outage(3, 5, Fate.DOWN),)),
+        Course({"loss": {"model": "trace", "outcomes": "110", "random_start": True}}),
+        Course({"loss": {"model": "pattern", "outcomes": "110"}}),
+    ],
+    ids=["queue", "recorded delays", "away while packets are under way", "memory", "no limit"],
+)
+def test_what_theory_does_not_know(course: Course) -> None:
+    """There is no number then."""
+    assert law_of(course) is None
+    assert np.isnan(traces(course)).all()
+    assert math.isnan(Expectation(WALK, None, Outcomes.plain).limit)

@@ -1,0 +1,127 @@
+"""Twin track: which of two tracks is the process's own, only the secret tells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+from slot_loop import DRIFTING, STABLE, UNSTABLE, coins, keys_of, play
+
+from emulator.model.closed_forms import twin_track_bound
+from emulator.model.eavesdroppers import READERS
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.process import Process
+from emulator.model.schemes.twin_track import Tracks, TwinTrack
+from emulator.model.theory import expected_covariances
+from emulator.streams import Batch
+
+KEYS = keys_of(("start", "track"))
+
+
+def spread(process: Process, k: int) -> np.ndarray:
+    """A^k Σ0 A^kᵀ."""
+    power = np.linalg.matrix_power(process.A, k)
+    return power @ process.initial_covariance @ power.T
+
+
+@pytest.mark.parametrize("process", [STABLE, UNSTABLE])
+def test_packets_are_on_one_track_or_the_other(process: Process) -> None:
+    """z_k is x_k or x_k + A^k (y_0 − x_0), by a fair coin from slot 0 on; the twin's distance has covariance 2 A^k Σ0 A^kᵀ."""
+    slots, trials = 20, 5000
+    batch = Batch(slots, trials)
+    played = play(TwinTrack(process), batch, {"legitimate": np.ones((slots, trials), bool)})
+    tracks = Tracks(process, KEYS, batch)
+    assert np.array_equal(played.x[0], tracks.initial)
+    apart = played.packets[0].z - played.x[0]
+    twins = 0
+    start = np.where(tracks.on_twin(0), apart, tracks.distance(0))
+    for k, (x, packet) in enumerate(zip(played.x, played.packets, strict=True)):
+        twin = tracks.on_twin(k)
+        twins += int(twin.sum())
+        distance = np.linalg.matrix_power(process.A, k) @ start
+        scale = float(np.abs(x).max() + np.abs(distance).max())
+        assert np.allclose(packet.z, np.where(twin, x + distance, x), rtol=0, atol=1e-12 * scale)
+    assert stats.binomtest(twins, slots * trials).pvalue > 1e-6
+    white = np.linalg.solve(np.linalg.cholesky(2.0 * process.initial_covariance), tracks.distance(0))
+    assert 1e-6 < stats.chi2.cdf((white * white).sum(), white.size) < 1.0 - 1e-6
+    for i in range(2):
+        for j in range(2):
+            ours = np.linalg.solve(np.linalg.cholesky(process.initial_covariance), tracks.initial)
+            theirs = ours + np.sqrt(2.0) * white
+            assert abs(np.mean(ours[i] * theirs[j])) < 6.0 / np.sqrt(trials)
+
+
+def test_errors_are_the_closed_form() -> None:
+    """Mean squared error and mean P of the user: (1−μ) Σ_{j<k} (1−μ)^j A^j Q A^jᵀ, at 5 standard errors, exactly 0 at k = 0."""
+    slots, trials, mu = 20, 20_000, 0.7
+    played = play(TwinTrack(DRIFTING), Batch(slots, trials), {"legitimate": coins(mu, slots, trials)})
+    powers = [np.linalg.matrix_power(DRIFTING.A, j) for j in range(slots)]
+    terms = [(1.0 - mu) ** (j + 1) * np.trace(power @ DRIFTING.Q @ power.T) for j, power in enumerate(powers)]
+    expected = np.array([sum(terms[:k]) for k in range(slots)])
+    theory = expected_covariances(DRIFTING, TwinTrack(DRIFTING).outcomes(mu), slots)
+    assert np.allclose(np.trace(theory, axis1=1, axis2=2), expected, rtol=1e-12)
+    for found in (played.squared_error("legitimate"), played.trace("legitimate")):
+        assert (np.abs(found.mean(1) - expected) <= 5.0 * found.std(1) / np.sqrt(trials) + 1e-25).all()
+
+
+@pytest.mark.parametrize("process", [STABLE, UNSTABLE])
+@pytest.mark.parametrize("quality", [1.0, 0.8])
+def test_no_strategy_is_below_the_bound(process: Process, quality: float) -> None:
+    """Every strategy there is, even with a schedule's key, has a mean squared error of at least ½ tr A^k Σ0 A^kᵀ."""
+    slots, trials = 15, 4000
+    batch = Batch(slots, trials)
+    eavesdroppers = {
+        name: strategy(
+            Knowledge(process, 1.0, dict.fromkeys(strategy.parameters, 0.5), keys_of(strategy.streams({}))),
+            batch,
+        )
+        for name, strategy in READERS.items()
+    }
+    gamma = {"legitimate": coins(0.7, slots, trials), **{name: coins(quality, slots, trials, 3) for name in READERS}}
+    played = play(TwinTrack(process), batch, gamma, eavesdroppers)
+    bound = twin_track_bound(process, slots)
+    assert np.allclose(bound, [0.5 * np.trace(spread(process, k)) for k in range(slots)], rtol=1e-12)
+    for name in READERS:
+        found = played.squared_error(name)
+        assert (found.mean(1) + 5.0 * found.std(1) / np.sqrt(trials) > bound).all()
+        if name == "naive" and quality == 1.0:
+            assert (np.abs(found.mean(1) - 2.0 * bound) < 5.0 * found.std(1) / np.sqrt(trials)).all()
+
+
+def test_exchanging_the_tracks_changes_no_packet() -> None:
+    """The argument of the bound: from y_0, with all coins turned over and the same noise, the packets are the same."""
+    rng = np.random.default_rng(3)
+    x_0, y_0 = rng.standard_normal((2, 2))
+    w, coin = rng.standard_normal((12, 2)), rng.random(12) < 0.5
+
+    def packets(start: np.ndarray, other: np.ndarray, on_twin: np.ndarray) -> list[np.ndarray]:
+        found, x, apart = [], start, other - start
+        for k in range(12):
+            if k:
+                x, apart = UNSTABLE.A @ x + w[k], UNSTABLE.A @ apart
+            found.append(x + apart if on_twin[k] else x)
+        return found
+
+    assert np.allclose(packets(x_0, y_0, coin), packets(y_0, x_0, ~coin), rtol=1e-9)
+
+
+def test_the_bound_is_met_by_who_sees_both_tracks() -> None:
+    """Half-way between the tracks the mean squared error is the bound itself: there is no better one."""
+    slots, trials = 10, 20_000
+    batch = Batch(slots, trials)
+    tracks = Tracks(UNSTABLE, KEYS, batch)
+    bound = twin_track_bound(UNSTABLE, slots)
+    for k in range(slots):
+        error = ((tracks.distance(k) / 2.0) ** 2).sum(0)
+        assert abs(error.mean() - bound[k]) < 5.0 * error.std() / np.sqrt(trials)
+
+
+def test_one_state_that_leaks_breaks_it() -> None:
+    """Who learns a single x_k tells the tracks apart in that slot, and by their distance in every other."""
+    batch = Batch(10, 500)
+    played = play(TwinTrack(UNSTABLE), batch, {"legitimate": np.ones((10, 500), bool)})
+    on_twin = Tracks(UNSTABLE, KEYS, batch).on_twin(4)
+    guessed = ((played.packets[4].z - played.x[4]) ** 2).sum(0) > 1e-12
+    assert np.array_equal(guessed, on_twin)
+    back = np.linalg.matrix_power(np.linalg.inv(UNSTABLE.A), 4) @ (played.packets[4].z - played.x[4])
+    assert np.allclose(back[:, guessed], Tracks(UNSTABLE, KEYS, batch).distance(0)[:, guessed], atol=1e-6)

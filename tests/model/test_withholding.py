@@ -1,0 +1,44 @@
+"""Withholding: what is not sent nobody has."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+from slot_loop import DRIFTING, UNSTABLE, coins, play
+
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.schemes.withholding import Withholding
+from emulator.model.theory import expected_covariances, limit, lyapunov
+from emulator.streams import Batch
+
+
+def test_packets_are_sent_with_their_probability() -> None:
+    """Always in slot 0, then with probability p, independent of the state: binomial bounds at 1e-6 confidence."""
+    played = play(Withholding(DRIFTING, 0.3), Batch(50, 2000), {"legitimate": np.ones((50, 2000), bool)})
+    sent = np.array([packet.sent for packet in played.packets])
+    assert sent[0].all()
+    assert stats.binomtest(int(sent[1:].sum()), sent[1:].size, 0.3).pvalue > 1e-6
+    assert all(np.array_equal(packet.z, x) for packet, x in zip(played.packets, played.x, strict=True))
+
+
+def test_errors_are_the_closed_form() -> None:
+    """User and eavesdropper: mean squared error and mean P are those of a link of quality μp, at 5 standard errors."""
+    slots, trials, scheme = 25, 20_000, Withholding(DRIFTING, 0.4)
+    naive = STRATEGIES["naive"](Knowledge(DRIFTING, 1.0, {}, {}), Batch(slots, trials))
+    gamma = {"legitimate": coins(0.8, slots, trials, 1), "naive": coins(0.6, slots, trials, 2)}
+    played = play(scheme, Batch(slots, trials), gamma, {"naive": naive})
+    for name, outcomes in (
+        ("legitimate", scheme.outcomes(0.8)),
+        ("naive", scheme.eavesdropper_outcomes(0.6, 1.0, 1.0)),
+    ):
+        expected = np.trace(expected_covariances(DRIFTING, outcomes, slots), axis1=1, axis2=2)
+        for found in (played.squared_error(name), played.trace(name)):
+            deviation = np.abs(found.mean(1) - expected)
+            assert (deviation < 5.0 * found.std(1) / np.sqrt(trials) + 1e-15).all()
+
+
+def test_the_limit_is_the_papers() -> None:
+    """(1 − μp) S(μp)."""
+    found = limit(UNSTABLE, Withholding(UNSTABLE, 0.8).outcomes(0.9))
+    assert np.allclose(found, (1.0 - 0.72) * lyapunov(UNSTABLE, 1.0 - 0.72), rtol=1e-12)

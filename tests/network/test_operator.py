@@ -1,0 +1,189 @@
+"""Who may ask the observer and who may answer for it, with real sessions: the operator, and nobody but the observer.
+
+As in test_access.py nothing waits for silence: a question that is answered proves that what came before it was dealt with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import zenoh
+from bench import Bench, Ear, bench_of, connect, scenario_of, until
+
+from emulator.brief import Brief
+from emulator.control import Control
+from emulator.errors import MalformedMessage
+from emulator.network.access import Keys
+from emulator.network.operator import Answer, Request, ask, read_request
+from emulator.network.wire import pack
+
+OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
+PATIENCE = 5.0
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """One router for all tests of this file, and an observer that answers."""
+    with bench_of(scenario_of(), tmp_path_factory.mktemp("operator")) as one:
+        yield one
+
+
+def operator(stage: Bench) -> Brief:
+    """The operator's credentials, as an observer's brief would have them."""
+    observer = stage.briefs["observer"]
+    return replace(observer, process="operator", user="operator", password=observer.part["operator"])
+
+
+def control(stage: Bench, **changes: Any) -> Control:
+    """What is in the run's control.json."""
+    brief = operator(stage)
+    return Control(
+        **{"run": brief.run, "router": brief.router, "user": brief.user, "password": brief.password, **changes}
+    )
+
+
+@contextmanager
+def answering(stage: Bench) -> Iterator[list[bytes]]:
+    """The observer answers "yes"; what it was asked."""
+    key, asked = stage.keys.control("observer"), list[bytes]()
+
+    def answer(query: zenoh.Query) -> None:
+        asked.append(query.payload.to_bytes() if query.payload is not None else b"")
+        query.reply(key, Answer(7, "yes").pack())
+        query.drop()
+
+    queryable = stage.sessions["observer"].declare_queryable(key, answer)
+    until(lambda: ask(control(stage), Request("status"), PATIENCE), "an observer that answers")
+    asked.clear()
+    yield asked
+    queryable.undeclare()
+
+
+def attempts(stage: Bench) -> list[str]:
+    """The key at which the observer is asked, and wildcards that have it in them."""
+    under = f"evedrop/{stage.keys.run}"
+    return [stage.keys.control("observer"), f"{under}/control/*", f"{under}/**", "evedrop/**", "**"]
+
+
+def replies(session: zenoh.Session, key: str) -> list[bytes]:
+    """What a question at a key brings, but for what a session says of itself."""
+    found = [reply.ok for reply in session.get(key, payload=Request("pause").pack(), timeout=PATIENCE) if reply.ok]
+    return [one.payload.to_bytes() for one in found if not str(one.key_expr).startswith("@/")]
+
+
+def test_the_operator_is_answered(stage: Bench) -> None:
+    """Its question reaches the observer as it was put, and the answer comes back."""
+    with answering(stage) as asked:
+        assert ask(control(stage), Request("step", slots=3), PATIENCE) == Answer(7, "yes")
+        assert asked == [Request("step", slots=3).pack()]
+
+
+@pytest.mark.parametrize("who", OTHERS)
+def test_nobody_else_may_ask(who: str, stage: Bench) -> None:
+    """Neither sensor nor receiver gets an answer, at the key or any wildcard, and the observer hears nothing of it."""
+    with answering(stage) as asked, connect(stage.briefs[who]) as session:
+        for key in attempts(stage):
+            assert replies(session, key) == [], key
+        assert ask(control(stage), Request("status"), PATIENCE) == Answer(7, "yes")
+        assert asked == [Request("status").pack()]
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_an_eavesdropper_may_not_ask_in_any_mode(mode: str, stage: Bench) -> None:
+    """A session that says it is a peer or a router gets as little."""
+    changes = {"mode": mode, "listen": {"endpoints": []}}
+    with answering(stage) as asked, connect(stage.briefs["eve"], **changes) as session:
+        for key in attempts(stage):
+            assert replies(session, key) == [], key
+        assert ask(control(stage), Request("status"), PATIENCE) == Answer(7, "yes")
+        assert asked == [Request("status").pack()]
+
+
+@pytest.mark.parametrize("wrong", [{"password": "guessed"}, {"password": ""}, {"user": "trudy"}, {"user": "eve"}])
+def test_a_stranger_gets_no_session(wrong: dict[str, str], stage: Bench) -> None:
+    """Without the operator's password nothing can be asked."""
+    with answering(stage) as asked:
+        with pytest.raises(zenoh.ZError):
+            ask(control(stage, **wrong), Request("pause"), PATIENCE)
+        assert asked == []
+
+
+def test_nobody_else_may_answer(stage: Bench) -> None:
+    """Whoever else offers to answer is never asked: neither beside the observer nor in its absence."""
+    feigned: list[str] = []
+    sessions = [connect(stage.briefs[who]) for who in OTHERS] + [connect(operator(stage))]
+    try:
+        for session in sessions:
+            for key in attempts(stage):
+                session.declare_queryable(key, lambda query: feigned.append(str(query.key_expr)))
+            # Denied, but answered in its turn: what was declared before has been dealt with.
+            assert ask_nothing(session, stage) == []
+        with answering(stage) as asked:
+            assert ask(control(stage), Request("status"), PATIENCE) == Answer(7, "yes")
+            assert len(asked) == 1
+        assert ask(control(stage), Request("status"), PATIENCE) is None
+    finally:
+        for session in sessions:
+            session.close()
+    # A session's own questions reach its own queryables; nobody else's did.
+    assert set(feigned) <= {stage.keys.journal}
+
+
+def ask_nothing(session: zenoh.Session, stage: Bench) -> list[bytes]:
+    """Ask where nobody answers."""
+    return [reply.ok.payload.to_bytes() for reply in session.get(stage.keys.journal, timeout=PATIENCE) if reply.ok]
+
+
+def test_the_operator_may_do_nothing_else(stage: Bench) -> None:
+    """With its credentials nothing can be read, written, answered or feigned on any key: it can only ask."""
+    keys = stage.keys
+    ear = Ear()
+    every = [keys.uplink, keys.journal, *(keys.downlink(name) for name in OTHERS[1:])]
+    for name in (*OTHERS, "router", "observer", "operator"):
+        every += [keys.telemetry(name), keys.progress(name), keys.control(name), keys.alive(name)]
+    with answering(stage) as asked, connect(operator(stage)) as session:
+        for key in (*every, *attempts(stage)):
+            session.declare_subscriber(key, ear)
+            session.liveliness().declare_subscriber(key, ear, history=True)
+        with connect(operator(stage)) as writer:  # its own puts and tokens would reach its own ears
+            tokens = [writer.liveliness().declare_token(keys.alive(name)) for name in (*OTHERS, "router", "observer")]
+            for key in every:
+                writer.put(key, b"\xc1", congestion_control=zenoh.CongestionControl.BLOCK)
+                writer.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
+            assert replies(writer, keys.control("observer")) == [Answer(7, "yes").pack()]
+            for token in tokens:
+                token.undeclare()
+            assert replies(writer, keys.control("observer")) == [Answer(7, "yes").pack()]
+        for name in OTHERS:
+            stage.settle(name)
+            stage.put("observer", keys.control(name), b"noted")
+            assert stage.controls[name].hear() == (keys.control(name), b"noted")
+        assert replies(session, keys.control("observer")) == [Answer(7, "yes").pack()]
+        assert len(asked) == 3
+    assert ear.all() == []
+    for ears in (stage.downlinks, stage.controls, stage.progress, stage.telemetry):
+        assert {name: one.all() for name, one in ears.items()} == {name: [] for name in ears}
+    assert (stage.journal.all(), stage.tokens.all()) == ([], [])
+    assert stage.router.poll() is None
+
+
+def test_of_another_run_nothing_can_be_asked(stage: Bench) -> None:
+    """The operator's rights end with the keys of its run."""
+    with answering(stage) as asked, connect(operator(stage)) as session:
+        assert replies(session, Keys("another").control("observer")) == []
+        assert asked == []
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"\xc1", b"", pack({}), pack({"do": "end"}), pack({"do": "step"}), pack({"do": "step", "slots": 0}),
+     pack({"do": "link", "event": 3}), pack({"do": "link"}), pack({"do": "link", "event": {1: 2}})],
+)  # fmt: skip
+def test_what_is_no_request_is_malformed(payload: bytes) -> None:
+    """The error says where it came from and what was expected."""
+    with pytest.raises(MalformedMessage, match=r"malformed message on operator.*expected"):
+        read_request("operator", payload)

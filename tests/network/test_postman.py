@@ -1,0 +1,22 @@
+"""Parts of a slot, waited for in real time: never too early, in order, and nobody else held up."""
+
+from __future__ import annotations
+
+import time
+from queue import SimpleQueue
+
+from emulator.network.postman import Postman
+
+
+def test_messages_go_out_when_they_are_due_and_in_order() -> None:
+    """A message waits its time; one that is due at once goes before it on another round, and after it on its own."""
+    postman, out = Postman(), SimpleQueue[tuple[str, bytes, float]]()
+    slow = postman.round(lambda payload: out.put(("slow", payload, time.monotonic())))
+    quick = postman.round(lambda payload: out.put(("quick", payload, time.monotonic())))
+    began = time.monotonic()
+    slow(b"1", 0.3)
+    slow(b"2", 0.0)
+    quick(b"3", 0.0)
+    found = [out.get(timeout=20) for _ in range(3)]
+    assert [(name, payload) for name, payload, _ in found] == [("quick", b"3"), ("slow", b"1"), ("slow", b"2")]
+    assert all(at - began >= 0.3 for name, _, at in found if name == "slow")

@@ -1,0 +1,274 @@
+"""Runs steered while they go on, by the commands that people type, and run again from their results folders."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emulator import load_results
+from emulator.cli import main
+from emulator.control import Control, read_control
+from emulator.errors import UsageError
+from tests.conftest import Done, Evedrop, Live, wait_until
+
+SCENARIO = """
+title = "Steered"
+slots = {slots}
+seed = 11
+trials = 3
+pace = {pace}
+
+[process]
+A = [[1.0, 0.05], [0.0, 1.0]]
+Q = [[1e-3, 0.0], [0.0, 1e-4]]
+initial_covariance = [[1.0, 0.0], [0.0, 0.01]]
+
+[encoding]
+scheme = "innovation"
+state_probability = 0.4
+
+[legitimate]
+window = 2
+link = {{ loss = {{ model = "gilbert-elliott", p = 0.1, r = 0.3 }} }}
+
+[eavesdroppers.smart]
+strategy = "smart"
+link = {{ quality = 0.7 }}
+
+{events}
+"""
+
+KILLED = '[[event]]\nfrom = 60\nto = 300\nkill = "smart"\nstate = "last"\n'
+DELAYED = '[[event]]\nat = 330\nlink = "legitimate"\nset = { delay = { model = "constant", value = 1.0 } }\n'
+
+
+class Steered:
+    """A live run, and the commands that steer it, in this process: so the first of them comes long before the last slot."""
+
+    def __init__(
+        self, evedrop: Evedrop, capsys: pytest.CaptureFixture[str], slots: int, pace: float, events: str
+    ) -> None:
+        self._capsys = capsys
+        path = evedrop.folder / "steered.toml"
+        path.write_text(SCENARIO.format(slots=slots, pace=pace, events=events), encoding="utf-8")
+        self.live: Live = evedrop.live(str(path), "--json")
+        wait_until(self.control.is_file, "a run that can be steered")
+
+    @property
+    def control(self) -> Path:
+        """The file by which it is found."""
+        return self.live.folder / "control.json"
+
+    def try_to(self, command: str, *words: str) -> Done:
+        """Type a command."""
+        self._capsys.readouterr()
+        status = main([command, str(self.live.folder), *words])
+        return Done(status, *self._capsys.readouterr())
+
+    def __call__(self, command: str, *words: str) -> str:
+        """Type a command that must do what it says; what it said."""
+        done = self.try_to(command, *words)
+        assert (done.status, done.err) == (0, ""), done
+        return done.out.strip()
+
+    def status(self) -> dict[str, Any]:
+        """How it is doing."""
+        found: dict[str, Any] = json.loads(self("status", "--json"))
+        return found
+
+    def end(self) -> Done:
+        """Its end, after which nobody can get at it."""
+        done = self.live.end()
+        assert not self.control.exists()
+        return done
+
+
+Start = Callable[..., Steered]
+
+
+@pytest.fixture
+def steered(evedrop: Evedrop, capsys: pytest.CaptureFixture[str]) -> Start:
+    """Starts a run."""
+    return lambda slots=600, pace=0.005, events="": Steered(evedrop, capsys, slots, pace, events)
+
+
+def slot_of(answer: str) -> int:
+    """The slot that `held before slot 17` or `from slot 17 on: …` names."""
+    return int(re.findall(r"slot (\d+)", answer)[-1])
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Receiver → digest."""
+    return {name: peer["digest"] for name, peer in load_results(folder).summary["peers"].items()}
+
+
+def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> None:
+    """Steered in real time, while a receiver is away too: live and in memory its folder gives the same digests again."""
+    run = steered(slots=800, pace=0.002, events=KILLED + DELAYED)
+    wait_until(lambda: run.status()["slot"] > 60, "a receiver that is down")
+    said = [run("link", "legitimate", "quality=0.6"), run("link", "smart", "cut"), run("pause")]
+    said += [
+        run(
+            "link",
+            "legitimate",
+            "loss.model=gilbert-elliott",
+            "loss.p=0.2",
+            "loss.r=0.5",
+            "delay.model=constant",
+            "delay.value=2",
+        )
+    ]
+    said += [run("step", "7"), run("link", "smart", "heal"), run("link", "legitimate", "cut"), run("step", "1")]
+    said += [run("link", "legitimate", "heal"), run("resume")]
+    assert said[0].endswith("on: link legitimate: quality = 0.6")
+    assert said[4].startswith("slots ")
+    assert slot_of(said[4]) == slot_of(said[2]) + 7 == slot_of(said[3]) + 7
+    assert run.end().status == 0
+    once = digests(run.live.folder)
+    assert None not in once.values()
+    folder = str(run.live.folder)
+    for command in (("run", folder, "--view", "off", "--pace", "0"), ("montecarlo", folder, "--trials", "3")):
+        again = evedrop.folder / f"again-{command[0]}"
+        assert evedrop(*command, "--out", str(again)).status == 0
+        assert digests(again) == once
+        assert evedrop("diff", folder, str(again)).status == 0
+        events = [(one["slot"], one["event"]) for one in load_results(run.live.folder).summary["events"]]
+        repeated = [(one["slot"], one["event"]) for one in load_results(again).summary["events"]]
+        theirs = ("pause the run", "resume the run", "step 7 slots", "step 1 slot")
+        assert sorted(repeated) == sorted(one for one in events if one[1] not in theirs)
+    run.live.nothing_left()
+
+
+def test_a_paused_run_stands_still(steered: Start) -> None:
+    """No slot passes until it goes on; status and summary tell what was done, and by whom."""
+    run = steered()
+    at = slot_of(run("pause"))
+    found = run.status()
+    assert (found["slot"], found["state"], found["slots"]) == (at, "paused", 600)
+    assert found["processes"] == dict.fromkeys(("router", "sensor", "legitimate", "smart"), True)
+    assert found["links"]["smart"]["offered"] == 3 * at
+    assert run("pause") == f"held already, before slot {at}"
+    assert run("link", "smart", "quality=0.5") == f"from slot {at} on: link smart: quality = 0.5"
+    assert run("step", "4") == f"slots {at} to {at + 3} passed; held before slot {at + 4}"
+    shown = run("status").splitlines()
+    assert shown[0] == f"slot {at + 4} of 600, 0 slots/s, paused before slot {at + 4}"
+    assert shown[-2] == f"event at slot {at}: link smart: quality = 0.5 (by the operator)"
+    assert run("resume") == f"the run goes on with slot {at + 4}"
+    summary = run.end().summary
+    assert summary["ended"] == "complete"
+    assert [(one["slot"] - at, one["event"], one["by"]) for one in summary["events"]] == [
+        (0, "pause the run", "operator"),
+        (0, "link smart: quality = 0.5", "operator"),
+        (0, "step 4 slots", "operator"),
+        (4, "resume the run", "operator"),
+    ]
+
+
+def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
+    """Every one at once, with exit status 2; what is not a command is refused before the run hears of it."""
+    run = steered()
+    run("pause")
+    before = (run.live.folder / "scenario.toml").read_text()
+    done = run.try_to("link", "legitimate", "quality=1.2", "sluts=3")
+    assert done.status == 2
+    assert done.err.splitlines() == [
+        "evedrop: link legitimate: 2 mistakes, nothing was changed",
+        "  set.sluts: is nothing that can be changed of a link; expected quality, loss, delay, reorder, duplicate, "
+        "corrupt, rate or queue",
+        "  set.quality: is 1.2; expected a number from 0 to 1",
+    ]
+    assert (
+        run.try_to("link", "nobody", "cut").err.splitlines()[1] == '  cut: names "nobody"; expected legitimate or smart'
+    )
+    for words in (("smart", "cut", "heal"), ("smart", "quality"), ("smart", "loss=1", "loss.p=1"), ("smart", "=1")):
+        assert run.try_to("link", *words).status == 2
+    assert run.try_to("step", "0").status == 2
+    assert (run.live.folder / "scenario.toml").read_text() == before
+    run("resume")
+    assert [one["event"] for one in run.end().summary["events"]] == ["pause the run", "resume the run"]
+
+
+def test_a_step_beyond_the_end_ends_the_run(steered: Start) -> None:
+    """It is answered with the last slot, and the run is complete."""
+    run = steered()
+    at = slot_of(run("pause"))
+    assert run("step", "1000") == f"slots {at} to 599 passed; the run is over"
+    assert run.end().summary["ended"] == "complete"
+
+
+def test_a_long_slot_is_not_waited_for(steered: Start) -> None:
+    """In a run of a slot an hour the hold comes at once, before the slot that is due next."""
+    run = steered(slots=3, pace=3600.0)
+    assert run("pause") == "held before slot 1"
+    assert run("link", "smart", "cut") == "from slot 1 on: cut smart"
+    run.live.process.send_signal(signal.SIGTERM)
+    assert run.end().status == 130
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: Start) -> None:
+    """Ctrl-C, or the launcher killed, while the run is held: what was measured and done is on disk, the password is not."""
+    run = steered()
+    at = slot_of(run("pause"))
+    run("link", "smart", "cut")
+    run.live.process.send_signal(number)
+    assert run.live.end().status in {130, -signal.SIGKILL}
+    wait_until(lambda: not run.live.left(), "no process left of the run")
+    assert not run.control.exists()
+    summary = run.live.results.summary
+    assert (summary["slots"], summary["ended"]) == (at, "interrupted")
+    assert [one["event"] for one in summary["events"]] == ["pause the run", "cut smart"]
+
+
+@pytest.mark.parametrize("name", ["router", "observer"])
+def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedrop) -> None:
+    """A process that is killed while a step goes on ends the step's command too, with status 2."""
+    run = steered(slots=100_000)
+    run("pause")
+    waiting = Live(
+        evedrop._start(["-m", "emulator"], ("step", str(run.live.folder), "90000"), {}),
+        evedrop.temporary,
+        evedrop.folder,
+    )
+    wait_until(lambda: run.status()["events"][-1]["event"] == "step 90000 slots", "a step that goes on")
+    run.live.kill(name)
+    done = waiting.end()
+    assert done.status == 2, done
+    assert "no run is going on in" in done.err or "nothing was changed" in done.err
+    assert run.live.end().status == 3
+    assert not run.control.exists()
+
+
+def test_no_run_is_said(evedrop: Evedrop, tmp_path: Path) -> None:
+    """Of a folder without a run, of one that is over, and of one whose run was killed: exit status 2, and why."""
+    folder = tmp_path / "over"
+    assert "there is no such folder" in evedrop("pause", str(folder)).err
+    folder.mkdir()
+    done = evedrop("status", str(folder))
+    assert (done.status, done.out) == (2, "")
+    assert done.err.startswith(f"evedrop: no run is going on in {folder}; it has no control.json (yet); give ")
+    (folder / "summary.json").write_text("{}")
+    assert "it is over" in evedrop("step", str(folder), "3").err
+    Control("r0", "tcp/127.0.0.1:9", "operator", "secret").write(folder)
+    done = evedrop("link", str(folder), "smart", "cut")
+    assert (done.status, len(done.err.splitlines())) == (2, 1)
+    assert "nobody answers at tcp/127.0.0.1:9" in done.err
+
+
+def test_the_control_file_is_nobody_elses(tmp_path: Path) -> None:
+    """It can be read by its owner alone, reads back as it was written, and what is no such file is refused."""
+    control = Control("r0", "tcp/127.0.0.1:9", "operator", "secret")
+    control.write(tmp_path)
+    path = tmp_path / "control.json"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert read_control(tmp_path) == control
+    for text in ("", "[]", "{}", '{"run": 1}', json.dumps({**json.loads(path.read_text()), "user": 3})):
+        path.write_text(text)
+        with pytest.raises(UsageError, match="is not one"):
+            read_control(tmp_path)

@@ -1,0 +1,256 @@
+"""What was expected of a run: found as plain numpy finds it in the tables, alike live and in memory, and seen again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.api import montecarlo, run
+from emulator.model.receiver import Action
+from emulator.runs.judge import Evidence, told
+from emulator.runs.montecarlo import Plan
+from emulator.runs.results import Results, load_results
+from emulator.runs.score import Tally
+from emulator.runs.verdict import Secrecy, Verdict
+from emulator.runs.watched import IN_STEP, Watch, Watched
+from emulator.scenario import load
+from tests.conftest import Evedrop
+
+SLOTS, TRIALS, FIRST = 90, 12, 30
+FIGURES = ("mean_squared_error", "received_fraction", "used_fraction")
+ON_SUSPICIOUS: list[dict[str, Any]] = [
+    {"figure": f"suspicious.{figure}", **what, "above": 0.0}
+    for figure in FIGURES
+    for what in ({}, {"slots": [FIRST, 70]}, {"quantile": 0.9}, {"slots": [FIRST, 70], "quantile": 0.9})
+]
+OTHERS: list[dict[str, Any]] = [
+    {"figure": "naive.mean_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
+    {"figure": "naive.expected_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
+    {"figure": "links.naive.lost", "above": 0},
+    {"figure": "links.naive.lost_by.nothing", "above": 0},
+    {"link": "naive"},
+    {"secrecy": "relative", "against": "naive"},
+    {"secrecy": "perfect", "against": "smart"},
+    {"in_step": "suspicious", "by": 80},
+    {"in_step": "suspicious", "by": 80, "since": FIRST},
+    {"in_step": "suspicious", "by": 0},
+]
+OPTIONS: dict[str, Any] = {"slots": SLOTS, "trials": TRIALS, "record_trials": TRIALS, "expect": ON_SUSPICIOUS + OTHERS}
+
+Runs = Callable[[str], Results]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    """The same run live and in memory, once for all tests."""
+
+    @cache
+    def one(where: str) -> Results:
+        return {"live": run, "memory": montecarlo}[where](
+            "eavesdroppers", out=tmp_path_factory.mktemp(where), **OPTIONS
+        )
+
+    return one
+
+
+def of_trials(results: Results, receiver: str) -> dict[str, Any]:
+    """Columns of the receiver's rows, (slots, trials)."""
+    rows = [row for row in results.trials.to_pylist() if row["peer"] == receiver]
+    return {name: np.array([row[name] for row in rows]).reshape(SLOTS, TRIALS) for name in ("action", "squared_error")}
+
+
+def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
+    """To the last bit, but for sums over all slots, and the believed trace, of which a live run has the sum over trials."""
+    live, memory = (made(where).summary["expectations"] for where in ("live", "memory"))
+    assert len(live) == len(OPTIONS["expect"])
+    for one, other in zip(live, memory, strict=True):
+        exact = ("slots" in one["text"] or "quantile" in one["text"]) and "mean_trace" not in one["text"]
+        exact = exact or not isinstance(one["found"], float)
+        assert one["found"] == (other["found"] if exact else pytest.approx(other["found"], rel=1e-12))
+        assert {key: one[key] for key in ("text", "held", "wanted")} == {
+            key: other[key] for key in ("text", "held", "wanted")
+        }
+        assert ("replay" in one) == ("replay" in other) == (one["held"] is False)
+
+
+def test_figures_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> None:
+    """Mean over slots and trials, and quantile over trials of a trial's mean, by numpy from every recorded trial."""
+    table = of_trials(made("memory"), "suspicious")
+    received = table["action"] != "dropped"
+    columns = {
+        "mean_squared_error": table["squared_error"],
+        "received_fraction": received,
+        "used_fraction": received & (table["action"] != "discarded"),
+    }
+    for expect, found in zip(ON_SUSPICIOUS, made("memory").summary["expectations"], strict=False):
+        means = columns[expect["figure"].split(".")[1]][slice(*expect.get("slots", (0, SLOTS)))].mean(axis=0)
+        known = np.quantile(means, expect["quantile"]) if "quantile" in expect else means.mean()
+        assert found["found"] == pytest.approx(known, rel=1e-12), found["text"]
+        assert found["held"] is True
+
+
+def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
+    """Traces over a range, a link's account, secrecy by theory and run, and the slot by which all were in step."""
+    results = made("live")
+    found = {one["text"]: one for one in results.summary["expectations"]}
+    rows = [row for row in results.slots.to_pylist() if row["peer"] == "naive" and FIRST <= row["slot"] < 70]
+    for figure in ("mean_trace_covariance", "expected_trace_covariance"):
+        known = np.mean([row[figure] for row in rows])
+        assert found[f"naive.{figure} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(known, rel=1e-12)
+    assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
+    unknown = found["links.naive.lost_by.nothing above 0"]
+    assert (unknown["found"], unknown["held"]) == (None, None)
+    assert told(unknown).endswith(": this run does not tell")
+    perfect = found["perfect secrecy against smart promised by theory and shown by the run"]
+    assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
+    states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))
+    for since, text in ((0, ""), (FIRST, f", since slot {FIRST}")):
+        one = found[f"suspicious in step by slot 80{text}"]
+        assert one["found"] == since + states[since:].argmax(axis=0).max()
+        assert one["held"] is (one["found"] <= 80)
+    late = found["suspicious in step by slot 0"]
+    assert late["found"] > 0
+    assert late["held"] is False
+
+
+def test_expectations_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    """Two blocks and a part: the same to the last bit."""
+    options = {**OPTIONS, "trials": 1037, "record_trials": 1}
+    runs = [
+        montecarlo("eavesdroppers", out=tmp_path / f"{workers}", plan=Plan(workers=workers), **options)
+        for workers in (1, 3)
+    ]
+    alone, spread = (
+        [{key: value for key, value in one.items() if key != "replay"} for one in made.summary["expectations"]]
+        for made in runs
+    )
+    assert alone == spread
+
+
+@given(cuts=st.sets(st.integers(1, 39)), blocks=st.sets(st.integers(1, 6)))
+def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks: set[int]) -> None:
+    """Slots in chunks and trials in blocks: the bits are those of one piece."""
+    draw = np.random.default_rng(1)
+    error, action = draw.lognormal(size=(40, 7)), draw.integers(0, 4, (40, 7)).astype(np.uint8)
+    watches = [Watch(figure, *span) for figure in FIGURES for span in ((0, 40), (7, 21))]
+    steps = [Watch(IN_STEP, 0, 40), Watch(IN_STEP, 11, 40)]
+
+    def watched(trials: slice, ends: list[int]) -> Watched:
+        one = Watched([*watches, *steps], error[:, trials].shape[1])
+        for first, end in zip([0, *ends], [*ends, 40], strict=True):
+            one.add(first, error[first:end, trials], action[first:end, trials], np.zeros(end - first))
+        return one
+
+    edges = [0, *sorted(blocks), 7]
+    parts = Watched.of([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
+    whole = watched(slice(0, 7), [])
+    for watch in watches:
+        assert parts.means(watch).tolist() == whole.means(watch).tolist()
+        assert parts.mean(watch) == whole.mean(watch)
+    for watch in steps:
+        firsts = [next(k for k in range(watch.first, 40) if action[k, r] == Action.STATE) for r in range(7)]
+        assert parts.in_step(watch) == whole.in_step(watch) == max(firsts)
+
+
+def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> None:
+    """Null, not held, and the report says so; a run that ended too early to tell is neither."""
+    expect = [{"in_step": "legitimate", "by": 3}]
+    results = montecarlo(
+        "eavesdroppers", slots=9, trials=5, legitimate__link__quality=0.0, expect=expect, out=tmp_path / "a"
+    )
+    (one,) = results.summary["expectations"]
+    assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
+    assert told(one) == "expected legitimate in step by slot 3: FAILED, found none"
+    ranged = {"figure": "smart.used_fraction", "slots": [3, 9], "below": 1}
+    secret = {"secrecy": "relative", "against": "smart"}
+    scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
+    short = {name: Tally(9, 1) for name in scenario.receivers}
+    open_ = Secrecy("smart", Verdict.UNDECIDED, Verdict.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
+    figures = dict.fromkeys(scenario.receivers, short["smart"].figures)
+    judged = Evidence(scenario, figures, {}, short, {}, {"smart": open_}).judged("evedrop run x")
+    assert [one["held"] for one in judged] == [None] * 3
+    assert [one["found"] for one in judged[:2]] == [None] * 2
+    assert not any("replay" in one for one in judged)
+
+
+@pytest.mark.parametrize(
+    ("shown", "promised", "found", "held"),
+    [
+        (Verdict.HELD, True, "theory promises it, the run shows it", True),
+        (Verdict.UNDECIDED, True, "theory promises it, the run has too few trials to tell", False),
+        (Verdict.FAILED, True, "theory promises it, the run shows that it fails", False),
+        (Verdict.HELD, False, "theory denies it, the run shows it", False),
+        (Verdict.HELD, None, "there is no theory for these links, the run shows it", False),
+    ],
+)
+def test_secrecy_is_held_where_theory_and_run_agree(
+    shown: Verdict, promised: bool | None, found: str, held: bool
+) -> None:
+    """Of both kinds; whatever the other kind's verdict is."""
+    for kind in ("relative", "perfect"):
+        scenario = load("eavesdroppers", {"expect": [{"secrecy": kind, "against": "smart"}]})
+        other = {"relative": Verdict.HELD, "perfect": Verdict.HELD}
+        claims = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
+        verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
+                          trials=9, judged_by="mean")  # fmt: skip
+        (one,) = Evidence(scenario, {}, {}, {}, {}, {"smart": verdict}).judged(None)
+        assert (one["found"], one["held"]) == (found, held)
+
+
+@pytest.mark.parametrize(
+    ("account", "found", "held"),
+    [
+        ({"offered": 9}, None, None),
+        ({"rate": 0.8, "within_interval": True}, 0.8, True),
+        ({"rate": 0.2, "within_interval": False}, 0.2, False),
+    ],
+)
+def test_a_link_must_be_within_its_interval(account: dict[str, Any], found: float | None, held: bool | None) -> None:
+    """As its account says; an account that does not say leaves it open."""
+    scenario = load("eavesdroppers", {"expect": [{"link": "smart"}]})
+    (one,) = Evidence(scenario, {}, {"smart": account}, {}, {}, {}).judged(None)
+    assert (one["found"], one["held"]) == (found, held)
+
+
+@pytest.mark.parametrize("command", ["run", "montecarlo"])
+def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: str) -> None:
+    """From the results folder, whose name has a blank in it, and with everything that was changed for the run: exit 1."""
+    view = ("--view", "off") if command == "run" else ()
+    done = evedrop(
+        command, "eavesdroppers", "--slots", "40", "--trials", "10", "--seed", "3", "--first-trial", "5", *view,
+        "--set", "expect.0={figure = 'smart.mean_squared_error', slots = [9, 40], quantile = 0.9, above = 9.0}",
+        "--set", "expect.1={in_step = 'suspicious', by = 0}", "--out", "a run",
+    )  # fmt: skip
+    assert (done.status, done.err) == (1, "")
+    first = load_results(evedrop.folder / "a run").summary["expectations"]
+    assert [one["held"] for one in first] == [False, False]
+    assert "2 of 2 expectations FAILED" in done.out
+    said = [line.strip() for line in done.out.splitlines()]
+    for one in first:
+        assert said[said.index(told(one)) + 1] == f"see it again: {one['replay']}"
+    words = shlex.split(first[0]["replay"])
+    assert words[:2] == ["evedrop", command]
+    again = evedrop(*words[1:], *view, "--json", "--out", "again")
+    assert again.status == 1
+    for one, other in zip(first, json.loads(again.out)["expectations"], strict=True):
+        assert (one["text"], one["found"], one["held"]) == (other["text"], other["found"], other["held"])
+
+
+def test_one_trial_of_a_study_can_be_watched_whatever_was_expected(evedrop: Evedrop) -> None:
+    """The most surprising trial's command leaves out expectations that one trial cannot meet."""
+    expect = "expect.0={figure = 'smart.mean_squared_error', quantile = 0.9, above = 0.0}"
+    done = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "30", "--set", expect, "--out", "study")
+    assert (done.status, done.err) == (0, "")
+    line = next(line for line in done.out.splitlines() if "watch it live: " in line)
+    again = evedrop("check", "study", *shlex.split(line.partition("run study ")[2])[2:4])
+    assert again.status == 0

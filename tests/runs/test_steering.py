@@ -1,0 +1,322 @@
+"""What a run does when the scenario and operators hold and steer it, with a conductor that only notes what it is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from emulator.network.operator import Answer, Request, read_answer
+from emulator.runs.orders import Order
+from emulator.runs.steering import Steering
+from emulator.scenario import Scenario, checked
+
+SLOTS = 100
+TABLES: dict[str, Any] = {
+    "title": "Steered",
+    "slots": SLOTS,
+    "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
+    "encoding": {"scheme": "innovation", "state_probability": 0.5},
+    "legitimate": {"link": {"quality": 0.9}},
+    "eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.7}}},
+}
+
+
+@dataclass
+class Asked:
+    """A question as the observer has it: keeps its answer."""
+
+    payload: bytes = b""
+    answers: list[Answer] = field(default_factory=list)
+
+    def answer(self, payload: bytes) -> None:
+        """Keep it."""
+        self.answers.append(read_answer("key", payload))
+
+
+@dataclass
+class Told:
+    """A conductor that keeps what it would send, and who is there."""
+
+    absent: set[str] = field(default_factory=set)
+    away: set[str] = field(default_factory=set)
+    sent: list[tuple[Any, ...]] = field(default_factory=list)
+
+    def command(self, name: str, do: str, **fields: Any) -> None:
+        """Keep it."""
+        self.sent.append((name, do, *([fields] if fields else [])))
+
+    def there(self, name: str) -> bool:
+        """Whether it is."""
+        return name not in self.away
+
+    def told(self) -> list[tuple[Any, ...]]:
+        """All since the last time."""
+        found, self.sent = self.sent, []
+        return found
+
+
+class Run:
+    """A steered run in a test's hands."""
+
+    def __init__(self, *events: dict[str, Any]) -> None:
+        self.conductor = Told()
+        self.kept: list[Scenario] = []
+        self.news: list[tuple[str, dict[str, Any]]] = []
+        scenario = checked({**TABLES, "event": list(events)}, "test")
+        self.steering = Steering(
+            scenario,
+            self.conductor,  # type: ignore[arg-type]
+            lambda event, **news: self.news.append((event, news)),
+            self.kept.append,
+        )
+
+    def asks(self, do: str, reported: int = 0, **fields: Any) -> Asked:
+        """An operator asks for something while so many slots are reported."""
+        asked = Asked()
+        self.steering.take(Order(Request(do, **fields), asked), reported)  # type: ignore[arg-type]
+        return asked
+
+    def holds(self, k: int) -> list[tuple[Any, ...]]:
+        """The sensor holds before slot k, and then everybody has reported; what the others were told."""
+        self.conductor.told()
+        self.steering.held(k)
+        self.steering.carry_on(k - 1)
+        assert self.conductor.told() == [], "something was done before everybody had reported"
+        self.steering.carry_on(k)
+        return self.conductor.told()
+
+    @property
+    def events(self) -> list[tuple[int, str, str]]:
+        """What was done."""
+        return [(event["slot"], event["event"], event["by"]) for event in self.steering.events]
+
+
+GO = [("router", "go"), ("sensor", "go", {"absent": []})]
+SET = {"link": "legitimate", "set": {"quality": 0.2}}
+SETTINGS = {"loss": {"model": "bernoulli", "quality": 0.2}}
+
+
+def go(until: int) -> list[tuple[Any, ...]]:
+    """What is told when the run goes on for some slots."""
+    return [("router", "go"), ("sensor", "go", {"absent": [], "until": until})]
+
+
+def test_a_change_is_made_between_two_slots() -> None:
+    """The sensor is asked to hold; when it does the router is told, the scenario kept, the run let go, and the slot answered."""
+    run = Run()
+    asked = run.asks("link", event=SET)
+    assert run.conductor.told() == [("sensor", "hold")]
+    change = {"link": "legitimate", "changes": [{"at": 17, "settings": SETTINGS}]}
+    assert run.holds(17) == [("router", "change", change), *GO]
+    assert asked.answers == [Answer(17, "from slot 17 on: link legitimate: quality = 0.2")]
+    assert run.events == [(17, "link legitimate: quality = 0.2", "operator")]
+    assert [one.model_dump(exclude_none=True)["event"] for one in run.kept] == [[{"at": 17, **SET}]]
+
+
+def test_what_the_scenario_changes_later_is_told_again() -> None:
+    """A later change of the scenario lies over the operator's as it would had both been in the file."""
+    later = {"at": 50, "link": "legitimate", "set": {"reorder": 0.5, "delay": {"model": "constant", "value": 1.0}}}
+    run = Run(later, {"at": 60, "cut": "smart"})
+    run.asks("link", event=SET)
+    _, _, fields = run.holds(17)[0]
+    both = {**SETTINGS, "reorder": 0.5, "delay": {"model": "constant", "value": 1.0}}
+    assert fields["changes"] == [{"at": 17, "settings": SETTINGS}, {"at": 50, "settings": both}]
+
+
+def test_two_operators_are_served_in_the_order_they_came() -> None:
+    """Both changes are made at one hold, for which the sensor is asked once; the second sees what the first did."""
+    run = Run()
+    first, second, third = (run.asks("link", event=event) for event in (SET, {"cut": "smart"}, {"cut": "smart"}))
+    assert run.conductor.told() == [("sensor", "hold")]
+    assert [one[1] for one in run.holds(8)] == ["change", "change", "go", "go"]
+    assert first.answers[0].slot == second.answers[0].slot == 8
+    assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected it to heal before",)
+
+
+@pytest.mark.parametrize(
+    ("event", "mistakes"),
+    [
+        ({"link": "legitimate", "set": {"quality": 1.2}}, ["set.quality: is 1.2; expected a number from 0 to 1"]),
+        ({"heal": "smart"}, ["heal: smart is not cut at slot 5; expected a cut before"]),
+        ({"cut": "nobody"}, ['cut: names "nobody"; expected legitimate or smart']),
+        ({"cut": "legitimate"}, ["event.0.cut: legitimate is cut already, from slot 5 on; expected it to heal before"]),
+        ({"kill": "smart"}, ["kill: is nothing that can be done now; expected link with set, cut or heal"]),
+        ({"at": 9, "cut": "smart"}, ["at: is nothing that can be done now; expected link with set, cut or heal"]),
+        ({}, ["event: says not what happens; expected one of"]),
+        (
+            {"link": "smart", "set": {"loss": {"model": "gilbert-elliott", "p": 2.0}, "sluts": 1}},
+            ["set.sluts: is nothing that can be changed", "set.loss.r: is missing", "set.loss.p: is 2.0; expected"],
+        ),
+    ],
+)
+def test_mistakes_change_nothing(event: dict[str, Any], mistakes: list[str]) -> None:
+    """All mistakes are answered at once, in the words for a scenario's events, and the run goes on as it was."""
+    run = Run({"at": 40, "cut": "legitimate"})
+    asked = run.asks("link", event=event)
+    assert run.holds(5) == GO
+    found = asked.answers[0].refused
+    assert len(found) == len(mistakes)
+    for line, wanted in zip(found, mistakes, strict=True):
+        assert line.startswith(wanted)
+    assert (run.events, run.kept) == ([], [])
+
+
+def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
+    """A kill waits for its receiver's last word; while it is not done nothing else is; then the change is made, at that slot."""
+    run = Run({"at": 30, "kill": "smart"})
+    assert run.holds(30) == []
+    assert run.events == []
+    run.steering.left("smart", 30)
+    run.steering.carry_on(30)
+    assert [event for event, _ in run.news] == ["act"]
+    asked = run.asks("link", event=SET)
+    run.steering.carry_on(30)
+    assert run.conductor.told() == []
+    assert asked.answers == []
+    run.steering.done(1)
+    run.conductor.away.add("smart")
+    run.steering.carry_on(30)
+    assert [one[1] for one in run.conductor.told()] == ["change", "go", "go"]
+    assert asked.answers[0].slot == 30
+    assert [event[1] for event in run.events] == ["kill smart", "link legitimate: quality = 0.2"]
+
+
+def test_a_wish_to_hold_that_meets_one_of_the_scenario_is_done_there() -> None:
+    """The hold that was asked for and the scenario's are one; the scenario's event comes first, and nothing is held twice."""
+    run = Run({"at": 30, "cut": "smart"})
+    asked = run.asks("link", event={"heal": "smart"})
+    assert [one[1] for one in run.holds(30)] == ["change", *[one[1] for one in GO]]
+    assert asked.answers[0].slot == 30
+    assert [event[1] for event in run.events] == ["cut smart", "heal smart"]
+
+
+def test_a_pause_lasts_until_it_is_ended() -> None:
+    """The run stays held; changes are made at once and at that slot; a second pause says that it is held already."""
+    run = Run()
+    first = run.asks("pause")
+    assert run.holds(12) == []
+    assert first.answers == [Answer(12, "held before slot 12")]
+    second = run.asks("pause")
+    changed = run.asks("link", event=SET)
+    run.steering.carry_on(12)
+    assert [one[1] for one in run.conductor.told()] == ["change"]
+    assert second.answers == [Answer(12, "held already, before slot 12")]
+    assert changed.answers[0].slot == 12
+    resumed = run.asks("resume")
+    run.steering.carry_on(12)
+    assert run.conductor.told() == GO
+    assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
+    assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
+    assert ("held", {"before": 12}) in run.news
+
+
+def test_resuming_a_run_that_goes_on_holds_nothing() -> None:
+    """It is answered at once, and is no event."""
+    run = Run()
+    assert run.asks("resume", reported=9).answers == [Answer(9, "the run goes on already")]
+    assert (run.conductor.told(), run.events) == ([], [])
+
+
+def test_a_step_lets_slots_pass_and_holds_again() -> None:
+    """Its answer comes when they have passed; what holds the run on the way does not end it."""
+    run = Run({"at": 14, "cut": "smart"})
+    run.asks("pause")
+    run.holds(12)
+    stepped = run.asks("step", slots=5)
+    run.steering.carry_on(12)
+    assert run.conductor.told() == go(17)
+    assert run.holds(14) == go(17)
+    changed = run.asks("link", event=SET)
+    assert [one[1] for one in run.holds(15)] == ["change", "go", "go"]
+    assert changed.answers[0].slot == 15
+    assert stepped.answers == []
+    assert run.holds(17) == []
+    assert stepped.answers == [Answer(17, "slots 12 to 16 passed; held before slot 17")]
+    assert run.steering.paused
+
+
+def test_a_step_of_a_run_that_goes_on_holds_it_first() -> None:
+    """The slots are counted from the slot before which it is held."""
+    run = Run()
+    stepped = run.asks("step", slots=1)
+    assert run.conductor.told() == [("sensor", "hold")]
+    assert run.holds(20) == go(21)
+    assert run.holds(21) == []
+    assert stepped.answers == [Answer(21, "slot 20 passed; held before slot 21")]
+
+
+def test_a_step_within_a_step_is_refused() -> None:
+    """The first goes on to its end."""
+    run = Run()
+    first = run.asks("step", slots=10)
+    run.holds(20)
+    second = run.asks("step", slots=3)
+    assert run.holds(22) == go(30)
+    assert second.answers[0].refused == ("another step goes on, to slot 29; wait for its end, or pause before",)
+    assert run.holds(30) == []
+    assert first.answers[0].slot == 30
+
+
+def test_a_pause_ends_a_step() -> None:
+    """Who stepped is told how far it came; a hold where the step would have ended is passed over."""
+    run = Run()
+    stepped = run.asks("step", slots=10)
+    run.holds(20)
+    run.asks("pause")
+    assert run.holds(22) == []
+    assert stepped.answers == [Answer(22, "slots 20 to 21 passed; the run was paused before the step was over")]
+    run.asks("resume")
+    run.steering.carry_on(22)
+    assert run.holds(30) == GO
+
+
+def test_a_resume_ends_a_step() -> None:
+    """The run goes on past the slot where the step would have ended."""
+    run = Run()
+    stepped = run.asks("step", slots=10)
+    run.holds(20)
+    assert run.asks("resume", reported=24).answers[0].slot == 24
+    assert stepped.answers == [Answer(24, "slots 20 to 23 passed; the run was resumed before the step was over")]
+    assert run.holds(30) == GO
+
+
+def test_a_step_beyond_the_end_ends_with_the_run() -> None:
+    """It is answered when the last slot is scored."""
+    run = Run()
+    stepped = run.asks("step", slots=SLOTS)
+    run.holds(90)
+    run.steering.over(SLOTS, complete=True)
+    assert stepped.answers == [Answer(SLOTS, f"slots 90 to {SLOTS - 1} passed; the run is over")]
+
+
+@pytest.mark.parametrize("do", ["pause", "link", "step"])
+def test_what_comes_after_the_last_slot_is_refused(do: str) -> None:
+    """The sensor has sent all slots and holds no more: whoever asked is told, and nothing has changed."""
+    run = Run()
+    asked = run.asks(do, reported=SLOTS - 3, event=SET, slots=2)
+    run.steering.over(SLOTS, complete=True)
+    assert asked.answers[0].refused == ("the run came to its end before; nothing was done",)
+    assert (run.events, run.kept) == ([], [])
+
+
+def test_an_interrupt_answers_who_waits() -> None:
+    """A step that is not over, and what waits behind it, are refused."""
+    run = Run()
+    stepped = run.asks("step", slots=50)
+    run.holds(20)
+    waiting = run.asks("pause")
+    run.steering.over(31, complete=False)
+    assert stepped.answers[0].refused == ("slots 20 to 30 passed; the run was ended before the step was over",)
+    assert len(waiting.answers[0].refused) == 1
+
+
+def test_a_pause_before_the_last_slot_holds() -> None:
+    """One slot is left then, and passes when the run goes on."""
+    run = Run()
+    run.asks("pause")
+    assert run.holds(SLOTS - 1) == []
+    run.asks("resume")
+    run.steering.carry_on(SLOTS - 1)
+    assert run.conductor.told() == GO

@@ -1,0 +1,246 @@
+"""Scenarios as tests: by `evedrop test` and by pytest, what passes, what is said of the rest, and what CI reads."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from emulator import cli
+from emulator.errors import RunError
+from emulator.runs import testing
+from emulator.runs.junit import junit_of
+from emulator.runs.results import load_results
+from emulator.runs.testing import Finding, Manner, Outcome
+from emulator.scenario import shipped
+from tests.conftest import Done, Evedrop, Live, wait_until
+
+SCENARIO = (
+    shipped()["eavesdroppers"]
+    .read_text(encoding="utf-8")
+    .partition("[[expect]]")[0]
+    .replace("slots = ", "slots = 60 #")
+)
+HOLDS = SCENARIO + '[[expect]]\nfigure = "legitimate.mean_squared_error"\nbelow = 0.1\n'
+FAILS = HOLDS + '[[expect]]\nfigure = "smart.received_fraction"\nslots = [10, 60]\nabove = 2\n'
+WRONG = SCENARIO.replace("slots = ", "sluts = ").replace("seed = ", "seed = -")
+
+
+def written(folder: Path, **texts: str) -> None:
+    """Scenarios in a folder, by name."""
+    folder.mkdir(exist_ok=True)
+    for name, text in texts.items():
+        (folder / f"{name}.toml").write_text(text, encoding="utf-8")
+
+
+def pytest_in(evedrop: Evedrop, *arguments: str) -> Done:
+    """Run pytest with the plugin, found as it is in an environment with it, and with warnings as errors."""
+    command = [sys.executable, "-m", "pytest", "-p", "emulator.pytest_plugin", "-W", "error", "--color=no", *arguments]
+    environment = {**evedrop.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(command, cwd=evedrop.folder, env=environment, capture_output=True, text=True, check=False)
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
+    """A line each, reasons and the results of what did not pass, a sum; the worst status; a report that says the same."""
+    written(evedrop.folder / "cases", fails=FAILS, holds=HOLDS, wrong=WRONG)
+    done = evedrop("test", "cases", "--in-memory", "--trials", "3", "--out", "kept", "--junit", "reports/junit.xml")
+    assert (done.status, done.err) == (2, "")
+    lines = done.out.splitlines()
+    assert re.fullmatch(r"FAILED    +\d+\.\d s  cases/fails.toml", lines[0])
+    failed = "expected smart.received_fraction over slots 10 to 59 above 2: FAILED, found 0."
+    assert lines[1].startswith(f"    {failed}")
+    assert lines[1].endswith(f"; see it again: evedrop montecarlo {evedrop.folder}/kept/fails --trials 3")
+    assert lines[2] == "    results: kept/fails"
+    assert re.fullmatch(r"passed    +\d+\.\d s  cases/holds.toml", lines[3])
+    assert re.fullmatch(r"MISTAKES  +\d+\.\d s  cases/wrong.toml", lines[4])
+    assert [line.split()[0] for line in lines[5:-1]] == ["slots:", "seed:", "sluts:"]
+    assert re.fullmatch(r"1 passed, 1 FAILED, 1 MISTAKES, in \d+\.\d s", lines[-1])
+    assert load_results(evedrop.folder / "kept" / "holds").summary["trials"] == 3
+    assert sorted(path.name for path in (evedrop.folder / "kept").iterdir()) == ["fails", "holds"]
+
+    suites = ET.parse(evedrop.folder / "reports" / "junit.xml").getroot()  # noqa: S314 - our own
+    (suite,) = suites
+    assert (suites.tag, suite.tag, suite.get("name")) == ("testsuites", "testsuite", "evedrop")
+    for one in (suites, suite):
+        assert [one.get(count) for count in ("tests", "failures", "errors", "skipped")] == ["3", "1", "1", "0"]
+    assert [(case.get("classname"), case.get("name")) for case in suite] == [
+        ("cases", "fails"), ("cases", "holds"), ("cases", "wrong"),
+    ]  # fmt: skip
+    times = [float(str(case.get("time"))) for case in suite]
+    assert float(str(suite.get("time"))) == pytest.approx(sum(times), abs=0.01)
+    assert [[part.tag for part in case] for case in suite] == [["properties", "failure"], ["properties"], ["error"]]
+    known = {one.get("name"): one.get("value") for one in suite[0][0]}
+    assert known == {"seed": str(load_results(evedrop.folder / "kept/fails").summary["seed"]), "results": "kept/fails"}
+    assert str(suite[0][1].get("message")).startswith(failed)
+    assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[5:-1]]
+
+
+def test_a_live_test_that_fails_says_how_to_see_it_again(evedrop: Evedrop) -> None:
+    """Two at a time, live: one passes, one fails with exit 1, and its command gives the same failure; nothing is left."""
+    written(evedrop.folder / "cases", fails=FAILS, holds=HOLDS)
+    done = evedrop("test", "cases", "--jobs", "2")
+    assert (done.status, done.err) == (1, "")
+    assert [line.split()[0] for line in done.out.splitlines() if "cases/" in line and " s " in line] == [
+        "FAILED",
+        "passed",
+    ]
+    reason = next(line for line in done.out.splitlines() if "see it again: " in line)
+    words = shlex.split(reason.partition("see it again: ")[2])
+    assert words[:2] == ["evedrop", "run"]
+    again = evedrop(*words[1:], "--view", "off", "--out", "again")
+    assert (again.status, again.err) == (1, "")
+    assert reason.partition("; ")[0].strip() in [line.strip() for line in again.out.splitlines()]
+    assert [path.name.partition("-")[0] for path in sorted((evedrop.folder / "runs").iterdir())] == ["fails", "holds"]
+    assert list(evedrop.temporary.iterdir()) == []
+
+
+def test_shipped_names_and_expectations_that_nobody_can_tell(evedrop: Evedrop) -> None:
+    """A shipped scenario by its name; a figure that the run does not have is no pass, though it is no failed run."""
+    written(evedrop.folder, unknown=SCENARIO + '[[expect]]\nfigure = "links.smart.lost_by.gremlins"\nbelow = 1\n')
+    done = evedrop("test", "bursts", "unknown.toml", "--in-memory", "--trials", "2")
+    assert done.status == 1
+    assert "expected links.smart.lost_by.gremlins below 1: this run does not tell" in done.out
+    assert re.search(r"^passed .* bursts$", done.out, re.MULTILINE)
+
+
+def test_where_there_is_no_scenario_there_is_no_test(evedrop: Evedrop) -> None:
+    """Exit 2 for a folder without one; a file that was named is tried, and its mistakes told."""
+    (evedrop.folder / "pyproject.toml").write_text("[project]\n")
+    done = evedrop("test", ".")
+    assert (done.status, done.out) == (2, "")
+    assert done.err.startswith("evedrop: no scenario in .; a scenario is a TOML file with [process]")
+    for named in ("pyproject.toml", "nowhere.toml"):
+        done = evedrop("test", named)
+        assert (done.status, done.err) == (2, "")
+        assert done.out.startswith("MISTAKES")
+    assert evedrop("test", "vehicle", "--jobs", "0").status == 2
+
+
+def test_a_run_that_fails_is_neither_passed_nor_failed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Exit 3, the story in lines, an error in the report; the next scenario is tested all the same."""
+    written(tmp_path, one=HOLDS, two=FAILS)
+
+    def launch(*_: object) -> None:
+        raise RunError("smart was ended by signal 9\nlogs/smart.log: the last lines")
+
+    monkeypatch.setattr(testing, "launch", launch)
+    report = tmp_path / "report.xml"
+    assert cli.main(["test", str(tmp_path), "--out", str(tmp_path / "runs"), "--junit", str(report)]) == 3
+    told = capsys.readouterr().out.splitlines()
+    assert told[1:4] == [
+        "    smart was ended by signal 9", "    logs/smart.log: the last lines", f"    results: {tmp_path}/runs/one",
+    ]  # fmt: skip
+    assert told[-1].startswith("2 BROKEN, in ")
+    assert [case[1].get("type") for case in ET.parse(report).getroot()[0]] == ["broken", "broken"]  # noqa: S314 - our own
+
+
+def test_tests_of_one_name_keep_their_results_apart(tmp_path: Path) -> None:
+    """A second run into the same place gets a number, and nothing is overwritten."""
+    written(tmp_path, one=HOLDS)
+    manner = Manner(in_memory=True, out=tmp_path / "out")
+    folders = [testing.carry_out(str(tmp_path / "one.toml"), manner).folder for _ in range(3)]
+    assert folders == [tmp_path / "out" / name for name in ("one", "one-2", "one-3")]
+    blocked = testing.carry_out(str(tmp_path / "one.toml"), Manner(in_memory=True, out=tmp_path / "one.toml"))
+    assert (blocked.outcome, blocked.folder) == (Outcome.MISTAKES, None)
+    assert "cannot be made (Not a directory)" in blocked.reasons[0]
+
+
+def test_a_report_holds_what_xml_cannot() -> None:
+    """Markup is escaped, and characters that no XML may have are replaced."""
+    strange = '<a> & "b" ]]> \x00\x1b[31m \ud800 \U0001f512'
+    finding = Finding(f"a{strange}b.toml", Outcome.BROKEN, 1.25, (strange, "second"), 7, Path(f"runs/{strange}"))
+    (case,) = ET.fromstring(junit_of([finding], 0.0).decode())[0]  # noqa: S314 - our own
+    known = '<a> & "b" ]]> \ufffd\ufffd[31m \ufffd \U0001f512'
+    assert case.get("name") == f"a{known}b"
+    assert case.get("time") == "1.250"
+    assert case[0][1].get("value") == f"runs/{known}"
+    assert (case[1].tag, case[1].get("message"), case[1].text) == ("error", known, f"{known}\nsecond")
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, jobs: str) -> None:
+    """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
+    written(evedrop.folder / "cases", a=HOLDS, b=HOLDS.replace("slots = 60", "slots = 200000"))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "emulator", "test", "cases", "--jobs", jobs, "--junit", "report.xml"],
+        cwd=evedrop.folder,
+        env=evedrop.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    live = Live(process, evedrop.temporary, evedrop.folder)
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    assert first.startswith("passed")
+    live.child("sensor")
+    process.send_signal(signal.SIGINT)
+    done = live.end()
+    assert done.status == 130
+    assert "interrupted" in done.err
+    live.nothing_left()
+    (case,) = ET.parse(evedrop.folder / "report.xml").getroot()[0]  # noqa: S314 - our own
+    assert case.get("name") == "a"
+
+
+def test_tests_end_with_whoever_started_them(evedrop: Evedrop) -> None:
+    """Kill -9 of `evedrop test` while two run: their processes end too."""
+    written(evedrop.folder / "cases", a=HOLDS.replace("slots = 60", "slots = 200000"), b=HOLDS)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "emulator", "test", "cases", "--jobs", "2"],
+        cwd=evedrop.folder,
+        env=evedrop.environment,
+        stdout=subprocess.DEVNULL,
+    )
+    live = Live(process, evedrop.temporary, evedrop.folder)
+    live.child("sensor")
+    process.kill()
+    process.wait()
+    wait_until(lambda: not live.left(), "no process left")
+
+
+def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
+    """One test a file; what is no scenario is left alone; failures say found, wanted and command, and no traceback."""
+    written(evedrop.folder, fails=FAILS, holds=HOLDS, wrong=WRONG, _not=HOLDS)
+    (evedrop.folder / "pyproject.toml").write_text("[project]\n")
+    done = pytest_in(
+        evedrop, ".", "--evedrop-in-memory", "--evedrop-trials", "3", "--evedrop-out", "kept", "--junitxml", "r.xml"
+    )
+    assert done.status == 1
+    assert "1 passed" in done.out
+    assert "2 failed" in done.out
+    assert "Traceback" not in done.out + done.err
+    assert "emulator/" not in done.out.replace("emulator/pytest_plugin", "")
+    kept = evedrop.folder / "kept" / "fails"
+    failed = next(line for line in done.out.splitlines() if line.startswith("expected smart.received_fraction"))
+    assert "over slots 10 to 59 above 2: FAILED, found 0." in failed
+    assert failed.endswith(f"see it again: evedrop montecarlo {kept} --trials 3")
+    assert "results: kept/fails" in done.out
+    assert "sluts: is no entry of this table; did you mean slots?" in done.out
+    assert load_results(kept).summary["mode"] == "exact"
+    assert 'name="evedrop_results" value="kept/holds"' in (evedrop.folder / "r.xml").read_text()
+
+
+def test_pytest_runs_a_named_scenario_live(evedrop: Evedrop) -> None:
+    """Without options: live, with the trials of the file, results below runs/."""
+    written(evedrop.folder, holds=HOLDS.replace("slots = 60", "trials = 2\nslots = 60"))
+    began = time.time()
+    done = pytest_in(evedrop, "holds.toml", "-q")
+    assert done.status == 0, done.out
+    (folder,) = (evedrop.folder / "runs").iterdir()
+    summary = load_results(folder).summary
+    assert (summary["mode"], summary["trials"]) == ("live", 2)
+    assert folder.stat().st_mtime >= began - 1
+    done = pytest_in(evedrop, "--collect-only", "-q")
+    assert "holds.toml::holds" in done.out
+    assert "1 test collected" in done.out

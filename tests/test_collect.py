@@ -1,0 +1,62 @@
+"""Which files are taken for scenarios, and which are left alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from emulator.collect import is_scenario, scenarios_in
+from emulator.runs.testing import scenarios_of
+from emulator.scenario import shipped
+
+SCENARIO = shipped()["eavesdroppers"].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "taken"),
+    [
+        ("mine.toml", SCENARIO, True),
+        ("mine.toml", "\ufeff" + SCENARIO, True),
+        ("mine.toml", "process.A = 1\nencoding = {}\n", True),
+        ("mine.toml", "[process]\n[encoding]\nslots = = 3\n", True),
+        ("mine.toml", "process and encoding = = 3\n", False),
+        ("mine.toml", "process = 3\nencoding = 3\n", False),
+        ("mine.toml", "[process]\n", False),
+        ("pyproject.toml", '[project]\ndescription = "encoding of a process"\n', False),
+        ("_new.toml", SCENARIO, False),
+        ("mine.txt", SCENARIO, False),
+        ("scenario.toml", SCENARIO, True),
+    ],
+)
+def test_what_looks_like_a_scenario_is_taken(tmp_path: Path, name: str, text: str, taken: bool) -> None:
+    """TOML with both tables, or with both headings and a slip of the pen; by name nothing that begins with _."""
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    assert is_scenario(path) is taken
+
+
+def test_what_cannot_be_read_is_no_scenario(tmp_path: Path) -> None:
+    """Bytes that are no text, a folder of that name, nothing at all."""
+    (tmp_path / "a.toml").write_bytes(b"\xff process encoding")
+    (tmp_path / "b.toml").mkdir()
+    assert not any(is_scenario(tmp_path / f"{name}.toml") for name in "abc")
+
+
+@pytest.mark.parametrize("beside", ["summary.json", "slots.parquet"])
+def test_the_copy_in_a_results_folder_is_none(tmp_path: Path, beside: str) -> None:
+    """Of a run that ended, and of one that goes on."""
+    (tmp_path / "scenario.toml").write_text(SCENARIO, encoding="utf-8")
+    (tmp_path / beside).touch()
+    assert not is_scenario(tmp_path / "scenario.toml")
+
+
+def test_folders_are_searched_in_order_and_each_scenario_is_taken_once(tmp_path: Path) -> None:
+    """Hidden folders are left out; a file that is named twice, or is in a folder that is named too, is one test."""
+    for place in ("b.toml", "a/z.toml", "a/c.toml", ".hidden/h.toml", "a/_not.toml"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_text(SCENARIO, encoding="utf-8")
+    found = [str(tmp_path / place) for place in ("b.toml", "a/c.toml", "a/z.toml")]
+    assert [str(path) for path in scenarios_in(tmp_path)] == found
+    z, c, b = (found[i] for i in (2, 1, 0))
+    assert scenarios_of([z, "vehicle", str(tmp_path), z, str(shipped()["vehicle"])]) == [z, "vehicle", b, c]

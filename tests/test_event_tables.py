@@ -1,0 +1,226 @@
+"""Events in a scenario: every mistake at once with its number, and what right ones come to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from emulator.errors import ScenarioError
+from emulator.model.link import NEVER
+from emulator.model.links.link import Fate
+from emulator.scenario import Scenario, checked
+
+
+def tables(*events: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """A scenario with these events."""
+    return {
+        "title": "Events",
+        "slots": 100,
+        "process": {"A": [[1.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]},
+        "encoding": {"scheme": "innovation", "state_probability": 0.5},
+        "legitimate": {"link": {"quality": 0.9}},
+        "eavesdroppers": {"eve": {"strategy": "smart", "link": {"quality": 0.9}}},
+        "event": list(events),
+        **more,
+    }
+
+
+def mistakes(*events: dict[str, Any], **more: Any) -> list[str]:
+    """What is wrong with a scenario."""
+    with pytest.raises(ScenarioError) as caught:
+        checked(tables(*events, **more), "file")
+    assert caught.value.exit_status == 2
+    return caught.value.mistakes
+
+
+def right(*events: dict[str, Any], **more: Any) -> Scenario:
+    """A scenario with which nothing is wrong."""
+    return checked(tables(*events, **more), "file")
+
+
+WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
+    "beyond the end": ([{"at": 100, "cut": "eve"}], "event.0.at: is 100, but the last slot is 99; expected a slot of"),
+    "ends beyond": ([{"from": 9, "to": 101, "cut": "eve"}], "event.0.to: is 101; expected at most 100, the end of"),
+    "before it begins": (
+        [{"from": 9, "to": 9, "cut": "eve"}],
+        "event.0.to: is 9, not after from, which is 9; expected",
+    ),
+    "no such link": ([{"at": 1, "cut": "mallory"}], 'event.0.cut: names "mallory"; expected legitimate or eve'),
+    "no receiver": (
+        [{"at": 1, "kill": "router"}],
+        'event.0.kill: names "router": it is none of the receivers; expected',
+    ),
+    "two things": (
+        [{"at": 1, "cut": "eve", "note": "x"}],
+        "event.0.event: has cut or note at once; expected one of set",
+    ),
+    "nothing": ([{"at": 1}], "event.0.event: says not what happens; expected one of set, cut"),
+    "no time": ([{"cut": "eve"}], "event.0.at: is missing; expected at = 400"),
+    "two times": ([{"at": 1, "from": 2, "to": 3, "cut": "eve"}], "event.0.at: and from are both there"),
+    "no end": ([{"from": 2, "cut": "eve"}], "event.0.to: is missing beside from; expected the slot in which it ends"),
+    "end alone": ([{"at": 2, "to": 3, "cut": "eve"}], "event.0.to: is there without from"),
+    "no lasting thing": ([{"from": 2, "to": 3, "note": "x"}], "event.0.from: is there, but note happens in one slot"),
+    "set nothing": ([{"at": 1, "link": "eve", "set": {}}], "event.0.set: is empty; expected what changes"),
+    "set nowhere": (
+        [{"at": 1, "set": {"quality": 0.5}}],
+        "event.0.link: is missing; expected the link that is changed",
+    ),
+    "set wrongly": (
+        [{"at": 1, "link": "eve", "set": {"quality": 2.0}}],
+        "event.0.set.quality: is 2.0; expected a number",
+    ),
+    "set what is not": ([{"at": 1, "link": "eve", "set": {"colour": 2}}], "event.0.set.colour: is nothing that can be"),
+    "set a model wrongly": (
+        [{"at": 1, "link": "eve", "set": {"loss": {"model": "pattern", "outcomes": "12"}}}],
+        "event.0.set.loss.outcomes: is ",
+    ),
+    "heals what is whole": (
+        [{"at": 1, "heal": "eve"}],
+        "event.0.heal: eve is not cut at slot 1; expected a cut before",
+    ),
+    "restarts who is there": (
+        [{"at": 1, "restart": "eve"}],
+        "event.0.restart: eve is not down at slot 1; expected a kill",
+    ),
+    "killed twice": (
+        [{"at": 1, "kill": "eve"}, {"at": 3, "kill": "eve"}],
+        "event.1.kill: eve is down already, from slot 1 on; expected it to be back",
+    ),
+    "cut twice": (
+        [{"from": 1, "to": 9, "cut": "eve"}, {"at": 3, "partition": ["eve"]}],
+        "event.1.cut: eve is cut already, from slot 1 on; expected it to heal before",
+    ),
+    "back and gone at once": (
+        [{"from": 1, "to": 5, "kill": "eve"}, {"at": 5, "pause": "eve"}],
+        "event.1.pause: eve is back in slot 5 only; expected a later slot",
+    ),
+    "state of nobody": (
+        [{"at": 1, "cut": "eve", "state": "last"}],
+        "event.0.state: is there without a restart; remove",
+    ),
+    "jams nothing": (
+        [{"at": 1, "jam": "acknowledgements"}],
+        "event.0.jam: the scheme innovation has no acknowledgements",
+    ),
+    "unknown entry": ([{"at": 1, "cut": "eve", "why": "x"}], "event.0.why: is no entry of this table"),
+    "seconds without length": (
+        [{"at": 1, "link": "eve", "set": {"delay": {"model": "constant", "value": 1.0, "unit": "seconds"}}}],
+        "event.0.set.delay.unit: is seconds; expected slot_seconds",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_event_is_named(name: str) -> None:
+    """With its number, what was found and what was expected; exit status 2."""
+    events, line = WRONG[name]
+    found = mistakes(*events)
+    assert any(one.startswith(line) for one in found), found
+
+
+def test_all_wrong_events_are_named_at_once() -> None:
+    """A line for each, beside mistakes of other tables."""
+    found = mistakes(
+        {"at": 100, "cut": "eve"},
+        {"at": 1, "kill": "nobody"},
+        {"at": 1},
+        legitimate={"link": {"quality": 0.9, "delay": {"model": "constant"}, "reorder": 3.0}, "window": -1},
+    )
+    starts = (
+        "event.0.at",
+        "event.1.kill",
+        "event.2.event",
+        "legitimate.link.delay.value",
+        "legitimate.link.reorder",
+        "legitimate.window",
+    )
+    assert all(any(line.startswith(start) for line in found) for start in starts), found
+
+
+@pytest.mark.parametrize(
+    ("link", "line"),
+    [
+        (
+            {"correlation": {"with": "nobody", "strength": 0.5}},
+            'correlation.with: is "nobody"; expected another receiver',
+        ),
+        ({"correlation": {"with": "eve", "strength": 0.5}}, 'correlation.with: is "eve"; expected another receiver'),
+        ({"correlation": {"with": "legitimate", "strength": 1.5}}, "correlation.strength: is 1.5; expected a number"),
+        (
+            {"delay": {"model": "constant", "value": 1.0, "unit": "days"}},
+            'delay.unit: is "days"; expected "slots" or "se',
+        ),
+        (
+            {"delay": {"model": "constant", "value": 1.0, "unit": "seconds"}},
+            "delay.unit: is seconds; expected slot_seconds",
+        ),
+        (
+            {"delay": {"model": "constnat", "value": 1.0}},
+            'delay.model: is "constnat"; expected constant, normal, pareto or',
+        ),
+        ({"queue": 5}, "queue: is there without a rate"),
+        ({"reorder": 0.5}, "reorder: is there without a delay"),
+        ({"rate": 0.0}, "rate: is 0.0"),
+    ],
+)
+def test_a_wrong_link_is_named(link: dict[str, Any], line: str) -> None:
+    """With its path."""
+    eve = {"eve": {"strategy": "smart", "link": {"quality": 0.9, **link}}}
+    found = mistakes(eavesdroppers=eve)
+    assert any(one.startswith(f"eavesdroppers.eve.link.{line}") for one in found), found
+
+
+def test_correlation_needs_links_that_lose_alike() -> None:
+    """The same model on both, and no correlation of the other's own."""
+    bursts = {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}
+    tie = {"with": "legitimate", "strength": 0.5}
+    (line,) = mistakes(eavesdroppers={"eve": {"strategy": "smart", "link": {"loss": bursts, "correlation": tie}}})
+    assert "the loss models differ (bernoulli there and gilbert-elliott here)" in line
+    chained = {
+        "eve": {"strategy": "smart", "link": {"quality": 0.9, "correlation": tie}},
+        "mallory": {"strategy": "smart", "link": {"quality": 0.9, "correlation": {"with": "eve", "strength": 1.0}}},
+    }
+    (line,) = mistakes(eavesdroppers=chained)
+    assert "is eve, whose own losses are tied to another link's" in line
+
+
+def test_what_events_come_to() -> None:
+    """Changes of links that add up and go back, cuts, outages and holds, in order of slots."""
+    scenario = right(
+        {"from": 30, "to": 40, "link": ["eve"], "set": {"corrupt": 0.5}},
+        {"at": 10, "link": "eve", "set": {"quality": 0.5}},
+        {"from": 20, "to": 25, "partition": ["legitimate", "eve"]},
+        {"from": 50, "to": 60, "kill": "legitimate", "state": "last"},
+        {"at": 70, "kill": "eve"},
+        {"at": 80, "restart": "eve"},
+        {"at": 90, "pause": "eve"},
+        {"at": 5, "note": "here we go"},
+    )
+    eve = scenario.course("eve")
+    half, whole = ({"model": "bernoulli", "quality": quality} for quality in (0.5, 0.9))
+    assert [(one.at, one.settings, one.cut) for one in eve.changes] == [
+        (10, {"loss": half}, None),
+        (20, None, True),
+        (25, None, False),
+        (30, {"loss": half, "corrupt": 0.5}, None),
+        (40, {"loss": whole}, None),
+    ]
+    outages = {
+        name: [(one.start, one.stop, one.reason, one.keeps_state) for one in scenario.timeline.outages[name]]
+        for name in scenario.receivers
+    }
+    assert outages == {
+        "legitimate": [(50, 60, Fate.DOWN, True)],
+        "eve": [(70, 80, Fate.DOWN, False), (90, NEVER, Fate.PAUSED, True)],
+    }
+    assert sorted(scenario.timeline.holds) == [5, 10, 20, 25, 30, 40, 50, 60, 70, 80, 90]
+    assert scenario.timeline.holds[20][0].said == "cut legitimate, eve"
+
+
+def test_events_survive_being_written_and_read() -> None:
+    """A checked scenario, dumped as tables, is the same scenario."""
+    scenario = right({"from": 20, "to": 25, "cut": "eve"}, {"at": 30, "link": "eve", "set": {"quality": 0.5}})
+    again = Scenario.model_validate(scenario.model_dump(mode="json"))
+    assert again == scenario
+    assert again.timeline == scenario.timeline
