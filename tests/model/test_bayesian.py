@@ -84,7 +84,7 @@ def enumerated(process: Process, mu_d: float, z: Floats, gamma: list[bool]) -> t
 def test_it_is_the_posterior_over_all_type_words(
     n: int, radius: float, mu_d: float, gamma: list[bool], seed: int
 ) -> None:
-    """Random systems, losses and μ_d, seven slots: x̂ and P to 1e-10 of an enumeration of all words of types."""
+    """Random systems, losses and μ_d, seven slots: x̂ and P to 1e-8 of an enumeration of all words of types."""
     random = np.random.default_rng(seed)
     A = random.standard_normal((n, n))
     A *= radius / np.abs(np.linalg.eigvals(A)).max()
