@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link_law import law_of
+from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.runs.results import Results, load_results
 from emulator.scenario import Scenario, checked, load
@@ -99,6 +100,11 @@ def design(
     from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
+    if SCHEMES.foreign(made.encoding.scheme):
+        raise UsageError(
+            f"the design of μ_d is for the paper's scheme; no closed form is known for {made.encoding.scheme}; give "
+            "--set 'encoding={scheme = \"innovation\", state_probability = 0.6}', or study it by evedrop sweep"
+        )
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
     quality = {}

@@ -140,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
     add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
-    add("check", commands.check, "validate scenarios only", _scenarios, _set)
+    add("check", commands.check, "validate scenarios, or classes of your own", _scenarios, _set, _classes)
     links = top.group("links", "what can be found out about links")
     links.add(
         "fit", commands.fit_link, "the loss model, and delays, of a recorded link", _argument("trace", "TRACE"), _fits
@@ -169,7 +169,18 @@ def _scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def _scenarios(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenarios", nargs="+", metavar="SCENARIO")
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO")
+
+
+def _classes(parser: argparse.ArgumentParser) -> None:
+    for kind, what in (
+        ("scheme", "a scheme, or the one that an eavesdropper is checked beside"),
+        ("eavesdropper", "an eavesdropper"),
+        ("link", "a loss model"),
+        ("delay", "a delay model"),
+    ):
+        text = f"check {what}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+        parser.add_argument(f"--{kind}", metavar="NAME", help=text)
 
 
 def _places(parser: argparse.ArgumentParser) -> None:

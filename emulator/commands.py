@@ -283,10 +283,15 @@ def test(options: argparse.Namespace) -> int:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Validate scenarios."""
+    """Validate scenarios, or classes."""
     from emulator.runs.estimates import warnings_of
     from emulator.scenario import load
 
+    names = {kind: name for kind in ("scheme", "eavesdropper", "link", "delay") if (name := getattr(options, kind))}
+    if bool(names) == bool(options.scenarios):
+        raise UsageError("evedrop check: expected scenarios, or classes by --scheme, --eavesdropper, --link or --delay")
+    if names:
+        return _check_classes(names, _changes(options))
     status = 0
     for name in options.scenarios:
         try:
@@ -298,6 +303,24 @@ def check(options: argparse.Namespace) -> int:
         print(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
         for warning in warnings_of(scenario):
             print(f"  warning: {warning}")
+    return status
+
+
+def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
+    from emulator.conformance.examine import examined
+
+    status = 0
+    for one in examined(names, parameters):
+        broken = [verdict for verdict in one.verdicts if verdict.broken is not None]
+        print(
+            f"{one.title}: {f'{len(broken)} broken' if broken else 'all'} of {len(one.verdicts)} rules"
+            + ("" if broken else " kept")
+        )
+        for verdict in one.verdicts:
+            print(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}")
+            if verdict.broken is not None:
+                print(f"          {verdict.broken}")
+        status = UsageError.exit_status if broken else status
     return status
 
 
@@ -340,9 +363,13 @@ def brief(options: argparse.Namespace) -> int:
 def process(options: argparse.Namespace) -> int:
     """Be one process of a run."""
     from emulator.brief import read_brief
+    from emulator.model.registry import NotRegistered
+    from emulator.modules import look_in
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
+    if brief.part.get("modules") is not None:
+        look_in(str(brief.part["modules"]))
     match options.role:
         case "router":
             from emulator.network.router import route as play
@@ -358,5 +385,8 @@ def process(options: argparse.Namespace) -> int:
             return observe(brief)
         case _:
             raise BriefError(f"no role {options.role}; give one of those that `evedrop --help` lists")
-    play(brief)
+    try:
+        play(brief)
+    except NotRegistered as error:
+        raise BriefError(f"{options.brief} names {error.name}{error.why or ', which is no class here'}") from error
     return 0

@@ -13,6 +13,7 @@ from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
+from emulator.modules import named_in
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
 from emulator.runs.acknowledging import chart_of, way_back_of
 from emulator.runs.folder import new_folder
@@ -128,7 +129,7 @@ def briefs_of(
             flow=flow_of(scenario),
             model=model,
             keys={name: key.hex() for name, key in owned.items()},
-            part=part,
+            part={**part, "modules": scenario.modules} if any(named_in(part)) and process != OBSERVER else part,
             ends_with_stdin=ends_with_stdin,
         )
 

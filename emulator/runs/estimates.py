@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from emulator.model.theory import stability_bound
+from emulator.modules import sources_of
 from emulator.network.access import LEGITIMATE
 from emulator.runs.expectation import expectations_of
 from emulator.scenario import Scenario
@@ -41,6 +42,9 @@ def warnings_of(scenario: Scenario) -> list[str]:
         found.append(
             f"this run will write about {size / 1e9:.1f} GB of results; fewer slots or record_trials write less"
         )
+    for module, source in sources_of(scenario.model_dump(mode="json")).items():
+        if scenario.made_with.get(module, source) != source:
+            found.append(f"the {module} is not the one these results were made with; its digests may be others")
     return found
 
 

@@ -16,6 +16,7 @@ import tomli_w
 
 from emulator.model.digest import Digests, RunDigest, block_starts
 from emulator.model.process import Floats
+from emulator.modules import sources_of
 from emulator.network.access import LEGITIMATE
 from emulator.runs.acknowledging import Detection
 from emulator.runs.channel import channel_of
@@ -210,6 +211,7 @@ def resolved(scenario: Scenario) -> str:
     tables["made_with"] = {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
+        **sources_of(tables),
     }
     text: str = tomli_w.dumps(tables)
     return text
