@@ -45,13 +45,31 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
     view = choose(view)
     if listen is not None:
         check_endpoint(listen)
+    with stop_on_signals() as stop:
+        if scenario.shards == 1:
+            return launch_one(scenario, folder, view, listen, tell, stop)
+        from emulator.runs.shards import launch_shards  # noqa: PLC0415 - it launches each of them by the function below
+
+        return launch_shards(scenario, folder, view, listen, tell, stop)
+
+
+def launch_one(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Callable[[News], None],
+    stop: threading.Event,
+    shard: bool = False,
+) -> Ended:
+    """Run a scenario as `launch` does, on one router, until `stop` is set; shard: whether others carry further trials."""
     endpoint = listen or f"tcp/127.0.0.1:{free_port()}"
-    with stop_on_signals() as stop, _private_folder() as private:
+    with _private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None))
+            briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None, shard))
             observer = briefs.pop(OBSERVER)
             with Children(folder / "logs", private) as children:
                 for brief in briefs.values():
