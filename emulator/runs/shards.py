@@ -21,6 +21,7 @@ from emulator.errors import Interrupted, RunError, UsageError
 from emulator.runs.children import News
 from emulator.runs.folder import new_folder
 from emulator.runs.launcher import Ended, launch_one
+from emulator.runs.ports import free_port
 from emulator.runs.viewer import Viewer
 from emulator.scenario import Scenario
 
@@ -128,10 +129,10 @@ class _Course:
     """In the order of time."""
     viewer: Viewer | None = None
 
-    def launched(self, shard: Shard, tell: Callable[[News], None], view: str, stop: threading.Event) -> None:
-        """Launch one to its end; whatever ends it early ends all."""
+    def launched(self, shard: Shard, at: str, tell: Callable[[News], None], view: str, stop: threading.Event) -> None:
+        """Launch one, its router at an endpoint, to its end; whatever ends it early ends all."""
         try:
-            ended = launch_one(shard.scenario, shard.folder, view, None, tell, stop, shard=True)
+            ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, shard=True)
         except BaseException as error:
             self.failures.append((shard, error))
             stop.set()
@@ -162,18 +163,17 @@ def launch_shards(
             f"--listen {listen} is one router's endpoint, and each of the {scenario.shards} shards has a router; leave it "
             "out, or give --set shards=1"
         )
+    endpoints = _endpoints(scenario.shards)
     new_folder(folder)
     shards = shards_of(scenario, folder)
     progress, course = OneProgress(shards, tell), _Course()
-    others = [
-        threading.Thread(target=course.launched, args=(shard, progress.of(shard), "off", stop), name=shard.name)
-        for shard in shards[1:]
-    ]
-    for thread in others:
+    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
+    threads = [threading.Thread(target=course.launched, args=(*one, "off", stop)) for one in others]
+    for thread in threads:
         thread.start()
     # Here, not on a thread: a viewer ends with the thread that has started it.
-    course.launched(shards[0], progress.of(shards[0]), view, stop)
-    for thread in others:
+    course.launched(*first, view, stop)
+    for thread in threads:
         thread.join()
     try:
         return Ended(_made_one(scenario, folder, shards, course, progress.started), course.viewer)
@@ -181,6 +181,14 @@ def launch_shards(
         if course.viewer is not None:
             course.viewer.stop()
         raise
+
+
+def _endpoints(count: int) -> list[str]:
+    """So many endpoints on loopback; of ports that are found one by one, two might be the same while nobody listens yet."""
+    ports = set[int]()
+    while len(ports) < count:
+        ports.add(free_port())
+    return [f"tcp/127.0.0.1:{port}" for port in ports]
 
 
 def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course: _Course, started: float | None) -> int:

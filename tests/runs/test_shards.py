@@ -166,13 +166,12 @@ def test_progress_is_that_of_the_slowest() -> None:
 
 def test_a_real_time_run_keeps_its_pace_in_every_shard(evedrop: Evedrop) -> None:
     """No shard is done before its slots have passed."""
-    done = evedrop("run", "eavesdroppers", "--view", "off", "--json", "--out", "run", "--slots", "60", "--pace", "0.01")
-    sharded = evedrop(
-        *("run", "eavesdroppers", "--view", "off", "--json", "--out", "sharded", "--slots", "60", "--pace", "0.01"),
+    done = evedrop(
+        *("run", "eavesdroppers", "--view", "off", "--json", "--out", "run", "--slots", "60", "--pace", "0.02"),
         *("--trials", "2", "--set", "shards=2"),
     )
-    assert done.status == sharded.status == 0
-    assert sharded.summary["wall_seconds"] >= 59 * 0.01
+    assert done.status == 0
+    assert done.summary["wall_seconds"] >= 59 * 0.02
 
 
 def child(live: Live, shard: int, name: str) -> int:
