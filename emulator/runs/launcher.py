@@ -7,9 +7,8 @@ Ctrl-C reaches the launcher only; each holds the other end of a pipe, so none ou
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import GRACE_SECONDS, Children, Exit, News
 from emulator.runs.folder import new_folder
 from emulator.runs.ports import check_endpoint, free_port
+from emulator.runs.private import private_folder
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
 from emulator.scenario import Scenario
@@ -64,7 +64,7 @@ def launch_one(
 ) -> Ended:
     """Run a scenario as `launch` does, on one router, until `stop` is set; shard: whether others carry further trials."""
     endpoint = listen or f"tcp/127.0.0.1:{free_port()}"
-    with _private_folder() as private:
+    with private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
@@ -92,17 +92,6 @@ def launch_one(
         finally:
             remove_control(folder)
     return Ended(status, viewer)
-
-
-@contextlib.contextmanager
-def _private_folder() -> Iterator[Path]:
-    """For the briefs: nobody else may look into it."""
-    try:
-        made = tempfile.TemporaryDirectory(prefix="evedrop-", ignore_cleanup_errors=True)
-    except OSError as error:
-        raise UsageError(f"no temporary folder can be made ({error.strerror}); set TMPDIR to one") from error
-    with made as private:
-        yield Path(private)
 
 
 def _forget(folder: Path) -> None:
