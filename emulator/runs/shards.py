@@ -54,7 +54,7 @@ class Shard:
         """What it says of itself, as it is for the run: who, and where the logs will be."""
         trials = self.trials
         which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
-        return f"shard {self.number} ({which}): " + re.sub(r"\blogs/", f"logs/{self.name}/", str(said))
+        return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(said))
 
 
 def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:

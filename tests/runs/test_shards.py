@@ -164,14 +164,16 @@ def test_progress_is_that_of_the_slowest() -> None:
     assert (told[1]["done"], told[1]["rate"], told[1]["squared_errors"]) == (20, 4.0, {"smart": 3.0})
 
 
-def test_a_real_time_run_keeps_its_pace_in_every_shard(evedrop: Evedrop) -> None:
-    """No shard is done before its slots have passed."""
+def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_status(evedrop: Evedrop) -> None:
+    """No shard is done before its slots have passed, and what is expected is judged once, of all trials."""
     done = evedrop(
         *("run", "eavesdroppers", "--view", "off", "--json", "--out", "run", "--slots", "60", "--pace", "0.02"),
         *("--trials", "2", "--set", "shards=2"),
+        *("--set", "expect=[{ figure = 'legitimate.mean_squared_error', below = 1e-9 }]"),
     )
-    assert done.status == 0
+    assert done.status == 1, done.err
     assert done.summary["wall_seconds"] >= 59 * 0.02
+    assert [one["held"] for one in done.summary["expectations"]] == [False]
 
 
 def child(live: Live, shard: int, name: str) -> int:
