@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py [--quick] [PICTURE]
 
-About ten minutes, `--quick` one. A delivery is one packet's fate at one receiver in one trial, counted once its slot is in the
+About seven minutes, `--quick` one. A delivery is one packet's fate at one receiver in one trial, counted once its slot is in the
 results. Rates are those of the steady part of a run: start, end and the making one of shards left out. Memory is the largest
 sum of all processes' resident memory, in which what they share counts in each. Compare within one table, not between tables:
 what else runs on the machine is in all of its numbers, and the load is printed at its head and its foot.
@@ -42,6 +42,7 @@ class Grid:
     trials: tuple[int, ...]
     receivers: tuple[int, ...]
     shards: tuple[int, ...]
+    """Of runs over the second number of receivers; the others are not split."""
     seconds: float
     """Each run's, about."""
 
@@ -49,7 +50,7 @@ class Grid:
     def points(self) -> Iterator[tuple[int, int, int]]:
         """Trials, receivers and shards of each run."""
         for trials, receivers, shards in product(self.trials, self.receivers, self.shards):
-            if shards <= trials:
+            if shards == 1 or (shards <= trials and receivers == self.receivers[1]):
                 yield trials, receivers, shards
 
 
@@ -78,6 +79,11 @@ class Measured:
     def rate(self) -> float:
         """Deliveries a second."""
         return self.slots_per_second * self.trials * self.receivers
+
+    @property
+    def cost(self) -> float:
+        """Microseconds of processor a delivery, of all processes together."""
+        return self.cores / self.rate * 1e6
 
 
 def changes_of(slots: int, trials: int, receivers: int, shards: int) -> dict[str, Any]:
@@ -225,10 +231,10 @@ def draw(found: list[Measured], picture: Path) -> None:
         high = max(one.trials for one in found)
         speed.loglog([low, high], [first, first * high / low], ":", color=GREY, linewidth=1.0, label="linear")
         speed.set_ylim(top=2.5 * max(one.rate for one in found))
-        many = [one for one in found if one.receivers == receivers[min(1, len(receivers) - 1)]]
+        many = [one for one in found if one.receivers == receivers[1]]
         for colour, trials in zip(COLOURS, sorted({one.trials for one in many if one.trials > 1}), strict=False):
             line = [one for one in many if one.trials == trials]
-            base = next(one.rate for one in line if one.shards == 1)
+            base = _alone(many, trials)
             gain.plot(
                 [one.shards for one in line],
                 [one.rate / base for one in line],
@@ -238,16 +244,23 @@ def draw(found: list[Measured], picture: Path) -> None:
                 label=f"{trials:,} trials",
             )
         gain.axhline(1.0, color=GREY, linewidth=1.0)
-        gain.set_ylim(bottom=0.0)
+        gain.set_ylim(0.0, 1.25 * max(one.rate / _alone(many, one.trials) for one in many))
         gain.set_xticks(sorted({one.shards for one in found}))
         for axes, title, x in (
             (speed, "Deliveries a second, 1 shard", "trials"),
-            (memory, "Resident memory of all processes, MB, 1 shard", "trials"),
-            (gain, f"Deliveries a second over those of 1 shard, {many[0].receivers} receivers", "shards"),
+            (memory, "Memory of all processes, MB, 1 shard", "trials"),
+            (gain, f"Rate over that of 1 shard, {many[0].receivers} receivers", "shards"),
         ):
             axes.set_title(title)
             axes.set_xlabel(x)
             axes.legend()
+        for which in (memory.yaxis.set_major_formatter, memory.yaxis.set_minor_formatter):
+            which(lambda value, _: f"{value:,.0f}" if f"{value:g}"[0] in "1257" else "")
+
+
+def _alone(found: list[Measured], trials: int) -> float:
+    """The rate of so many trials in one shard."""
+    return next(one.rate for one in found if one.shards == 1 and one.trials == trials)
 
 
 def load_now() -> str:
@@ -259,14 +272,14 @@ def main(quick: bool, picture: Path | None) -> None:
     """All of it."""
     grid = QUICK if quick else FULL
     print(f"{os.cpu_count()} cores, load before: {load_now()}")
-    print("trials  receivers  shards    slots   slots/s  deliveries/s  cores used  busiest process      MB", flush=True)
+    print("trials  receivers  shards    slots   slots/s  deliveries/s   µs each  cores used  busiest process      MB")
     found = []
     for point in grid.points:
         one = measure(*point, grid.seconds)
         found.append(one)
         print(
             f"{one.trials:>6} {one.receivers:>10} {one.shards:>7} {one.slots:>8,} {one.slots_per_second:>9,.0f} "
-            f"{one.rate:>13,.0f} {one.cores:>11.2f}  {one.busiest:<11} {one.share:.2f} {one.megabytes:>9,.0f}",
+            f"{one.rate:>13,.0f} {one.cost:>9.3f} {one.cores:>11.2f}  {one.busiest:<11} {one.share:.2f} {one.megabytes:>9,.0f}",
             flush=True,
         )
     laws(found)
