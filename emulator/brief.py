@@ -30,7 +30,7 @@ _PARTS: Mapping[str, tuple[str, ...]] = {
     "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart"),
     "legitimate": ("scheme", "window", "outages"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
-    "observer": ("scenario", "results", "recording", "live", "operator"),
+    "observer": ("scenario", "results", "recording", "live", "operator", "shard"),
 }
 ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
 

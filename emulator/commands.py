@@ -120,6 +120,7 @@ def _replay(folder: Path) -> str | None:
     except UsageError:  # float64 cannot follow the states of so many slots
         return None
     recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
+    recorded += " --set shards=1" if scenario.shards > 1 else ""
     # A quantile over trials can be expected of many alone.
     expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
     return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"

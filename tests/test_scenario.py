@@ -59,6 +59,7 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
         ("seed", -1, "seed: is -1; expected a number at least 0"),
         ("trials", 0, "trials: is 0; expected a number at least 1"),
         ("record_trials", 2, "record_trials: is 2; expected at most trials, which is 1"),
+        ("shards", 2, "shards: is 2; expected at most trials, which is 1: a shard has one trial or more"),
         ("pace", -0.1, "pace: is -0.1; expected a number at least 0"),
         ("pace", float("nan"), "pace: is nan; expected"),
         ("process.A", 3, "process.A: is 3; expected a list, such as [[1.0, 0.3], [0.5, 1.001]]"),

@@ -99,6 +99,8 @@ class Observation:
     results: Path
     recording: bool
     live: str | None
+    shard: bool = False
+    """Whether the run is a shard of a larger one: it leaves its score to be merged, and is not steered by itself."""
 
 
 def briefs_of(
@@ -180,6 +182,7 @@ def briefs_of(
                 "recording": observation.recording,
                 "live": observation.live,
                 "operator": users[OPERATOR],
+                "shard": observation.shard,
             },
         ),
     ]
@@ -198,8 +201,13 @@ def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
 def write_briefs(scenario: Scenario, endpoint: str, results: Path, folder: Path) -> list[Path]:
     """Write the briefs into a folder, for processes that are started by hand; the observer's results go to `results`.
 
-    Raises UsageError if either folder has something in it or cannot be written.
+    Raises UsageError if either folder has something in it or cannot be written, and for a scenario in shards.
     """
+    if scenario.shards > 1:
+        raise UsageError(
+            f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
+            "itself, with its own --first-trial and --trials"
+        )
     new_folder(results)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)

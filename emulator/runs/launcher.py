@@ -7,9 +7,8 @@ Ctrl-C reaches the launcher only; each holds the other end of a pipe, so none ou
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import GRACE_SECONDS, Children, Exit, News
 from emulator.runs.folder import new_folder
 from emulator.runs.ports import check_endpoint, free_port
+from emulator.runs.private import private_folder
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
 from emulator.scenario import Scenario
@@ -45,13 +45,31 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
     view = choose(view)
     if listen is not None:
         check_endpoint(listen)
+    with stop_on_signals() as stop:
+        if scenario.shards == 1:
+            return launch_one(scenario, folder, view, listen, tell, stop)
+        from emulator.runs.shards import launch_shards  # noqa: PLC0415 - it launches each of them by the function below
+
+        return launch_shards(scenario, folder, view, listen, tell, stop)
+
+
+def launch_one(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Callable[[News], None],
+    stop: threading.Event,
+    shard: bool = False,
+) -> Ended:
+    """Run a scenario as `launch` does, on one router, until `stop` is set; shard: whether others carry further trials."""
     endpoint = listen or f"tcp/127.0.0.1:{free_port()}"
-    with stop_on_signals() as stop, _private_folder() as private:
+    with private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None))
+            briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None, shard))
             observer = briefs.pop(OBSERVER)
             with Children(folder / "logs", private) as children:
                 for brief in briefs.values():
@@ -74,17 +92,6 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
         finally:
             remove_control(folder)
     return Ended(status, viewer)
-
-
-@contextlib.contextmanager
-def _private_folder() -> Iterator[Path]:
-    """For the briefs: nobody else may look into it."""
-    try:
-        made = tempfile.TemporaryDirectory(prefix="evedrop-", ignore_cleanup_errors=True)
-    except OSError as error:
-        raise UsageError(f"no temporary folder can be made ({error.strerror}); set TMPDIR to one") from error
-    with made as private:
-        yield Path(private)
 
 
 def _forget(folder: Path) -> None:

@@ -36,6 +36,7 @@ from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
+from emulator.runs.shard_score import Score
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
 from emulator.scenario import Scenario
@@ -185,6 +186,8 @@ class Observation:
             return
         if order.request.do == "status":
             order.tell(self._status(conductor))
+        elif self._brief.part["shard"]:
+            order.refuse("this run is in shards, which are not steered; run it with --set shards=1 for that")
         else:
             self._steering.take(order, self._joiner.done)
 
@@ -276,6 +279,9 @@ class Observation:
     def finish(self, status: int, how: str) -> tuple[int, str]:
         """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
         safe = self._recording.close() if self._recording is not None else True
+        if self._brief.part["shard"]:
+            with suppress(OSError):  # of a full disk, which the summary says
+                Score(self._keeper.tallies, self._keeper.detection).leave(self.folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         ending = Ending(self._ended - self._started, how, replay_of(self.folder, self._scenario))
         summary = summary_of(

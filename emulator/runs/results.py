@@ -64,7 +64,7 @@ SENT = ("state", "innovation", "nothing")
 """What a packet was."""
 
 
-_NULLABLE = {
+NULLABLE = {
     "mean_squared_error",
     "mean_actual_trace_covariance",
     "expected_trace_covariance",
@@ -143,7 +143,7 @@ class _Table:
             return pa.BinaryArray.from_buffers(
                 field.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)]
             )
-        return pa.array(values, field.type, from_pandas=field.name in _NULLABLE)
+        return pa.array(values, field.type, from_pandas=field.name in NULLABLE)
 
     def close(self) -> None:
         try:
@@ -317,7 +317,7 @@ class Results:
             raise UsageError(
                 f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
             )
-        empty = [name for name in table.column_names if name not in _NULLABLE and table[name].null_count]
+        empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
         if empty:
             raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
         return table
@@ -359,6 +359,11 @@ def load_results(folder: str | Path) -> Results:
     try:
         summary = json.loads(path.read_text())
     except OSError as error:
+        if (Path(folder) / "shards").is_dir():
+            raise UsageError(
+                f"{folder} is of a run in shards that goes on or was killed; each of its shards is a results folder by "
+                f"itself when it has ended, such as {Path(folder) / 'shards' / '1'}"
+            ) from error
         raise UsageError(
             f"{folder} is no results folder ({path.name}: {error.strerror}); give the --out of a run"
         ) from error

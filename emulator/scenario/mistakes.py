@@ -131,6 +131,9 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials > 0:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
+    shards = tables.get("shards", 1)
+    if type(trials) is int and type(shards) is int and shards > trials > 0:
+        found.append(f"shards: is {shards}; expected at most trials, which is {trials}: a shard has one trial or more")
     if isinstance(tables.get("eavesdroppers", {}), dict):
         found += _strategy_mistakes(tables, slots)
     found += acknowledgement_mistakes(tables)

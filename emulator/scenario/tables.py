@@ -247,6 +247,7 @@ class Scenario(Table):
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
     first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
     record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
+    shards: Annotated[int, Field(ge=1, le=64, strict=True, examples=[2])] = 1
     pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
     slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
     secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
