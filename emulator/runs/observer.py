@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -26,13 +26,14 @@ from emulator.brief import Brief
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
-from emulator.network.access import LEGITIMATE, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, LEGITIMATE, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.session import Question, Session
 from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
+from emulator.runs.loop_tally import SolveTimes
 from emulator.runs.orders import Order
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
@@ -109,7 +110,10 @@ class Observation:
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials)
+        table, plant = scenario.controller, scenario.driven
+        loop = None if table is None or plant is None else (plant.inputs, table.period)
+        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop)
+        self._solve_times = SolveTimes()
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -123,13 +127,13 @@ class Observation:
 
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
-        self._writer = ResultsWriter(self.folder, self._scenario.receivers, self._shape[0])
+        self._writer = ResultsWriter.of(self.folder, self._scenario)
         return self._writer
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
         with Session(self._brief) as session:
-            conductor = Conductor(session, self._scenario.receivers, stop, self._beat)
+            conductor = Conductor(session, self._scenario.digested, stop, self._beat)
             if self._brief.part["recording"]:
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
@@ -142,7 +146,7 @@ class Observation:
                 self._control.write(self.folder)
                 conductor.start()
                 tell("started")
-                while self._joiner.done < self._scenario.slots:
+                while not self._joiner.complete(self._scenario.slots):
                     news = conductor.news()
                     if news is not None:
                         self._take(conductor, *news)
@@ -222,6 +226,8 @@ class Observation:
         if source == ROUTER:
             for name, account in self._joiner.journal(message).items():
                 self._keeper.tallies[name].count(account)
+        elif source == CONTROLLER:
+            self._solve_times.add(self._joiner.decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
@@ -241,7 +247,7 @@ class Observation:
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         if self._recording is not None:
-            self._recording.add(shown(slots, scored))
+            self._recording.add(shown(slots, scored, self._scenario.process.around))
         conductor.report(self._joiner.done)
         self._progress(scored)
 
@@ -291,6 +297,7 @@ class Observation:
             ending,
             events=self._events,
             detection=self._keeper.detection,
+            loop=None if self._keeper.loop is None else (self._keeper.loop, self._solve_times),
         )
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
@@ -313,6 +320,7 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
     """All rows of some slots."""
     for name, one in scored.items():
         writer.slot_rows(slots.first, name, one.sums, one.expected)
+    writer.input_rows(slots, first_trial)
     writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
     writer.journal_rows(slots)
 
@@ -346,14 +354,17 @@ def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -
     return Recording(path, scene, live)
 
 
-def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
-    """Some slots as the view takes them: the first recorded trial, and means over all."""
+def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float]) -> Any:
+    """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
+
+    around: the reference from which states are deviations, (n,).
+    """
     from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
     from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
 
     peers = {
         name: PeerSlots(
-            x_hat=receiver.x_hat[:, :, 0],
+            x_hat=receiver.x_hat[:, :, 0] + around,
             P=receiver.P[:, :, :, 0],
             action=receiver.action[:, 0],
             squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
@@ -362,4 +373,4 @@ def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
         )
         for name, receiver in slots.receivers.items()
     }
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0], nu=slots.nu[:, 0], peers=peers)
+    return ShownSlots(first=slots.first, x=slots.x[:, :, 0] + around, nu=slots.nu[:, 0], peers=peers)

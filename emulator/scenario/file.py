@@ -20,6 +20,7 @@ from pydantic import (
 from emulator.errors import ScenarioError, UsageError
 from emulator.model.registry import place_of
 from emulator.modules import named_in
+from emulator.scenario.disturbances import disturbances_beside, disturbances_read
 from emulator.scenario.dry_run import dry_run, foreign
 from emulator.scenario.mistakes import across_tables, sentences
 from emulator.scenario.recordings import beside, read_recordings
@@ -95,6 +96,7 @@ def parse(
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     beside(tables, folder)
+    disturbances_beside(tables, folder)
     for entry in ("secret_file", "modules"):
         if isinstance(tables.get(entry), str):
             tables[entry] = str((folder / tables[entry]).absolute())
@@ -119,7 +121,7 @@ def checked(
         tables.setdefault("modules", str(folder))
     if isinstance(tables.get("modules"), str):
         tables["modules"] = str(Path(tables["modules"]).absolute())
-    recordings = read_recordings(tables)
+    recordings = [*read_recordings(tables), *disturbances_read(tables)]
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:

@@ -23,9 +23,11 @@ from emulator.model.process import Process
 from emulator.model.schemes import SCHEMES, scheme_of
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.across import acknowledgement_mistakes, away_in, event_mistakes, link_mistakes
+from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
 from emulator.scenario.link_table import CorrelationTable, LinkTable
+from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
     SECRET_BYTES,
@@ -105,6 +107,8 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "event": EventTable,
         "correlation": CorrelationTable,
         "acknowledgements": AcknowledgementsTable,
+        "plant": PlantTable,
+        "controller": ControllerTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -137,6 +141,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
     if isinstance(tables.get("eavesdroppers", {}), dict):
         found += _strategy_mistakes(tables, slots)
     found += acknowledgement_mistakes(tables)
+    found += loop_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)
