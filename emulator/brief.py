@@ -27,7 +27,7 @@ _KINDS: Mapping[tuple[str, ...], type] = {
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
     "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller"),
-    "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart", "plant", "controller"),
+    "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart", "plant", "controller"),
     "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
     "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
@@ -44,6 +44,8 @@ class Flow:
     """The sensor stays at most this far ahead of the slowest receiver and of the observer."""
     batch: int
     """Telemetry, journal and progress are sent at least this often."""
+    patience: float = 30.0
+    """Seconds for which a process may be cut off before that ends the run."""
 
 
 @dataclass(frozen=True)

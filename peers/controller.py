@@ -10,9 +10,10 @@ from emulator.model.controllers.controller import Assignment
 from emulator.model.plant import Plant
 from emulator.network.access import CONTROLLER
 from emulator.network.reporting import DecisionReporter
+from emulator.network.resending import Due
 from emulator.network.session import Session
 from emulator.network.wire import Reader, decided, read_known
-from peers.loop import disturbances_in
+from peers.loop import disturbances_in, kept_decisive
 
 
 def steer(brief: Brief) -> None:
@@ -25,15 +26,19 @@ def steer(brief: Brief) -> None:
     on_truth = part["acts_on"] == "truth"
     with Session(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
-        inbox, put = session.inbox(key), session.outlet(session.keys.input)
-        telemetry = session.outlet(session.keys.telemetry(CONTROLLER))
+        inbox, put = session.inbox(key), kept_decisive(session, session.keys.input, brief, assignment.period)
+        # Slots are joined without its reports, so all that is kept is sent again.
+        kept = brief.flow.window + 1 + assignment.period
+        telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
+        due = Due(key, brief.flow.patience)
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):
-            x = read_known(Reader(key, inbox.recv().payload.to_bytes()), name, k, (process.n, brief.trials))
+            message = due.take(lambda: Reader(key, inbox.recv().payload.to_bytes()), k)
+            x = read_known(message, name, k, (process.n, brief.trials))
             began = time.perf_counter()
             u = controller.decide(k, x, disturbances[k])
             took = time.perf_counter() - began
-            put(decided(k, u, controller.failed))
+            put(k, decided(k, u, controller.failed))
             reporter.add(k, u, controller.failed, took)
         session.wait_for("end")

@@ -11,9 +11,11 @@ import numpy as np
 from emulator.brief import Brief
 from emulator.model.follower import Follower
 from emulator.model.receiver import Belief, Receiver
+from emulator.model.transit import Arrival
 from emulator.network.reporting import BeliefReporter
+from emulator.network.resending import Due
 from emulator.network.session import Session
-from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_delivery
+from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_acknowledgement, read_delivery
 from peers.loop import Consultation
 
 
@@ -26,6 +28,7 @@ def follow(
     """Run a receiver over all slots of its brief, but for those in which it is away.
 
     It may acknowledge what it receives, and be consulted by a controller.
+    What it has had already is acknowledged once more and else ignored.
     """
     name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part["window"]
     outages = {start: (stop, keeps) for start, stop, keeps in brief.part["outages"]}
@@ -35,41 +38,72 @@ def follow(
     with Session(brief) as session:
         downlink = session.keys.downlink(name)
         deliveries = session.inbox(downlink)
-        put_telemetry = session.outlet(session.keys.telemetry(name))
+        put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in outages.items() for slot in (start, stop)]
-        put_progress = session.outlet(session.keys.progress(name))
-        put_acknowledgement = session.outlet(session.keys.acknowledged) if acknowledges else None
-        consultation = consult(session) if consult is not None else None
+        put_progress = session.kept(session.keys.progress(name), 0)
+        answers = Answers(brief, session, acknowledges, None if consult is None else consult(session))
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
+        due = Due(downlink, brief.flow.patience)
         session.ready()
         k = brief.first
         while k < brief.slots:
             message = Reader(downlink, deliveries.recv().payload.to_bytes())
+            found = message.integer("k")
             if is_hold(message):
-                if message.slot(k) in outages:
+                if found != k:
+                    due.missed(k, found)
+                    continue
+                if k in outages:
                     # Before the report that the conductor waits for: it may end this process at once.
                     _save(brief, follower.belief)
-                    put_telemetry(leaving(k, follower.belief))
+                    put_telemetry(k, leaving(k, follower.belief))
                 reporter.flush(k)
                 if outages.get(k, (0, False))[0] >= brief.slots:
                     break
                 continue
-            if k in outages:  # back from a pause
+            if k in outages and found >= k:  # back from a pause
                 stop, _ = outages[k]
                 follower.miss(range(k, stop))
                 reporter.skip(stop)
                 k = stop
+            if found != k:
+                if found < k:
+                    answers.had(found, message)
+                due.missed(k, found)
+                continue
             arrival = read_delivery(message, k, shape, brief.model.header)
-            if put_acknowledgement is not None:
-                put_acknowledgement(acknowledgement(k, arrival.heard.gamma))
-            if consultation is not None:
-                consultation.before(k)
+            answers.before(k, arrival)
             belief = follower.take(k, arrival)
-            if consultation is not None:
-                consultation.after(k, belief)
+            answers.after(k, belief)
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
         session.wait_for("end")
+
+
+class Answers:
+    """What a receiver says to others than the observer: acknowledgements, and its estimate to a controller. Final."""
+
+    def __init__(self, brief: Brief, session: Session, acknowledges: bool, consultation: Consultation | None) -> None:
+        self._trials = brief.trials
+        self._acknowledge = session.outlet(session.keys.acknowledged) if acknowledges else None
+        self._consultation = consultation
+
+    def had(self, k: int, delivery: Reader) -> None:
+        """A delivery of slot k has come once more: the first acknowledgement may have been lost."""
+        if self._acknowledge is not None:
+            self._acknowledge(acknowledgement(k, read_acknowledgement(delivery, k, self._trials)))
+
+    def before(self, k: int, arrival: Arrival) -> None:
+        """Slot k's delivery is here."""
+        if self._acknowledge is not None:
+            self._acknowledge(acknowledgement(k, arrival.heard.gamma))
+        if self._consultation is not None:
+            self._consultation.before(k)
+
+    def after(self, k: int, belief: Belief) -> None:
+        """Slot k's delivery has been dealt with."""
+        if self._consultation is not None:
+            self._consultation.after(k, belief)
 
 
 def _save(brief: Brief, belief: Belief) -> None:

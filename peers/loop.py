@@ -13,6 +13,7 @@ from emulator.model.informed import Informed
 from emulator.model.plant import Drive, Plant
 from emulator.model.process import Floats
 from emulator.model.receiver import Belief, Flags, Receiver
+from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
 from emulator.network.wire import Reader, known, read_decided
 
@@ -22,19 +23,25 @@ def disturbances_in(text: str, slots: int) -> Floats:
     return np.frombuffer(b64decode(text), "<f8").reshape(slots, -1)
 
 
+def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> Kept:
+    """An outlet of what is said in decision slots: what is said in one may be needed until the next."""
+    return session.kept(key, brief.flow.window + 1 + period, back=period)
+
+
 class Decided:
     """What the controller decides, as it comes in every period slots. Final."""
 
-    def __init__(self, session: Session, period: int, shape: tuple[int, int]) -> None:
+    def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
         self._key = session.keys.input
         self._inbox = session.inbox(self._key)
+        self._due = Due(self._key, patience)
         self._now: tuple[Floats, Flags]
 
     def of(self, k: int) -> tuple[Floats, Flags]:
         """The inputs (m, R) of slot k, and where their decision failed, (R,); slots come in order."""
         if k % self._period == 0:
-            message = Reader(self._key, self._inbox.recv().payload.to_bytes())
+            message = self._due.take(lambda: Reader(self._key, self._inbox.recv().payload.to_bytes()), k)
             self._now = read_decided(message, k, self._shape)
         return self._now
 
@@ -52,8 +59,10 @@ class Actuator:
         self._put = None
         if loop is not None:
             self._period = loop["period"]
-            self._decided = Decided(session, self._period, (plant.inputs, brief.trials))
-            self._put = session.outlet(session.keys.state) if loop["acts_on"] == "truth" else None
+            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.patience)
+            self._put = (
+                kept_decisive(session, session.keys.state, brief, self._period) if loop["acts_on"] == "truth" else None
+            )
 
     def pushed(self, k: int) -> Floats:
         """What moves the state into slot k, as `Trajectory.advance` takes it."""
@@ -65,7 +74,7 @@ class Actuator:
             return None
         decides = k % self._period == 0
         if decides and self._put is not None:
-            self._put(known("x", k, x))
+            self._put(k, known("x", k, x))
         steered = self._decided.of(k)
         if decides:
             self._drive.hold(steered[0])
@@ -78,11 +87,15 @@ class Consultation:
     def __init__(self, brief: Brief, session: Session, receiver: Receiver) -> None:
         loop: Mapping[str, Any] = brief.part["controller"]
         self._period = loop["period"]
-        self._put = session.outlet(session.keys.estimate) if loop["acts_on"] == "estimate" else None
+        self._put = (
+            kept_decisive(session, session.keys.estimate, brief, self._period)
+            if loop["acts_on"] == "estimate"
+            else None
+        )
         self._told: tuple[Informed, Decided] | None = None
         if isinstance(receiver, Informed):
             shape = (len(loop["plant"]["input_lower"]), brief.trials)
-            self._told = receiver, Decided(session, self._period, shape)
+            self._told = receiver, Decided(session, self._period, shape, brief.flow.patience)
 
     def before(self, k: int) -> None:
         """Learn the inputs that led into slot k."""
@@ -93,4 +106,4 @@ class Consultation:
     def after(self, k: int, belief: Belief) -> None:
         """Say what is believed after slot k."""
         if self._put is not None and k % self._period == 0:
-            self._put(known("x_hat", k, belief.x_hat))
+            self._put(k, known("x_hat", k, belief.x_hat))

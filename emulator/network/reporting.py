@@ -32,7 +32,7 @@ class TruthReporter:
     def __init__(
         self,
         brief: Brief,
-        put: Callable[[bytes], None],
+        put: Callable[[int, bytes], None],
         may_be_silent: bool = False,
         watches: bool = False,
         inputs: int = 0,
@@ -77,14 +77,14 @@ class TruthReporter:
                 None if column is None else column[rows] for column in (self._sent, self._alarms, self._failed)
             )
             u = None if self._u is None else self._u[rows]
-            self._put(Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed).pack())
+            self._put(end - 1, Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed).pack())
         self._first = end
 
 
 class DecisionReporter:
     """The controller's reports: how long it took to decide, and digests of what was decided. Final."""
 
-    def __init__(self, brief: Brief, put: Callable[[bytes], None], inputs: int, period: int) -> None:
+    def __init__(self, brief: Brief, put: Callable[[int, bytes], None], inputs: int, period: int) -> None:
         self._brief, self._put, self._period = brief, put, period
         self._log = InputLog(inputs, brief.trials, brief.slots)
         self._digests: dict[int, Digests] = {}
@@ -99,21 +99,22 @@ class DecisionReporter:
         self._seconds.append(seconds)
         if end // batch > self._first // batch or end == self._brief.slots:
             seconds_taken = np.array(self._seconds)
-            self._put(Decisions(self._first, end - self._first, seconds_taken, self._digests).pack())
+            self._put(end - 1, Decisions(self._first, end - self._first, seconds_taken, self._digests).pack())
             self._first, self._seconds, self._digests = end, [], {}
 
 
 class BeliefReporter:
     """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress. Final.
 
-    cuts: where it goes away or is back; first: its first slot; counts_late: whether it can make use of late packets.
+    put, put_progress: take the last slot that a message tells of, and the message. cuts: where it goes away or is back;
+    first: its first slot; counts_late: whether it can make use of late packets.
     """
 
     def __init__(
         self,
         brief: Brief,
-        put: Callable[[bytes], None],
-        put_progress: Callable[[bytes], None],
+        put: Callable[[int, bytes], None],
+        put_progress: Callable[[int, bytes], None],
         cuts: Iterable[int] = (),
         first: int = 0,
         counts_late: bool = False,
@@ -136,12 +137,12 @@ class BeliefReporter:
         if digests is not None or is_due(self._brief, k):
             self._report(k + 1, {} if digests is None else dict([digests]))
         if is_due(self._brief, k):
-            self._put_progress(progress(k + 1))
+            self._put_progress(k, progress(k + 1))
 
     def flush(self, end: int) -> None:
         """Report all slots below `end`, and that they are done."""
         self._report(end, {})
-        self._put_progress(progress(end))
+        self._put_progress(end - 1, progress(end))
 
     def skip(self, end: int) -> None:
         """Go on from slot `end`: somebody else reports the slots before it, in which this receiver was not there."""
@@ -163,5 +164,5 @@ class BeliefReporter:
             digests,
             None if self._late is None else self._late[1, row : row + end - self._first],
         )
-        self._put(report.pack())
+        self._put(end - 1, report.pack())
         self._first = end

@@ -165,9 +165,14 @@ class Joiner:
         """The first slot that the sensor has not reported."""
         return self._truth.end
 
+    @property
+    def journaled(self) -> int:
+        """The first slot that the router has not journaled."""
+        return self._journal.end
+
     def reported(self, name: str) -> int:
-        """The first slot that a receiver has not reported."""
-        return self._reports[name].end
+        """The first slot that a receiver, or the controller, has not reported."""
+        return self._decided if name == CONTROLLER else self._reports[name].end
 
     def complete(self, slots: int) -> bool:
         """Whether so many slots have been given back, and a controller has reported them."""

@@ -111,6 +111,7 @@ def summary_of(
     events: Sequence[Mapping[str, Any]] = (),
     detection: Detection | None = None,
     loop: tuple[LoopTally, SolveTimes] | None = None,
+    outages: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
     expected = expectations_of(scenario)
@@ -143,6 +144,7 @@ def summary_of(
         "peers": peers,
         "links": links,
         "events": list(events),
+        "outages": list(outages),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
         "controller": None
