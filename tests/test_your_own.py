@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Evedrop
+from tests.conftest import Evedrop
 
 from emulator.runs.results import load_results
 
