@@ -290,7 +290,7 @@ def check(options: argparse.Namespace) -> int:
 
     names = {kind: name for kind in ("scheme", "eavesdropper", "link", "delay") if (name := getattr(options, kind))}
     if bool(names) == bool(options.scenarios):
-        raise UsageError("evedrop check: expected scenarios, or classes by --scheme, --eavesdropper, --link or --delay")
+        raise UsageError("check: expected scenarios, or classes by --scheme, --eavesdropper, --link or --delay")
     if names:
         return _check_classes(names, _changes(options))
     status = 0

@@ -10,7 +10,7 @@ import pytest
 from emulator.conformance.eavesdroppers import Listening, eavesdropper_verdicts
 from emulator.conformance.examine import examined
 from emulator.conformance.links import DelayChecks, LossChecks
-from emulator.conformance.rules import Verdict
+from emulator.conformance.rules import Broken, Verdict
 from emulator.conformance.schemes import scheme_verdicts
 from emulator.errors import UsageError
 from emulator.model.delays import DELAY_MODELS
@@ -24,6 +24,7 @@ from emulator.model.links.gilbert_elliott import GilbertElliott
 from emulator.model.links.link import fates_of
 from emulator.model.process import Floats, Process
 from emulator.model.receiver import Belief, Codes, Flags, Heard
+from emulator.model.registry import asked
 from emulator.model.schemes import SCHEMES
 from emulator.model.schemes.cipher import Cipher, CipherEstimator
 from emulator.model.schemes.innovation import Innovation, SharedSecret
@@ -337,3 +338,44 @@ def test_what_cannot_be_checked_is_refused(names: dict[str, str], parameters: di
         list(examined(names, parameters))
     assert said in str(caught.value)
     assert caught.value.exit_status == 2
+
+
+class Chained(Bernoulli):
+    """Says that its losses follow a number."""
+
+    chain: Any = 3
+
+
+class Anywhen(Naive):
+    """Is told the state of no slot that there is."""
+
+    @classmethod
+    def betrayed(cls, parameters: Any) -> Any:
+        """No slot."""
+        del parameters
+        return "three"
+
+
+class Silent(Naive):
+    """Has nothing to say of its parameters, and no list to say it with."""
+
+    @classmethod
+    def mistakes(cls, given: Any) -> Any:
+        """Nothing."""
+        del given
+
+
+def test_whatever_a_class_says_of_itself_is_a_verdict() -> None:
+    """Nothing that it returns ends the check by an error; once shapes are wrong, no other rule is asked."""
+    (verdict,) = LossChecks(lambda: Chained(0.9), Chained).verdicts()
+    assert verdict.rule == "shapes and types"
+    assert "'int' object has no attribute 'transitions'" in str(verdict.broken)
+    listening = Listening("anywhen", Anywhen, {}, lambda process: Innovation(process, 0.6), Innovation)
+    with pytest.raises(Broken, match=r"betrayed\(\) is 'three'; expected a slot"):
+        eavesdropper_verdicts(listening)
+    assert asked(Silent, {"depth": 3}) == [
+        (
+            "depth",
+            "cannot be checked: Silent.mistakes returned None; expected it to return a list of (entry, what is wrong)",
+        )
+    ]

@@ -300,59 +300,6 @@ def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
     assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another figure")
 
 
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        (
-            {
-                "legitimate.link.delay": {"model": "constant", "value": 1.0},
-                "legitimate.window": 2,
-                "event": [{"from": 10, "to": 20, "kill": "legitimate"}],
-            },
-            "there is no theory for legitimate with these links, attacks and events together",
-        ),
-        (
-            {
-                "encoding": {"scheme": "acknowledged"},
-                "eavesdroppers": {"smart": {"strategy": "reference", "link": {"quality": 0.9}}},
-                "acknowledgements": {"link": {"quality": 0.9}, "attack": "all"},
-                "event": [{"from": 10, "to": 20, "jam": "acknowledgements"}],
-            },
-            "there is no theory for smart with these links, attacks and events together",
-        ),
-    ],
-)
-def test_an_expectation_that_events_leave_without_theory_is_refused(changes: dict[str, Any], why: str) -> None:
-    """What would come out as null is refused, also where link and strategy by themselves have a theory."""
-    figure = f"{why.split()[5]}.expected_trace_covariance"
-    (line,) = mistakes({**changes, "expect": [{"figure": figure, "below": 1.0}]})
-    assert line == f'expect.0.figure: is "{figure}", but {why}; expected another figure'
-    without = {name: value for name, value in changes.items() if name != "event"}
-    assert parse(tomli_w.dumps({**GOOD}), "scenario", {**without, "expect": [{"figure": figure, "below": 1.0}]})
-
-
-@pytest.mark.parametrize(
-    ("event", "away"),
-    [
-        ({"from": 10, "to": 20, "kill": "spy"}, "down (event.0, from slot 10 on)"),
-        ({"at": 15, "pause": "spy"}, "paused (event.0, from slot 15 on)"),
-        ({"from": 16, "to": 20, "kill": "spy"}, None),
-        ({"from": 10, "to": 15, "pause": "spy"}, None),
-        ({"from": 10, "to": 20, "kill": "legitimate"}, None),
-        ({"from": 10, "to": 20, "cut": "spy"}, None),
-    ],
-)
-def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | None) -> None:
-    """A slot in which it is down or paused is a mistake; a link that is cut is none, for it is not told over that."""
-    spy = {"strategy": "replay-informed", "reads_as": "naive", "learns_at": 15, "link": {"quality": 0.8}}
-    changes = {"eavesdroppers": {"spy": spy}, "event": [event]}
-    if away is None:
-        assert parse(tomli_w.dumps(GOOD), "scenario", changes).leaks == {"spy": 15}
-    else:
-        (line,) = mistakes(changes)
-        assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is there"
-
-
 def test_more_slots_than_the_horizon_are_refused() -> None:
     """The bound and three ways out are named, and the bound is exact."""
     (said,) = mistakes({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})

@@ -12,7 +12,10 @@ from typing import Any
 import pytest
 from tests.conftest import Evedrop
 
+from emulator.errors import ScenarioError
 from emulator.runs.results import load_results
+from emulator.scenario import load
+from emulator.scenario.amended import with_event
 
 PAGE = Path(__file__).parents[1] / "docs" / "your-own.md"
 BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -302,6 +305,24 @@ def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
         assert done.status == 3
         assert "ZeroDivisionError: division by zero" in done.err
         assert "tires.py" in done.err
+
+
+def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedrop) -> None:
+    """The router knows where the run's modules are; a run that was started without any gets none on the way."""
+    shifts = {"link": "legitimate", "set": {"loss": {"model": "shifts:Shifts", "period": 10, "good": 0.9, "bad": 0.1}}}
+    scenario = load(tutorial.folder / "three.toml")
+    assert with_event(scenario, shifts, 30).event[0].set == shifts["set"]
+    with pytest.raises(ScenarioError, match="set: names shifts:Shifts, and the run was started without modules"):
+        with_event(load("vehicle"), shifts, 30)
+    event = 'event=[{from = 5, to = 15, kill = "tracker"}, {at = 10, link = "naive", set = {loss = {model = "shifts:Shifts", '
+    event += "period = 10, good = 0.9, bad = 0.1}}}]"
+    for name, command in (
+        ("live", ("run", "--view", "off", "--set", "trials=2")),
+        ("memory", ("montecarlo", "--trials", "2")),
+    ):
+        words = (command[0], "three.toml", *command[1:], "--slots", "30", "--out", name, "--set", event)
+        assert tutorial(*words).status == 0
+    assert digests(tutorial.folder / "live") == digests(tutorial.folder / "memory")
 
 
 def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:

@@ -51,7 +51,10 @@ class Listening:
     def betrayed(self) -> int | None:
         """The slot whose state it is told."""
         with calling("betrayed()", self.kind):
-            return self.kind.betrayed(self.parameters)
+            slot = self.kind.betrayed(self.parameters)
+        if slot is not None and (type(slot) is not int or slot < 0):
+            raise Broken(f"betrayed() is {slot!r}; expected a slot, from 0 on, or None")
+        return slot
 
     def steps(self, problem: Problem, rubbish: float = 0.0) -> Iterator[tuple[Slot, Step]]:
         """Every slot of the scheme, and what it makes of it."""
@@ -74,17 +77,15 @@ def eavesdropper_verdicts(listening: Listening) -> list[Verdict]:
     checks = EavesdropperChecks(listening)
     at = listening.betrayed
     slots = 0 if at is None else min(at + 3, 200)
-    return judged(
-        [
-            ("shapes and types", checks.shapes),
-            ("the same eavesdropper made twice", checks.twice),
-            ("a trial by itself", checks.alone),
-            ("a slot asked for again", checks.again),
-            ("packets that were lost", checks.lost),
-            ("actions that γ tells", checks.actions),
-        ],
-        small(slots),
-    ) + judged([("what it says to theory", checks.theory)], large())
+    exact = [
+        ("shapes and types", checks.shapes),
+        ("the same eavesdropper made twice", checks.twice),
+        ("a trial by itself", checks.alone),
+        ("a slot asked for again", checks.again),
+        ("packets that were lost", checks.lost),
+        ("actions that γ tells", checks.actions),
+    ]
+    return judged((exact, small(slots)), ([("what it says to theory", checks.theory)], large()))
 
 
 class EavesdropperChecks:

@@ -18,7 +18,7 @@ from emulator.errors import UsageError
 from emulator.model.delays import DELAY_MODELS
 from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.links import LOSS_MODELS
-from emulator.model.registry import NotRegistered, Registry
+from emulator.model.registry import NotRegistered, Registry, asked
 from emulator.model.schemes import SCHEMES, scheme_of
 from emulator.modules import look_in
 
@@ -82,11 +82,7 @@ def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
     except NotRegistered as error:
         why = error.why or f" is none; expected MODULE:CLASS, or {', '.join(registry.names)}"
         raise UsageError(f"--{option} {error.name}{why}") from error
-    try:
-        with calling(f"{kind.__name__}.mistakes()", kind):
-            wrong = [f"{entry}: {what}" for entry, what in kind.mistakes(given)]
-    except Broken as error:
-        raise UsageError(f"--{option} {name}: {error}") from error
+    wrong = [f"{entry}: {what}" for entry, what in asked(kind, given)]
     if wrong:
         raise UsageError(f"--{option} {name}: {'; '.join(wrong)}; give others by --set")
     return _Named(name, kind, given)

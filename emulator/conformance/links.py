@@ -45,16 +45,14 @@ class LossChecks:
 
     def verdicts(self) -> list[Verdict]:
         """Every rule, on small problems."""
-        return judged(
-            [
-                ("shapes and types", self.shapes),
-                ("the same link made twice", self.twice),
-                ("a trial by itself", self.alone),
-                ("slots in pieces", self.pieces),
-                ("a copy that goes on", self.copied),
-            ],
-            small(),
-        ) + judged([("the quality it says", self.rate)], [_long(one) for one in large()])
+        exact = [
+            ("shapes and types", self.shapes),
+            ("the same link made twice", self.twice),
+            ("a trial by itself", self.alone),
+            ("slots in pieces", self.pieces),
+            ("a copy that goes on", self.copied),
+        ]
+        return judged((exact, small()), ([("the quality it says", self.rate)], [_long(one) for one in large()]))
 
     def _made(self) -> LossModel:
         with calling(f"{self._kind.__name__}(…)", self._kind):
@@ -173,10 +171,12 @@ class DelayChecks:
 
     def verdicts(self) -> list[Verdict]:
         """Every rule, on small problems."""
-        return judged(
-            [("shapes and types", self.shapes), ("a trial by itself", self.alone), ("slots in pieces", self.pieces)],
-            small(),
-        ) + judged([("the delays it says", self.law)], large())
+        exact = [
+            ("shapes and types", self.shapes),
+            ("a trial by itself", self.alone),
+            ("slots in pieces", self.pieces),
+        ]
+        return judged((exact, small()), ([("the delays it says", self.law)], large()))
 
     def _delays(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
         reader, parts = BlockReader(key("delay"), problem.batch, 1), []

@@ -128,18 +128,24 @@ Rule = tuple[str, Callable[[Any], None]]
 """A title, and a check of one problem that raises Broken."""
 
 
-def judged(rules: Sequence[Rule], problems: Sequence[Any]) -> list[Verdict]:
-    """Every rule on every problem, until one breaks it; if the first rule is broken, the others are not asked."""
+def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[Verdict]:
+    """Every rule on every problem of its group, until one breaks it; once the very first is broken, no other is asked."""
     verdicts: list[Verdict] = []
-    for title, check in rules:
-        broken = None
-        for problem in problems:
-            try:
-                check(problem)
-            except Broken as error:
-                broken = f"{problem}: {error}"
-                break
-        verdicts.append(Verdict(title, broken))
-        if verdicts[0].broken is not None:
-            break
+    for rules, problems in groups:
+        for title, check in rules:
+            broken = next((how for problem in problems if (how := _how_broken(check, problem)) is not None), None)
+            verdicts.append(Verdict(title, broken))
+            if verdicts[0].broken is not None:
+                return verdicts
     return verdicts
+
+
+def _how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
+    try:
+        check(problem)
+    except Broken as error:
+        return f"{problem}: {error}"
+    except Exception as error:
+        # What it gave us may break at any place, ours included.
+        return f"{problem}: what it returned led to {place_of(error)}; expected what the base class describes"
+    return None

@@ -51,6 +51,20 @@ def place_of(error: BaseException, file: str | None = None) -> str:
     return f"{type(error).__name__}: {error}{where}" if str(error) else f"{type(error).__name__}{where}"
 
 
+def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a class says is wrong with parameters that it has, (entry, what), be the class anybody's."""
+    entry = next(iter(given), "parameters")
+    wanted = "expected it to return a list of (entry, what is wrong)"
+    try:
+        found = model.mistakes(given)
+    except Exception as error:
+        file = getattr(sys.modules.get(model.__module__), "__file__", None)
+        return [(entry, f"cannot be checked: {model.__name__}.mistakes raised {place_of(error, file)}; {wanted}")]
+    if not isinstance(found, list) or not all(isinstance(one, tuple) and len(one) == 2 for one in found):
+        return [(entry, f"cannot be checked: {model.__name__}.mistakes returned {found!r}; {wanted}")]
+    return [(str(name), str(what)) for name, what in found]
+
+
 class Registry(Mapping[str, type[T]], Generic[T]):
     """Name → class, of one kind. Final. To be gone through are the built-in ones alone; any other can be asked for.
 

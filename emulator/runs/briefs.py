@@ -131,6 +131,11 @@ def briefs_of(
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
     loop = LoopBriefs(scenario)
 
+    def imports(process: str, part: Mapping[str, Any]) -> bool:
+        """Whether a process may need a class that is not built in. Of links, somebody may set another while the run goes on."""
+        own = process != OBSERVER and (process == ROUTER or any(named_in(part)))
+        return own and scenario.modules is not None
+
     def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
         return Brief(
             run=run,
@@ -146,7 +151,7 @@ def briefs_of(
             flow=flow_of(scenario),
             model=model,
             keys={name: key.hex() for name, key in owned.items()},
-            part={**part, "modules": scenario.modules} if any(named_in(part)) and process != OBSERVER else part,
+            part={**part, "modules": scenario.modules} if imports(process, part) else part,
             ends_with_stdin=ends_with_stdin,
         )
 

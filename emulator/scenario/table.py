@@ -17,7 +17,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from emulator.model.registry import NotRegistered, Registry, place_of
+from emulator.model.registry import NotRegistered, Registry, asked
 from emulator.network.access import RESERVED
 from emulator.scenario.words import as_toml, listed, near
 
@@ -67,17 +67,6 @@ def _no_class(name: Any, classes: Registry[Any]) -> str | None:
     except NotRegistered as error:
         return error.why
     return None
-
-
-def asked(model: Any, given: Mapping[str, Any]) -> list[Found]:
-    """What a class says is wrong with parameters that it has, be the class anybody's."""
-    try:
-        return [(str(entry), str(what)) for entry, what in model.mistakes(given)]
-    except Exception as error:
-        what = (
-            f"cannot be checked: {model.__name__}.mistakes raised {place_of(error)}; expected it to return a list of "
-        )
-        return [(next(iter(given), "parameters"), f"{what}(entry, what is wrong)")]
 
 
 def _process_name(name: str) -> str:

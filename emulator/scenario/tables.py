@@ -20,7 +20,7 @@ from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.link import Course
 from emulator.model.plant import Plant
 from emulator.model.process import Process, mistakes_of
-from emulator.model.registry import is_own
+from emulator.model.registry import asked, is_own
 from emulator.model.schemes import SCHEMES
 from emulator.modules import elsewhere, look_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
@@ -35,7 +35,6 @@ from emulator.scenario.table import (
     Probability,
     ProcessName,
     Table,
-    asked,
     numbers,
     one_of,
     registered,
