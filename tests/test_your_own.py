@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.conftest import Evedrop
 
 from emulator.errors import ScenarioError
 from emulator.runs.results import load_results
 from emulator.scenario import load
 from emulator.scenario.amended import with_event
+from tests.conftest import Evedrop
 
 PAGE = Path(__file__).parents[1] / "docs" / "your-own.md"
 BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -152,6 +152,27 @@ class Downlink:
             self._put(hold(k), 0.0)
 
 
+class Burst:
+    """Deliveries to who keeps nobody waiting, passed on many at a time. Final.
+
+    Where the sensor waits for somebody in every slot, a message by itself costs a receiver's waking up, and most of the time.
+    """
+
+    def __init__(self, put: Callable[[bytes], None]) -> None:
+        self._put = put
+        self._held: list[bytes] = []
+
+    def hold(self, payload: bytes, _: float) -> None:
+        """Take one."""
+        self._held.append(payload)
+
+    def flush(self) -> None:
+        """Pass on all that are held."""
+        for payload in self._held:
+            self._put(payload)
+        self._held.clear()
+
+
 class WayBackLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and who attacks it. Final."""
 
@@ -214,9 +235,13 @@ class Routing:
         self._due = Due(session.keys.uplink, brief.flow.patience)
         self._put_journal = session.outlet(session.keys.journal)
         postman = Postman() if brief.part["pace"] else None
+        self._bursts: list[Burst] = []
 
         def outlet(name: str, course: Course) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
+            if postman is None and brief.part["controller"] is not None and not self._is_waited_for(name):
+                self._bursts.append(Burst(put))
+                return self._bursts[-1].hold
             delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
             return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
 
@@ -231,6 +256,14 @@ class Routing:
         self._stale = False
         """Whether what comes is of no interest until it is said to come once more."""
         self._begin(0, 0)
+
+    def _is_waited_for(self, receiver: str) -> bool:
+        """Whether the sensor waits in some slots for what a receiver makes of them."""
+        part = self._brief.part
+        wiring = Wiring(**part["controller"])
+        return receiver == LEGITIMATE and (
+            not wiring.on_truth or wiring.knows_input or part["acknowledgements"] is not None
+        )
 
     def carry_on(self) -> None:
         """Route all slots, once more as often as it is asked for, until the conductor's end."""
@@ -248,6 +281,7 @@ class Routing:
         done: all slots below have been delivered, acknowledged and journaled.
         """
         self._stale = False
+        self._flush()  # of no use to anybody, but in no way of what comes now
         self._k, self._done, self._journaled = start, done, start
         self._downlinks = {
             name: Downlink(name, course, self._brief, self._outlets[name]) for name, course in self._courses.items()
@@ -287,6 +321,7 @@ class Routing:
             return
         self._route(k, message)
         if k + 1 == self._slots.stop:
+            self._flush()
             self._journal(k + 1)
             self._plan(k + 1)
 
@@ -300,6 +335,10 @@ class Routing:
         if self._way_back is not None and not known:
             self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
         self._k = k + 1
+
+    def _flush(self) -> None:
+        for burst in self._bursts:
+            burst.flush()
 
     def _once_more(self, message: Reader) -> None:
         """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
@@ -325,6 +364,7 @@ class Routing:
         """Pass a mark on, and do what the conductor says until it lets us go on."""
         for downlink in self._downlinks.values():
             downlink.mark(k)
+        self._flush()
         while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
             if command.text("do") == "change":
                 self._amend(command.text("link"), k, tuple(_change(one) for one in command.maps("changes")))

@@ -73,7 +73,7 @@ def launch_one(
         try:
             briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None, shard))
             observer = briefs.pop(OBSERVER)
-            with Children(folder / "logs", private) as children:
+            with Children(folder / "logs", private, scenario.controller is not None) as children:
                 for brief in briefs.values():
                     children.start(brief)
                 # The others find their feet while the viewer does; only the observer must know it.

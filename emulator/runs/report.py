@@ -131,6 +131,8 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
                 f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
             )
+    if summary["controller"] is not None:
+        console.print(_loop_line(summary["controller"]))
     for verdict in summary["secrecy"].values():
         console.print(verdict["sentence"])
     for name, peer in summary["peers"].items():
@@ -153,6 +155,22 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def _loop_line(controller: News) -> str:
+    """What became of a closed loop."""
+    errors = ", ".join(
+        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller["mean_squared_errors"].items()
+    )
+    line = (
+        f"controller {controller['strategy']}, {controller['decisions']:,} decisions; the estimator's error is {errors}"
+    )
+    failed, clipped = controller["failed_fraction"], controller["clipped_fraction"]
+    if failed:
+        line += f"; {failed:.2%} of inputs were held because a decision failed"
+    if clipped:
+        line += f"; {clipped:.2%} were clipped by the plant"
+    return line
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
