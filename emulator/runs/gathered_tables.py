@@ -108,11 +108,8 @@ class _Rows:
 class Statistics(Gathered):
     """Of every slot: means over trials are weighted by them, and standard errors pooled. Final."""
 
-    _TAKEN = (
-        "expected",
-        "error_quantile",
-        "trace_quantile",
-    )  # theory, the same for all; and what a live run has none of
+    # Theory, which is the same for all, and what a live run has none of.
+    _TAKEN = ("expected", "error_quantile", "trace_quantile")
 
     def __init__(self, receivers: Sequence[str]) -> None:
         super().__init__(receivers, 200.0)

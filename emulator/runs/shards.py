@@ -79,6 +79,7 @@ class OneProgress:
 
     def __init__(self, shards: Sequence[Shard], tell: Callable[[News], None]) -> None:
         self._trials = {shard.number: shard.scenario.trials for shard in shards}
+        self._slots = shards[0].scenario.slots
         self._tell = tell
         self._lock = threading.Lock()
         self._latest: dict[int, News] = {}
@@ -107,6 +108,8 @@ class OneProgress:
             if len(self._latest) == len(self._trials):
                 self._tell(self._all())
         else:
+            if kind == "ended" and number in self._latest:  # its last slots were too few to be told of
+                self._latest[number] = {**self._latest[number], "done": self._slots}
             self._tell(news)
 
     def _all(self) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def test_shards_are_contiguous_and_as_equal_as_can_be() -> None:
 def test_progress_is_that_of_the_slowest() -> None:
     """Nothing is told before all have begun, and never more than all have done."""
     told: list[Mapping[str, Any]] = []
-    shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2}), Path("run"))
+    shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
     one = OneProgress(shards, told.append)
     first, second = (one.of(shard) for shard in shards)
     first({"event": "started"})
@@ -162,6 +162,9 @@ def test_progress_is_that_of_the_slowest() -> None:
     second({"event": "progress", "done": 20, "rate": 4.0, "rate_unit": "slots/s", "squared_errors": {"smart": 4.0}})
     assert [news["event"] for news in told] == ["started", "progress"]
     assert (told[1]["done"], told[1]["rate"], told[1]["squared_errors"]) == (20, 4.0, {"smart": 3.0})
+    second({"event": "ended", "status": 0})
+    first({"event": "progress", "done": 70, "rate": 9.0, "rate_unit": "slots/s", "squared_errors": {"smart": 1.0}})
+    assert told[-1]["done"] == 70
 
 
 def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_status(evedrop: Evedrop) -> None:
