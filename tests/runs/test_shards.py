@@ -208,7 +208,7 @@ def whole(live: Live) -> int:
     return rows
 
 
-@pytest.mark.parametrize("name", ["smart", "router"])
+@pytest.mark.parametrize("name", ["smart", "sensor"])
 def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> None:
     """The shard and the process are named, with the log where it is, and no slot that was scored is lost."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
