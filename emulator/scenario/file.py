@@ -22,6 +22,7 @@ from emulator.model.registry import place_of
 from emulator.modules import named_in
 from emulator.scenario.disturbances import disturbances_beside, disturbances_read
 from emulator.scenario.dry_run import dry_run, foreign
+from emulator.scenario.filter_noise import filter_noise_read
 from emulator.scenario.mistakes import across_tables, sentences
 from emulator.scenario.recordings import beside, read_recordings
 from emulator.scenario.tables import Scenario
@@ -121,7 +122,7 @@ def checked(
         tables.setdefault("modules", str(folder))
     if isinstance(tables.get("modules"), str):
         tables["modules"] = str(Path(tables["modules"]).absolute())
-    recordings = [*read_recordings(tables), *disturbances_read(tables)]
+    recordings = [*read_recordings(tables), *disturbances_read(tables), *filter_noise_read(tables)]
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:

@@ -26,6 +26,7 @@ from emulator.scenario.across import acknowledgement_mistakes, away_in, event_mi
 from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.filter_noise import filter_mistakes
 from emulator.scenario.link_table import CorrelationTable, LinkTable
 from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.table import Found
@@ -142,6 +143,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         found += _strategy_mistakes(tables, slots)
     found += acknowledgement_mistakes(tables)
     found += loop_mistakes(tables)
+    found += filter_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)
