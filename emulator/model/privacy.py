@@ -26,7 +26,8 @@ FALSE_ALARMS = 0.05
 def active(load: Floats, window: int, threshold: float = THRESHOLD) -> Flags:
     """In which windows the house is active, (windows,); load: (slots,) in kW. A last window that is not whole is left out."""
     windows = len(load) // window
-    return load[: windows * window].reshape(windows, window).mean(axis=1) >= threshold
+    means: Floats = load[: windows * window].reshape(windows, window).mean(axis=1)
+    return np.greater_equal(means, threshold)
 
 
 def fall(level: Floats, window: int, known: Floats | None = None) -> Floats:
