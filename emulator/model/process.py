@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.elementary import Rows, cholesky, triangular_factor
+from emulator.model.elementary import Rows, cholesky, semidefinite_factor, triangular_factor
 from emulator.streams import Batch, BlockReader
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding d
 
 
 def product(M: Floats, x: Floats) -> Floats:
-    """M x for every trial: M (…, n, n), x (…, n, R) → (…, n, R)."""
+    """M x for every trial: M (…, m, n), x (…, n, R) → (…, m, R)."""
     y: Floats = M[..., :, 0, None] * x[..., None, 0, :]
     for j in range(1, M.shape[-1]):
         y += M[..., :, j, None] * x[..., None, j, :]
@@ -102,14 +102,21 @@ class Process:
 class ProcessNoise:
     """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`. Final.
 
-    initial: x_0 (n, R), where a scheme's secret decides it.
+    initial: x_0 (n, R), where a scheme's secret decides it; covariance: of w, (n, n), semidefinite, where it is not Q.
     """
 
-    def __init__(self, process: Process, key: bytes, batch: Batch, initial: Floats | None = None) -> None:
+    def __init__(
+        self,
+        process: Process,
+        key: bytes,
+        batch: Batch,
+        initial: Floats | None = None,
+        covariance: Floats | None = None,
+    ) -> None:
         self._initial = initial
         self._reader = BlockReader(key, batch, process.n)
         self._initial_factor = cholesky(process.initial_covariance)
-        self._factor = cholesky(process.Q)
+        self._factor = cholesky(process.Q) if covariance is None else semidefinite_factor(covariance)
         self._slots = range(0)
         self._noise: Floats
 
@@ -131,25 +138,34 @@ class ProcessNoise:
 class Trajectory:
     """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Final. Must be read slot by slot.
 
-    initial: x_0 (n, R), where a scheme's secret decides it.
+    initial, covariance: as of `ProcessNoise`.
     """
 
-    def __init__(self, process: Process, key: bytes, batch: Batch, initial: Floats | None = None) -> None:
+    def __init__(
+        self,
+        process: Process,
+        key: bytes,
+        batch: Batch,
+        initial: Floats | None = None,
+        covariance: Floats | None = None,
+    ) -> None:
         self._process = process
-        self._noise = ProcessNoise(process, key, batch, initial)
+        self._noise = ProcessNoise(process, key, batch, initial, covariance)
         self._next = 0
         self.x: Floats = np.zeros((process.n, batch.trials))
         self.predicted: Floats = self.x
         """A x_{k−1}, (n, R): what the innovation of this slot is measured against."""
 
-    def advance(self) -> Floats:
-        """The next slot's state, (n, R)."""
+    def advance(self, pushed: Floats | None = None) -> Floats:
+        """The next slot's state, (n, R); pushed: what else moves it there, (n, R) or (n, 1)."""
         noise = self._noise.at(self._next)
         if self._next == 0:
             self.x = noise
         else:
             self.predicted = self._process.predict(self.x)
             self.x = self.predicted + noise
+        if pushed is not None:
+            self.x = self.x + pushed
         self._next += 1
         return self.x
 

@@ -16,9 +16,10 @@ LEGITIMATE = "legitimate"
 ROUTER = "router"
 OBSERVER = "observer"
 OPERATOR = "operator"
+CONTROLLER = "controller"
 ACKNOWLEDGEMENTS = "acknowledgements"
 """No process: the name of their way back, whose random stream is `link/acknowledgements`."""
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR, ACKNOWLEDGEMENTS)
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
 
 
 @dataclass(frozen=True)

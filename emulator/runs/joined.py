@@ -47,6 +47,16 @@ class ReceiverSlots:
 
 
 @dataclass(frozen=True)
+class InputSlots:
+    """What the controller decided, over c slots."""
+
+    u: Floats
+    """As decided, (c, m, R); the plant may clip it."""
+    failed: Flags
+    """Whether the decision that holds failed, so that the inputs before are held, (c, R)."""
+
+
+@dataclass(frozen=True)
 class Slots:
     """c consecutive slots of all trials, complete."""
 
@@ -60,6 +70,8 @@ class Slots:
     """Whether there was a packet, as the sensor says, (c, R); None: always."""
     alarms: Flags | None = None
     """As in `Truth`."""
+    inputs: InputSlots | None = None
+    """None without a controller."""
 
     @property
     def count(self) -> int:
@@ -78,7 +90,8 @@ class Slots:
             for name, one in self.receivers.items()
         }
         sent = None if self.sent is None else self.sent.copy()
-        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent)
+        inputs = None if self.inputs is None else InputSlots(self.inputs.u.copy(), self.inputs.failed.copy())
+        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent, inputs=inputs)
 
 
 def concatenated(parts: Sequence[Slots]) -> Slots:
@@ -92,7 +105,11 @@ def concatenated(parts: Sequence[Slots]) -> Slots:
     }
     x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
     sent = None if parts[0].sent is None else np.concatenate([_all(part.sent, part.nu) for part in parts])
-    return Slots(parts[0].first, x, nu, receivers, sent)
+    inputs = None
+    if parts[0].inputs is not None:
+        of_parts = [part.inputs for part in parts if part.inputs is not None]
+        inputs = InputSlots(*(np.concatenate([getattr(one, name) for one in of_parts]) for name in ("u", "failed")))
+    return Slots(parts[0].first, x, nu, receivers, sent, inputs=inputs)
 
 
 def _all(flags: Flags | None, like: Flags) -> Flags:

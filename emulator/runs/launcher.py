@@ -108,9 +108,9 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
             summary = {**load_results(folder).summary, "ended": how}
         except UsageError:
             tallies = {name: Tally(scenario.slots, scenario.trials) for name in scenario.receivers}
-            summary = summary_of(scenario, tallies, dict.fromkeys(scenario.receivers), Ending(0.0, how))
+            summary = summary_of(scenario, tallies, dict.fromkeys(scenario.digested), Ending(0.0, how))
             if not any(folder.glob("*.parquet")):
-                with ResultsWriter(folder, scenario.receivers, len(scenario.process.A)):
+                with ResultsWriter.of(folder, scenario):
                     pass
         write_summary(folder, summary)
 

@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -122,7 +122,7 @@ class Observation:
 
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
-        self._writer = ResultsWriter(self.folder, self._scenario.receivers, self._shape[0])
+        self._writer = ResultsWriter.of(self.folder, self._scenario)
         return self._writer
 
     def conduct(self, stop: Stop) -> None:
@@ -238,7 +238,7 @@ class Observation:
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         if self._recording is not None:
-            self._recording.add(shown(slots, scored))
+            self._recording.add(shown(slots, scored, self._scenario.process.around))
         conductor.report(self._joiner.done)
         self._progress(scored)
 
@@ -340,14 +340,17 @@ def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -
     return Recording(path, scene, live)
 
 
-def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
-    """Some slots as the view takes them: the first recorded trial, and means over all."""
+def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float]) -> Any:
+    """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
+
+    around: the reference from which states are deviations, (n,).
+    """
     from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
     from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
 
     peers = {
         name: PeerSlots(
-            x_hat=receiver.x_hat[:, :, 0],
+            x_hat=receiver.x_hat[:, :, 0] + around,
             P=receiver.P[:, :, :, 0],
             action=receiver.action[:, 0],
             squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
@@ -356,4 +359,4 @@ def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
         )
         for name, receiver in slots.receivers.items()
     }
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0], nu=slots.nu[:, 0], peers=peers)
+    return ShownSlots(first=slots.first, x=slots.x[:, :, 0] + around, nu=slots.nu[:, 0], peers=peers)

@@ -21,12 +21,16 @@ from numpy.typing import NDArray
 from emulator.errors import UsageError
 from emulator.model.digest import DIGEST_BYTES, Digests
 from emulator.model.links.link import REASONS
+from emulator.model.plant import Plant
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
+from emulator.network.access import CONTROLLER
 from emulator.network.wire import packed_flags
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums
+from emulator.scenario import Scenario
+from emulator.scenario.disturbances import disturbances_of
 
 _ROWS = 65_536  # rows of a table held back until they are worth writing
 _BYTES = 16 * 2**20  # the same of wide rows, as a journal's of many trials are; and a row group has no more
@@ -100,6 +104,19 @@ DIGESTS = pa.schema(
 )
 
 
+def _inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
+    return pa.schema(
+        [
+            ("slot", pa.int64()),
+            ("trial", pa.int64()),
+            ("u", pa.list_(pa.float64(), inputs)),
+            ("d", pa.list_(pa.float64(), disturbances)),
+            ("failed", pa.bool_()),
+            ("clipped", pa.bool_()),
+        ]
+    )
+
+
 class _Table:
     """A Parquet file that grows. Rows are held back, as arrays of one row each slot, until they make a row group."""
 
@@ -155,14 +172,39 @@ class _Table:
 class ResultsWriter:
     """Writes a results folder. Final; use it as a context manager, so that whatever ends the run, the files are whole."""
 
-    def __init__(self, folder: Path, receivers: tuple[str, ...], n: int) -> None:
-        self._receivers = receivers
-        peers = {"peer": receivers}
+    def __init__(
+        self,
+        folder: Path,
+        receivers: tuple[str, ...],
+        n: int,
+        around: Sequence[float] | None = None,
+        loop: tuple[Plant, Floats] | None = None,
+    ) -> None:
+        """around: what is added to states and estimates, (n,); loop: of a closed one, plant and disturbances (slots, q)."""
+        self._digested = receivers if loop is None else (*receivers, CONTROLLER)
+        self._around = None if around is None or not any(around) else np.array(around)
+        peers = {"peer": self._digested}
         words = {**peers, "sent": SENT, "action": ACTIONS}
         self._slots = _Table(folder / "slots.parquet", SLOTS, peers)
         self._trials = _Table(folder / "trials.parquet", _trials_schema(n), words)
         self._journal = _Table(folder / "journal.parquet", JOURNAL, {"link": receivers})
         self._digests = _Table(folder / "digests.parquet", DIGESTS, peers)
+        self._tables = [self._slots, self._trials, self._journal, self._digests]
+        self._loop = loop
+        if loop is not None:
+            plant, disturbances = loop
+            self._inputs = _Table(folder / "inputs.parquet", _inputs_schema(plant.inputs, disturbances.shape[1]), {})
+            self._tables.append(self._inputs)
+
+    @classmethod
+    def of(cls, folder: Path, scenario: Scenario) -> Self:
+        """Of the results of a scenario."""
+        loop = (
+            None
+            if scenario.driven is None or scenario.controller is None
+            else (scenario.driven, disturbances_of(scenario))
+        )
+        return cls(folder, scenario.receivers, len(scenario.process.A), scenario.process.around, loop)
 
     def __enter__(self) -> Self:
         return self
@@ -171,7 +213,7 @@ class ResultsWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         failures: list[Exception] = []
-        for table in (self._slots, self._trials, self._journal, self._digests):
+        for table in self._tables:
             try:
                 table.close()
             except (
@@ -225,7 +267,7 @@ class ResultsWriter:
         trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
         nu = slots.nu[:, :recorded]
         packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, len(SENT) - 1)
-        x = slots.x[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)
+        x = self._levels(slots.x[:, :, :recorded])
         for name, receiver in slots.receivers.items():
             self._trials.add(
                 [
@@ -237,10 +279,33 @@ class ResultsWriter:
                     squared_errors[name][:, :recorded].reshape(-1),
                     np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
                     x,
-                    receiver.x_hat[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1),
+                    self._levels(receiver.x_hat[:, :, :recorded]),
                     np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
                 ]
             )
+
+    def _levels(self, x: Floats) -> Floats:
+        """States (c, n, r) as rows, (c r, n), with the reference added from which they are deviations."""
+        rows = x.transpose(0, 2, 1).reshape(-1, x.shape[1])
+        return rows if self._around is None else rows + self._around
+
+    def input_rows(self, slots: Slots, first_trial: int) -> None:
+        """A row per slot and recorded trial, the first of which is first_trial: what moved the plant."""
+        if slots.inputs is None or self._loop is None:
+            return
+        plant, disturbances = self._loop
+        recorded = next(iter(slots.receivers.values())).P.shape[3]
+        u, some = slots.inputs.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
+        self._inputs.add(
+            [
+                np.repeat(np.arange(some.start, some.stop), recorded),
+                np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
+                np.stack([plant.limited(one) for one in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
+                np.repeat(disturbances[some], recorded, axis=0),
+                slots.inputs.failed[:, :recorded].reshape(-1),
+                plant.clips(u).reshape(-1),
+            ]
+        )
 
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
@@ -264,7 +329,7 @@ class ResultsWriter:
             )
 
     def _names(self, name: str, count: int) -> NDArray[np.int8]:
-        return np.full(count, self._receivers.index(name), np.int8)
+        return np.full(count, self._digested.index(name), np.int8)
 
     def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
         """A row per receiver, trial and block: receiver → block → digests (R, 32) of the trials from first_trial on."""
@@ -336,6 +401,19 @@ class Results:
     def journal(self) -> pa.Table:
         """A row per slot and link."""
         return self._table("journal", JOURNAL)
+
+    @property
+    def inputs(self) -> pa.Table | None:
+        """A row per slot and recorded trial of a closed loop; None without a controller."""
+        if self.summary.get("controller") is None:
+            return None
+        path = self.folder / "inputs.parquet"
+        try:
+            schema = pq.read_schema(path)
+            widths = [int(schema.field(name).type.list_size) for name in ("u", "d")]
+        except (OSError, pa.ArrowException, KeyError, AttributeError):
+            widths = [0, 0]  # whatever it is, reading it with this schema says what is wrong
+        return self._table("inputs", _inputs_schema(*widths))
 
     @property
     def digests(self) -> pa.Table:

@@ -16,19 +16,23 @@ import tomli_w
 
 from emulator.model.digest import Digests, RunDigest, block_starts
 from emulator.model.process import Floats
-from emulator.network.access import LEGITIMATE
+from emulator.network.access import CONTROLLER, LEGITIMATE
+from emulator.plant_data import disturbances_text
 from emulator.runs.acknowledging import Detection
 from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
+from emulator.runs.loop_tally import Acted, LoopTally, SolveTimes
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.verdict import Secrecy, secrecy
 from emulator.runs.watched import Watched, watches_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
+DISTURBANCES = "disturbances.csv"
+"""Of a results folder whose scenario has some."""
 
 
 class Scored(NamedTuple):
@@ -47,6 +51,7 @@ class Scorekeeper:
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self.detection = Detection(trials)
+        self.loop = LoopTally.of(scenario, trials)
         self.tallies = {
             name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches_of(scenario).items()
         }
@@ -56,6 +61,9 @@ class Scorekeeper:
         scored = {}
         if slots.alarms is not None:
             self.detection.add(slots.first, slots.alarms)
+        if slots.inputs is not None and self.loop is not None:
+            user = slots.receivers[LEGITIMATE]
+            self.loop.add(Acted(slots.inputs, slots.x, user.x_hat, user.action))
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(
@@ -101,6 +109,7 @@ def summary_of(
     mode: str = "live",
     events: Sequence[Mapping[str, Any]] = (),
     detection: Detection | None = None,
+    loop: tuple[LoopTally, SolveTimes] | None = None,
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
     expected = expectations_of(scenario)
@@ -135,6 +144,9 @@ def summary_of(
         "events": list(events),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
+        "controller": None
+        if loop is None
+        else loop[0].summary(scenario, peers[LEGITIMATE], loop[1], digests[CONTROLLER]),
         "surprising": _surprising(scenario, tallies),
         "expectations": evidence.judged(ending.replay),
     }
@@ -196,15 +208,22 @@ def event_line(event: Mapping[str, Any]) -> str:
 
 
 def write_resolved(folder: Path, scenario: Scenario) -> None:
-    """Write the scenario.toml of a results folder, whole at any moment."""
-    unfinished = folder / "scenario.toml.new"
-    unfinished.write_text(resolved(scenario), encoding="utf-8")
-    os.replace(unfinished, folder / "scenario.toml")
+    """Write the scenario.toml of a results folder, and the disturbances that it names, each whole at any moment."""
+    texts = {"scenario.toml": resolved(scenario)}
+    plant = scenario.plant
+    if plant is not None and plant.disturbance_values:
+        texts = {DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_values), **texts}
+    for name, text in texts.items():
+        unfinished = folder / f"{name}.new"
+        unfinished.write_text(text, encoding="utf-8")
+        os.replace(unfinished, folder / name)
 
 
 def resolved(scenario: Scenario) -> str:
     """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
     tables = scenario.model_dump(mode="json", exclude_none=True)
+    if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
+        tables["plant"]["disturbance_file"] = DISTURBANCES
     if scenario.secret_file is not None:
         tables["secret_file"] = str(Path(scenario.secret_file).absolute())
     tables["made_with"] = {

@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from emulator.errors import ScenarioError, UsageError
+from emulator.scenario.disturbances import disturbances_beside, disturbances_read
 from emulator.scenario.mistakes import across_tables, sentences
 from emulator.scenario.recordings import beside, read_recordings
 from emulator.scenario.tables import Scenario
@@ -91,6 +92,7 @@ def parse(
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     beside(tables, folder)
+    disturbances_beside(tables, folder)
     if isinstance(tables.get("secret_file"), str):
         tables["secret_file"] = str((folder / tables["secret_file"]).absolute())
     return checked(tables, source, changes, beyond_horizon=beyond_horizon)
@@ -102,7 +104,7 @@ def checked(
     """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake."""
     for key, value in (changes or {}).items():
         _set(tables, key, value)
-    recordings = read_recordings(tables)
+    recordings = [*read_recordings(tables), *disturbances_read(tables)]
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:

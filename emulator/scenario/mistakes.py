@@ -24,8 +24,10 @@ from emulator.model.process import Process
 from emulator.model.schemes import SCHEMES, scheme_of
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.across import acknowledgement_mistakes, event_mistakes, link_mistakes
+from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
     SECRET_BYTES,
@@ -108,6 +110,8 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "event": EventTable,
         "correlation": CorrelationTable,
         "acknowledgements": AcknowledgementsTable,
+        "plant": PlantTable,
+        "controller": ControllerTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -148,6 +152,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
             if isinstance(expectation, dict):
                 found += [f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation)]
     found += acknowledgement_mistakes(tables)
+    found += loop_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)

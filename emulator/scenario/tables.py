@@ -14,19 +14,23 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field
 
 from emulator.model.acknowledgements import ATTACKS
+from emulator.model.controllers import Assignment
 from emulator.model.delays import DELAY_MODELS
 from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.link import Course
 from emulator.model.links import LOSS_MODELS, loss_of
 from emulator.model.links.link import LossModel
+from emulator.model.plant import Plant
 from emulator.model.process import Process, mistakes_of
 from emulator.model.schemes import SCHEMES
-from emulator.network.access import LEGITIMATE
+from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import ExpectTable
+from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
 from emulator.scenario.table import (
     Found,
     Matrix,
+    Number,
     Probability,
     ProcessName,
     Table,
@@ -38,6 +42,7 @@ from emulator.scenario.timeline import Timeline
 from emulator.scenario.words import as_toml, listed
 
 SECRET_BYTES = 32
+_MATRICES = ("A", "Q", "initial_covariance")
 _QUEUE = 100  # packets that wait before a link of limited rate, if the scenario does not say
 
 
@@ -47,13 +52,19 @@ class ProcessTable(Table):
     A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
     Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
     initial_covariance: Annotated[Matrix, Field(examples=[[[1.0, 0.0], [0.0, 1.0]]])]
+    reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
+    states: Annotated[
+        list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
+    ] = None
+    units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Whether the three are a process; what is missing or no matrix at all is left out of the question."""
         found: list[Found] = []
         matrices: dict[str, NDArray[np.float64]] = {}
-        for name, field in cls.model_fields.items():
+        for name in _MATRICES:
+            field = cls.model_fields[name]
             rows = table.get(name)
             if not numbers(rows) or rows is None:
                 continue
@@ -69,9 +80,18 @@ class ProcessTable(Table):
         if matrices:
             known = matrices.get("A", next(iter(matrices.values())))
             stand_in = np.eye(len(known))
-            all_three = [matrices.get(name, stand_in) for name in cls.model_fields]
+            all_three = [matrices.get(name, stand_in) for name in _MATRICES]
             found += [(name, what) for name, what in mistakes_of(*all_three) if name in matrices]
+            for name in ("reference", "states", "units"):
+                values = table.get(name)
+                if isinstance(values, list) and len(values) != len(known):
+                    found.append((name, f"has {len(values)} entries; expected {len(known)}, one for each state"))
         return found
+
+    @property
+    def around(self) -> list[float]:
+        """The public reference, from which states are transmitted as deviations; 0 unless it is given."""
+        return [0.0] * len(self.A) if self.reference is None else self.reference
 
     @property
     def process(self) -> Process:
@@ -209,6 +229,7 @@ class LegitimateTable(Table):
 
     link: LinkField
     window: WindowField = 0
+    knows_input: Annotated[bool, Field(strict=True, examples=[True])] = False
 
 
 class EavesdropperTable(Table):
@@ -322,6 +343,8 @@ class Scenario(Table):
         dict[ProcessName, EavesdropperTable],
         Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
     ] = Field(default_factory=dict)
+    plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
+    controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
@@ -335,6 +358,23 @@ class Scenario(Table):
     def receivers(self) -> tuple[str, ...]:
         """All receivers, the legitimate one first."""
         return (LEGITIMATE, *self.eavesdroppers)
+
+    @property
+    def driven(self) -> Plant | None:
+        """What drives the true states, if it is not the process alone."""
+        return None if self.plant is None else plant_of(self.plant, self.process.around)
+
+    @property
+    def assignment(self) -> Assignment | None:
+        """What the controller is told, if there is one."""
+        if self.driven is None or self.controller is None:
+            return None
+        return assignment_of(self.controller, self.process.process, self.driven, self.slot_seconds or 1.0)
+
+    @property
+    def digested(self) -> tuple[str, ...]:
+        """Whoever has a digest: all receivers, and the controller if there is one."""
+        return self.receivers if self.controller is None else (*self.receivers, CONTROLLER)
 
     @property
     def quality(self) -> dict[str, float]:
@@ -377,6 +417,8 @@ class Scenario(Table):
 
     def cuts(self, receiver: str) -> list[int]:
         """Slots in which a receiver goes away or is back, with which a block of its digest begins."""
+        if receiver == CONTROLLER:
+            return []
         return sorted({slot for one in self.timeline.outages[receiver] for slot in (one.start, one.stop)})
 
 

@@ -1,0 +1,12 @@
+"""Strategies of control by their name in a scenario: one file each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulator.model.controllers.controller import Assignment, Controller
+from emulator.model.controllers.lqr import Lqr
+
+CONTROLLERS: Mapping[str, type[Controller]] = {"lqr": Lqr}
+
+__all__ = ["CONTROLLERS", "Assignment", "Controller"]
