@@ -4,7 +4,7 @@ EvedropError                    exit status
 ├── UsageError                  2   the command line or a file it names cannot be used
 │   ├── ScenarioError           2   the scenario has mistakes: all of them, listed
 │   ├── TraceError              2   a recording cannot be read as one
-│   └── ProfileError            2   a table of powers over time cannot be read as one: all that is wrong, listed
+│   └── DisturbanceError        2   a table of disturbances cannot be read as one: all that is wrong, listed
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
@@ -46,8 +46,8 @@ class TraceError(UsageError):
         super().__init__(f"{path}: {what}")
 
 
-class ProfileError(UsageError):
-    """A table of powers over time that is none: `mistakes` lists every one, with its line in the file."""
+class DisturbanceError(UsageError):
+    """A table of disturbances that is none: `mistakes` lists every one, with its line in the file."""
 
     def __init__(self, path: str, mistakes: list[str]) -> None:
         self.mistakes = mistakes

@@ -15,15 +15,21 @@ import pytest
 
 from emulator.household import appliances, day, sun
 from emulator.household.draws import Draws
-from emulator.profiles import read_profile
+from emulator.plant_data import read_disturbances
 
 KEPT = Path(str(resources.files("scenarios")))
 TOLD = json.loads((KEPT / f"{day.NAME}.json").read_text(encoding="utf-8"))
 
 
+def read(folder: Path) -> np.ndarray:
+    """The day in a folder, (2, 86 400)."""
+    rows = read_disturbances(folder / f"{day.NAME}.csv.gz", ("P_solar", "P_load"), ("kW", "kW"), 86_400)
+    return np.array(rows).T
+
+
 def kept() -> tuple[np.ndarray, np.ndarray]:
     """P_solar and P_load of the day that is kept."""
-    solar, load = read_profile(KEPT / f"{day.NAME}.csv.gz", ("P_solar", "P_load"), 86_400)
+    solar, load = read(KEPT)
     return solar, load
 
 
@@ -44,7 +50,7 @@ def test_the_day_can_be_made_again(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecations between pvlib and pandas are not ours
         day.write(tmp_path, day.Recipe())
-    made = read_profile(tmp_path / f"{day.NAME}.csv.gz", ("P_solar", "P_load"), 86_400)
+    made = read(tmp_path)
     assert np.abs(made - kept()).max() <= 0.0011
     again = json.loads((tmp_path / f"{day.NAME}.json").read_text(encoding="utf-8"))
     if again["versions"] == TOLD["versions"]:

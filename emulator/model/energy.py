@@ -27,31 +27,59 @@ class Difference:
     """Slot by slot: Σ |P − P′| / Σ |P′|. Never below the two others, as shares of the same Σ |P′|."""
 
 
-def bought(grid_power: Floats, slot_seconds: float) -> Floats:
-    """Energy taken from the grid in kWh, (…); grid_power: (slots, …)."""
-    return _energy(np.maximum(grid_power, 0.0), slot_seconds)
+@dataclass(frozen=True)
+class Meter:
+    """Sums over slots of a run's grid power P, and of another's P′ beside it, (…) each, in kW. Final."""
 
+    bought: Floats
+    sold: Floats
+    other_bought: Floats
+    other_sold: Floats
+    apart: Floats
+    """Σ |P − P′|."""
 
-def sold(grid_power: Floats, slot_seconds: float) -> Floats:
-    """Energy given to the grid in kWh, (…), not negative; grid_power: (slots, …)."""
-    return _energy(np.maximum(-grid_power, 0.0), slot_seconds)
-
-
-def difference(grid_power: Floats, reference: Floats) -> Difference:
-    """The three measures, (…); grid_power: (slots, …), reference: of the other run, the same shape or (slots,).
-
-    Where the reference's sum is 0 a share of it is infinite, or NaN if both are 0.
-    """
-    other = reference.reshape(reference.shape + (1,) * (grid_power.ndim - reference.ndim))
-    magnitude = np.abs(other).sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return Difference(
-            np.abs(grid_power.sum(axis=0) - other.sum(axis=0)) / np.abs(other.sum(axis=0)),
-            np.abs(np.abs(grid_power).sum(axis=0) - magnitude) / magnitude,
-            np.abs(grid_power - other).sum(axis=0) / magnitude,
+    @classmethod
+    def over(cls, grid_power: Floats, other: Floats) -> Meter:
+        """Of some slots; both (slots, …)."""
+        return cls(
+            np.maximum(grid_power, 0.0).sum(axis=0),
+            np.maximum(-grid_power, 0.0).sum(axis=0),
+            np.maximum(other, 0.0).sum(axis=0),
+            np.maximum(-other, 0.0).sum(axis=0),
+            np.abs(grid_power - other).sum(axis=0),
         )
 
+    @classmethod
+    def zero(cls, trials: int) -> Meter:
+        """Of no slots."""
+        return cls(*(np.zeros(trials) for _ in range(5)))
 
-def _energy(power: Floats, slot_seconds: float) -> Floats:
-    energy: Floats = np.asarray(power.sum(axis=0) * (slot_seconds / _HOUR))
-    return energy
+    def with_more(self, more: Meter) -> Meter:
+        """Of these slots and others."""
+        return Meter(*(mine + theirs for mine, theirs in zip(self._sums, more._sums, strict=True)))
+
+    @classmethod
+    def of_all(cls, parts: list[Meter]) -> Meter:
+        """Of the trials of several, in order."""
+        return cls(*(np.concatenate(sums) for sums in zip(*(part._sums for part in parts), strict=True)))
+
+    @property
+    def _sums(self) -> tuple[Floats, ...]:
+        return self.bought, self.sold, self.other_bought, self.other_sold, self.apart
+
+    @property
+    def difference(self) -> Difference:
+        """The three measures. Where the other's sum is 0 a share of it is infinite, or NaN if both are 0."""
+        net, other_net = self.bought - self.sold, self.other_bought - self.other_sold
+        total, other_total = self.bought + self.sold, self.other_bought + self.other_sold
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return Difference(
+                np.abs(net - other_net) / np.abs(other_net),
+                np.abs(total - other_total) / other_total,
+                self.apart / other_total,
+            )
+
+
+def energy(summed_power: Floats, slot_seconds: float) -> Floats:
+    """Energy in kWh of a sum over slots of a power in kW."""
+    return summed_power * (slot_seconds / _HOUR)

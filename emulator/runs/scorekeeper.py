@@ -212,7 +212,10 @@ def write_resolved(folder: Path, scenario: Scenario) -> None:
     texts = {"scenario.toml": resolved(scenario)}
     plant = scenario.plant
     if plant is not None and plant.disturbance_values:
-        texts = {DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_values), **texts}
+        texts = {
+            DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values),
+            **texts,
+        }
     for name, text in texts.items():
         unfinished = folder / f"{name}.new"
         unfinished.write_text(text, encoding="utf-8")

@@ -7,16 +7,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from emulator.model.energy import bought, difference, sold
+from emulator.model.energy import Difference, Meter, energy
+
+
+def difference(run: np.ndarray, reference: np.ndarray) -> Difference:
+    """Of a run from one reference for all its trials."""
+    return Meter.over(run, reference.reshape(reference.shape + (1,) * (run.ndim - reference.ndim))).difference
 
 
 def test_energy_is_power_times_time() -> None:
     """An hour at 2 kW and half an hour at −1 kW, in slots of ten seconds, for two trials."""
     power = np.concatenate([np.full(360, 2.0), np.full(180, -1.0)])
     both = np.stack([power, -power], axis=1)
-    assert np.allclose(bought(both, 10.0), [2.0, 0.5])
-    assert np.allclose(sold(both, 10.0), [0.5, 2.0])
-    assert bought(power, 10.0).shape == ()
+    meter = Meter.over(both, 0.0 * both)
+    assert np.allclose(energy(meter.bought, 10.0), [2.0, 0.5])
+    assert np.allclose(energy(meter.sold, 10.0), [0.5, 2.0])
 
 
 def test_the_three_measures_by_hand() -> None:
@@ -50,3 +55,15 @@ def test_what_differs_slot_by_slot_bounds_the_rest(run: np.ndarray, reference: n
     assert (same.net, same.total, same.summed) == (0.0, 0.0, 0.0)
     alone = [difference(run[:, r], reference).summed for r in range(3)]
     assert np.array_equal(found.summed, alone)
+
+
+def test_a_meter_may_be_read_in_parts() -> None:
+    """Slots after slots, and trials beside trials, come to what all come to at once."""
+    rng = np.random.default_rng(4)
+    run, other = rng.standard_normal((2, 50, 4))
+    whole = Meter.over(run, other)
+    by_slots = Meter.zero(4).with_more(Meter.over(run[:20], other[:20])).with_more(Meter.over(run[20:], other[20:]))
+    by_trials = Meter.of_all([Meter.over(run[:, :1], other[:, :1]), Meter.over(run[:, 1:], other[:, 1:])])
+    for name in ("net", "total", "summed"):
+        assert np.allclose(getattr(by_slots.difference, name), getattr(whole.difference, name))
+        assert np.allclose(getattr(by_trials.difference, name), getattr(whole.difference, name))

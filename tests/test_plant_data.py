@@ -1,4 +1,4 @@
-"""Powers over time from a file: what is read, and what is said of a file that cannot be."""
+"""Disturbances from a file: what is read, and what is said of a file that cannot be."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator import profiles
-from emulator.errors import ProfileError
-from emulator.profiles import read_profile
+from emulator import plant_data
+from emulator.errors import DisturbanceError
+from emulator.plant_data import disturbances_text, read_disturbances
 
 NAMES = ("P_solar", "P_load")
+UNITS = ("kW", "kW")
 GOOD = "time [s], P_solar [kW], P_load [kW]\n0,0.5,0.2\n1,0.6,0.2\n2,0.7,1.25\n"
 
 
@@ -25,8 +26,8 @@ def write(folder: Path, text: str, name: str = "day.csv") -> Path:
 
 def mistakes(path: Path, slots: int = 3, slot_seconds: float = 1.0) -> list[str]:
     """What is said of a file."""
-    with pytest.raises(ProfileError) as caught:
-        read_profile(path, NAMES, slots, slot_seconds)
+    with pytest.raises(DisturbanceError) as caught:
+        read_disturbances(path, NAMES, UNITS, slots, slot_seconds)
     assert caught.value.exit_status == 2
     return caught.value.mistakes
 
@@ -43,15 +44,15 @@ def mistakes(path: Path, slots: int = 3, slot_seconds: float = 1.0) -> list[str]
 @pytest.mark.parametrize("name", ["day.csv", "day.csv.gz"])
 def test_a_day_is_read(tmp_path: Path, text: str, name: str) -> None:
     """Watts and kilowatts, columns in any order and more than are asked for, more lines than slots, compressed or not."""
-    found = read_profile(write(tmp_path, text, name), NAMES, 3)
-    assert np.allclose(found, [[0.5, 0.6, 0.7], [0.2, 0.2, 1.25]], rtol=1e-15)
+    found = np.array(read_disturbances(write(tmp_path, text, name), NAMES, UNITS, 3))
+    assert np.allclose(found[:3], [[0.5, 0.2], [0.6, 0.2], [0.7, 1.25]], rtol=1e-15)
 
 
 def test_slots_may_last_longer(tmp_path: Path) -> None:
     """Times advance by what a slot lasts, which need not be a binary fraction."""
     rows = "".join(f"{0.1 * k:.1f},1,2\n" for k in range(1000))
     path = write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}")
-    assert read_profile(path, NAMES, 1000, 0.1).shape == (2, 1000)
+    assert len(read_disturbances(path, NAMES, UNITS, 1000, 0.1)) == 1000
     assert "expected 60 s, for slots of 60 s" in mistakes(path, 10, 60.0)[0]
 
 
@@ -59,12 +60,12 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("", "is empty; expected a line of names such as time [s]"),
-        ("time [s],P_solar [kW],P_load [kW]\n", "has no line after its first; expected one for every slot"),
+        ("time [s],P_solar [kW],P_load [kW]\n", "has 0 rows; expected slots, which is 3, or more"),
         (GOOD.replace("[kW], P_l", "[A], P_l"), 'line 1: the column "P_solar" is in [A]; expected P_solar [kW] or P_solar [W]'),
         (GOOD.replace("P_load [kW]", "P_load"), 'line 1: the column "P_load" has no unit; expected P_load [kW]'),
         (GOOD.replace("time [s]", "time [h]"), 'line 1: the column "time" is in [h]; expected time [s]'),
         (GOOD.replace("P_load", "load"), 'line 1 has no column "P_load", only "time [s]", "P_solar [kW]", "load [kW]"'),
-        (GOOD.replace("P_load", "P_solar"), 'line 1 names "P_solar" twice; expected each column once'),
+        (GOOD.replace("P_solar [kW], P_load", "P_load [kW], P_load"), 'line 1 names "P_load" twice; expected each column once'),
         (GOOD.replace("1,0.6,0.2", "1,0.6"), "line 3 has 2 columns; expected 3, as the first line has"),
         (GOOD.replace("1,0.6,0.2", "1,sun,0.2"), 'line 3: P_solar is "sun"; expected a finite number'),
         (GOOD.replace("1,0.6,0.2", "1,,0.2"), "line 3: P_solar is empty; expected a finite number"),
@@ -72,7 +73,7 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
         (GOOD.replace("1,0.6,0.2\n", ""), "line 3: the time is 2 s after 0 s; expected 1 s, for slots of 1 s: a gap of 1 slot:"),
         (GOOD.replace("2,0.7", "1,0.7"), "line 4: the time is 1 s after 1 s; expected 2 s, for slots of 1 s: times must grow"),
         (GOOD.replace("0,0.5,0.2\n", ""), "line 2: the time starts at 1 s; expected 0"),
-        (GOOD.replace("2,0.7,1.25\n", ""), "has 2 slots, up to line 3, but the run has 3; expected as many or more"),
+        (GOOD.replace("2,0.7,1.25\n", ""), "has 2 rows; expected slots, which is 3, or more: a longer file, or --slots 2"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_day_is_said(tmp_path: Path, text: str, said: str) -> None:
@@ -83,9 +84,9 @@ def test_what_is_wrong_with_a_day_is_said(tmp_path: Path, text: str, said: str) 
 
 def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
     """Every column that is wrong, and the first lines that are with the number of them all."""
-    header = mistakes(write(tmp_path, "t,P_solar [A],P_load\n0,1,2\n"))
+    header = mistakes(write(tmp_path, "time [h],P_solar [A],P_load\n0,1,2\n"))
     assert [line.split(";")[0] for line in header] == [
-        'line 1 has no column "time", only "t", "P_solar [A]", "P_load"',
+        'line 1: the column "time" is in [h]',
         'line 1: the column "P_solar" is in [A]',
         'line 1: the column "P_load" has no unit',
     ]
@@ -95,8 +96,8 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
         'line 3: P_solar is "x"; expected a finite number',
         'line 3: P_load is "y"; expected a finite number',
     ]
-    assert found[-1] == "and more of the kind: 20 of 20 lines have mistakes"
-    assert len(found) == profiles._MOST_SAID + 1
+    assert found[-1] == "and more of the kind, in 20 of 20 lines"
+    assert len(found) == plant_data._MOST_SAID + 1
 
 
 @pytest.mark.parametrize(
@@ -109,3 +110,25 @@ def test_what_is_no_file_is_said(tmp_path: Path, name: str, content: bytes | Non
     (line,) = mistakes(tmp_path / name)
     assert line.startswith(("cannot be read (", "is empty"))
     assert "expected a" in line
+
+
+def test_without_units_in_the_scenario_none_are_asked_for(tmp_path: Path) -> None:
+    """Numbers are taken as they are, with or without a unit beside the name; lines that begin with # are passed over."""
+    path = write(tmp_path, "# measured\nP_load [W], P_solar\n7, 8\n# a pause\n9, 10\n")
+    assert read_disturbances(path, NAMES) == [[8.0, 7.0], [10.0, 9.0]]
+
+
+def test_units_of_any_kind_must_be_the_scenarios(tmp_path: Path) -> None:
+    """Powers may be changed from one to the other, anything else must be what is asked for."""
+    path = write(tmp_path, "wind [m/s], P [kW]\n3, 2\n")
+    assert read_disturbances(path, ("wind", "P"), ("m/s", "W")) == [[3.0, 2000.0]]
+    with pytest.raises(DisturbanceError, match=r'the column "wind" is in \[m/s\]; expected wind \[kn\]$'):
+        read_disturbances(path, ("wind", "P"), ("kn", "kW"))
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    """To the same bits, with units and without."""
+    rows = [[0.1, 1 / 3], [1e-300, -0.0]]
+    for units in (None, UNITS):
+        path = write(tmp_path, disturbances_text(NAMES, units, rows))
+        assert read_disturbances(path, NAMES, units) == rows
