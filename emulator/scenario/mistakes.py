@@ -27,6 +27,7 @@ from emulator.scenario.across import acknowledgement_mistakes, event_mistakes, l
 from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
@@ -112,6 +113,7 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "acknowledgements": AcknowledgementsTable,
         "plant": PlantTable,
         "controller": ControllerTable,
+        "household": HouseholdTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -147,12 +149,14 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
             lambda name: _no_theory(
                 name, tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name], encoding
             ),
+            isinstance(tables.get(HOUSEHOLD), dict),
         )
         for i, expectation in enumerate(expectations):
             if isinstance(expectation, dict):
                 found += [f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation)]
     found += acknowledgement_mistakes(tables)
     found += loop_mistakes(tables)
+    found += household_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)
