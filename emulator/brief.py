@@ -26,13 +26,14 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements"),
-    "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart"),
-    "legitimate": ("scheme", "window", "outages"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller"),
+    "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart", "plant", "controller"),
+    "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
+    "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
     "observer": ("scenario", "results", "recording", "live", "operator"),
 }
-ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
+ROLES = ("router", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 
 
 @dataclass(frozen=True)

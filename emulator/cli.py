@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
-    for role in ("router", "sensor", "legitimate", "eavesdropper", "observer"):
+    for role in ("router", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
         add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), _role(role))
     return parser
 

@@ -352,6 +352,8 @@ def process(options: argparse.Namespace) -> int:
             from peers.legitimate import estimate as play
         case "eavesdropper":
             from peers.eavesdropper import eavesdrop as play
+        case "controller":
+            from peers.controller import steer as play
         case "observer":
             from emulator.runs.observer import observe
 

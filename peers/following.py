@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,19 @@ from emulator.model.receiver import Belief, Receiver
 from emulator.network.reporting import BeliefReporter
 from emulator.network.session import Session
 from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_delivery
+from peers.loop import Consultation
 
 
-def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None:
-    """Run a receiver over all slots of its brief, but for those in which it is away; it may acknowledge what it receives."""
+def follow(
+    brief: Brief,
+    receiver: Receiver,
+    acknowledges: bool = False,
+    consult: Callable[[Session], Consultation] | None = None,
+) -> None:
+    """Run a receiver over all slots of its brief, but for those in which it is away.
+
+    It may acknowledge what it receives, and be consulted by a controller.
+    """
     name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part["window"]
     outages = {start: (stop, keeps) for start, stop, keeps in brief.part["outages"]}
     follower = Follower(receiver, window, brief.first)
@@ -29,6 +39,7 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
         cuts = [slot for start, (stop, _) in outages.items() for slot in (start, stop)]
         put_progress = session.outlet(session.keys.progress(name))
         put_acknowledgement = session.outlet(session.keys.acknowledged) if acknowledges else None
+        consultation = consult(session) if consult is not None else None
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
         session.ready()
         k = brief.first
@@ -51,7 +62,11 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
             arrival = read_delivery(message, k, shape, brief.model.header)
             if put_acknowledgement is not None:
                 put_acknowledgement(acknowledgement(k, arrival.heard.gamma))
+            if consultation is not None:
+                consultation.before(k)
             belief = follower.take(k, arrival)
+            if consultation is not None:
+                consultation.after(k, belief)
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
         session.wait_for("end")

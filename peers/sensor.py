@@ -8,6 +8,7 @@ from queue import SimpleQueue
 
 from emulator.brief import Brief
 from emulator.model.detection import Chart, Watch
+from emulator.model.plant import Plant
 from emulator.model.process import Trajectory
 from emulator.model.receiver import Flags
 from emulator.model.schemes import scheme_of
@@ -16,6 +17,7 @@ from emulator.network.access import OBSERVER, SENSOR
 from emulator.network.reporting import TruthReporter
 from emulator.network.session import Session
 from emulator.network.wire import Beside, Reader, held, hold, read_acknowledgement, read_progress, uplink
+from peers.loop import Actuator
 
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
@@ -53,12 +55,12 @@ class Window:
 class Holds:
     """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
 
-    def __init__(self, brief: Brief, session: Session, window: Window, scheme: Scheme) -> None:
+    def __init__(self, brief: Brief, session: Session, window: Window, scheme: Scheme, inputs: int) -> None:
         self._session, self._window = session, window
         self._holds = set(brief.part["holds"])
         self._telemetry = session.outlet(session.keys.telemetry(SENSOR))
         watches = brief.part["chart"] is not None
-        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches)
+        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches, inputs)
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
@@ -102,14 +104,17 @@ def sense(brief: Brief) -> None:
     process, keys = brief.model.process, brief.stream_keys
     scheme = scheme_of(process, brief.part["scheme"])
     encoder = scheme.encoder(keys, brief.batch)
-    trajectory = Trajectory(process, keys["process"], brief.batch, scheme.initial_state(keys, brief.batch))
+    initial, plant = scheme.initial_state(keys, brief.batch), brief.part["plant"]
+    noise = None if plant is None else Plant.of(plant).noise
+    trajectory = Trajectory(process, keys["process"], brief.batch, initial, noise)
     betrayed = set(brief.part["leaks"].values())
     pace = float(brief.part["pace"])
     with Session(brief) as session:
         window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window)
         send = session.outlet(session.keys.uplink)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
-        holds = Holds(brief, session, window, scheme)
+        actuator = Actuator(brief, session) if plant is not None else None
+        holds = Holds(brief, session, window, scheme, 0 if actuator is None else actuator.inputs)
         session.ready()
         session.wait_for("start")
         start = time.monotonic()
@@ -124,10 +129,11 @@ def sense(brief: Brief) -> None:
                 holds.hold(k)
                 start += time.monotonic() - began
                 time.sleep(max(0.0, start + k * pace - time.monotonic()) if pace else 0.0)
-            x = trajectory.advance()
+            x = trajectory.advance(None if actuator is None else actuator.pushed(k))
             packet = encoder.encode(k, x, trajectory.predicted)
             beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
             send(uplink(k, packet.z, **beside.given))
             alarms = back.wait(k, packet) if back is not None else None
-            holds.reporter.add(k, x, packet.nu, packet.sent, alarms)
+            steered = actuator.wait(k, x) if actuator is not None else None
+            holds.reporter.add(k, x, packet.nu, packet.sent, alarms, steered)
         session.wait_for("end")

@@ -51,6 +51,21 @@ class Keys:
         """Acknowledgements that were neither lost nor blocked, and those that are forged: router to sensor."""
         return self._under("ack/delivered")
 
+    @property
+    def estimate(self) -> str:
+        """What the legitimate estimator believes, to the controller."""
+        return self._under("estimate")
+
+    @property
+    def state(self) -> str:
+        """The true state, sensor to controller, where that acts on the truth."""
+        return self._under("state")
+
+    @property
+    def input(self) -> str:
+        """What the controller decides, to the sensor, and to a legitimate estimator that is told it."""
+        return self._under("input")
+
     def downlink(self, receiver: str) -> str:
         """Deliveries, router to one receiver."""
         return self._under(f"downlink/{receiver}")
@@ -87,16 +102,38 @@ class Grant:
     asks: tuple[str, ...] = ()
 
 
-def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
-    """The table of docs/protocol.md for a run; the router itself needs no grant."""
+@dataclass(frozen=True)
+class Wiring:
+    """How a controller is connected."""
+
+    acts_on: str
+    """`estimate` or `truth`."""
+    knows_input: bool
+    """Whether the legitimate estimator is told the inputs."""
+
+    @property
+    def on_truth(self) -> bool:
+        """Whether the controller is told the true state."""
+        return self.acts_on == "truth"
+
+
+def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None) -> list[Grant]:
+    """The table of docs/protocol.md for a run, with a controller if there is a loop; the router itself needs no grant."""
     keys = Keys(run)
     followers = (*receivers, OBSERVER)
-    processes = (SENSOR, *receivers)
+    processes = (SENSOR, *receivers) if loop is None else (SENSOR, *receivers, CONTROLLER)
+    state = (keys.state,) if loop is not None and loop.on_truth else ()
+    estimate = (keys.estimate,) if loop is not None and not loop.on_truth else ()
     table = [
         Grant(
             SENSOR,
-            writes=(keys.uplink, keys.telemetry(SENSOR)),
-            reads=(*(keys.progress(name) for name in followers), keys.control(SENSOR), keys.acknowledgements),
+            writes=(keys.uplink, keys.telemetry(SENSOR), *state),
+            reads=(
+                *(keys.progress(name) for name in followers),
+                keys.control(SENSOR),
+                keys.acknowledgements,
+                *(() if loop is None else (keys.input,)),
+            ),
             token=keys.alive(SENSOR),
         ),
         Grant(
@@ -109,16 +146,26 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
         ),
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
     ]
+    if loop is not None:
+        table.append(
+            Grant(
+                CONTROLLER,
+                writes=(keys.input, keys.telemetry(CONTROLLER)),
+                reads=(*estimate, *state, keys.control(CONTROLLER)),
+                token=keys.alive(CONTROLLER),
+            )
+        )
     for name in receivers:
+        user, told = name == LEGITIMATE, loop is not None and loop.knows_input
         table.append(
             Grant(
                 name,
                 writes=(
                     keys.telemetry(name),
                     keys.progress(name),
-                    *((keys.acknowledged,) if name == LEGITIMATE else ()),
+                    *((keys.acknowledged, *estimate) if user else ()),
                 ),
-                reads=(keys.downlink(name), keys.control(name)),
+                reads=(keys.downlink(name), keys.control(name), *((keys.input,) if user and told else ())),
                 token=keys.alive(name),
             )
         )

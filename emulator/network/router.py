@@ -27,7 +27,7 @@ from emulator.model.link import Change, Course, Fates, Link, streams_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
 from emulator.model.transit import Late, Transit
-from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, access_control, grants
+from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
 from emulator.network.postman import Postman
 from emulator.network.session import Session, router_config
 from emulator.network.wire import (
@@ -170,7 +170,8 @@ class WayBackLink:
 
 def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
-    table = grants(brief.run, tuple(brief.part["links"]))
+    wiring = brief.part["controller"]
+    table = grants(brief.run, tuple(brief.part["links"]), None if wiring is None else Wiring(**wiring))
     with _opened(brief, access_control(table)) as session:
         present = {grant.process: False for grant in table if grant.token is not None}
         for name in present:

@@ -195,6 +195,38 @@ def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
     return flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
 
 
+def known(name: str, k: int, x: Floats) -> bytes:
+    """What the controller acts on in slot k, (n, R): `x_hat`, an estimate, or `x`, the true state, as `name` says."""
+    return pack({"k": k, name: x.tobytes()})
+
+
+def read_known(message: Reader, name: str, k: int, shape: tuple[int, int]) -> Floats:
+    """The same, which must be of slot k."""
+    message.slot(k)
+    return message.finite(name, shape)
+
+
+def decided(k: int, u: Floats, failed: Flags) -> bytes:
+    """The inputs (m, R) from slot k on, and where they are those before, because the decision failed, (R,)."""
+    fields = {"k": k, "u": u.tobytes()}
+    if failed.any():
+        fields["failed"] = packed_flags(failed).tobytes()
+    return pack(fields)
+
+
+def read_decided(message: Reader, k: int, shape: tuple[int, int]) -> tuple[Floats, Flags]:
+    """The inputs (m, R) that must be from slot k on, and where their decision failed."""
+    message.slot(k)
+    return message.finite("u", shape), _failed(message, (shape[1],))
+
+
+def _failed(message: Reader, shape: tuple[int, ...]) -> Flags:
+    """Where decisions failed, (…, R): nowhere, unless it is said."""
+    if not message.has("failed"):
+        return np.zeros(shape, np.bool_)
+    return flags_of(message.array("failed", "u1", (*shape[:-1], (shape[-1] + 7) // 8)), shape[-1])
+
+
 def hold(k: int) -> bytes:
     """A mark between slots k − 1 and k, on uplink and downlinks: everybody reports all slots below k."""
     return pack({"k": k, "hold": True})
@@ -311,6 +343,10 @@ class Truth:
     """Whether there was a packet, (c, R); None of a scheme that sends in every slot."""
     alarms: Flags | None = None
     """Whether the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch them."""
+    u: Floats | None = None
+    """The inputs as they were decided, (c, m, R); None without a controller."""
+    failed: Flags | None = None
+    """Where their decision failed, (c, R)."""
 
     @property
     def count(self) -> int:
@@ -324,11 +360,15 @@ class Truth:
             fields["sent"] = packed_flags(self.sent).tobytes()
         if self.alarms is not None:
             fields["alarms"] = packed_flags(self.alarms).tobytes()
+        if self.u is not None:
+            fields["u"] = self.u.tobytes()
+        if self.failed is not None and self.failed.any():
+            fields["failed"] = packed_flags(self.failed).tobytes()
         return pack(fields)
 
 
-def read_truth(message: Reader, first: int, shape: tuple[int, int]) -> Truth:
-    """The sensor's telemetry that must begin at slot `first`."""
+def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int = 0) -> Truth:
+    """The sensor's telemetry that must begin at slot `first`, with so many inputs."""
     k, c = message.slot(first), message.integer("c", 1)
     n, trials = shape
     flags = {
@@ -336,7 +376,48 @@ def read_truth(message: Reader, first: int, shape: tuple[int, int]) -> Truth:
         for name in ("sent", "alarms")
     }
     masks = message.array("nu", "u1", (c, (trials + 7) // 8))
-    return Truth(k, message.finite("x", (c, n, trials)), flags_of(masks, trials), **flags)
+    return Truth(
+        k,
+        message.finite("x", (c, n, trials)),
+        flags_of(masks, trials),
+        flags["sent"],
+        flags["alarms"],
+        message.finite("u", (c, inputs, trials)) if inputs else None,
+        _failed(message, (c, trials)) if inputs else None,
+    )
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """The controller's telemetry over c slots."""
+
+    first: int
+    count: int
+    seconds: Floats
+    """What each decision took."""
+    digests: Mapping[int, Digests]
+    """As in `Report`."""
+
+    def pack(self) -> bytes:
+        """As a message."""
+        digests = {block: digests.tobytes() for block, digests in self.digests.items()}
+        return pack({"k": self.first, "c": self.count, "seconds": self.seconds.tobytes(), "digests": digests})
+
+
+def read_decisions(message: Reader, first: int, trials: int, period: int) -> Decisions:
+    """The controller's telemetry that must begin at slot `first`, with a decision every period slots."""
+    k, c = message.slot(first), message.integer("c", 1)
+    made = len(range(-(-k // period) * period, k + c, period))
+    return Decisions(k, c, message.finite("seconds", (made,)), _read_digests(message, trials))
+
+
+def _read_digests(message: Reader, trials: int) -> dict[int, Digests]:
+    digests: dict[int, Digests] = {}
+    for block, value in message.map("digests").items():
+        if type(block) is not int or not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
+            raise message.malformed(f"digests of block {block!r}", f"{trials * DIGEST_BYTES} bytes a block")
+        digests[block] = np.frombuffer(value, np.uint8).reshape(trials, DIGEST_BYTES)
+    return digests
 
 
 @dataclass(frozen=True)
@@ -388,11 +469,6 @@ def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: i
     action = message.array("action", "u1", (c, trials))
     if action.size and int(action.max()) > max(Action):
         raise message.malformed(f"action {int(action.max())}", f"actions from 0 to {int(max(Action))}")
-    digests: dict[int, Digests] = {}
-    for block, value in message.map("digests").items():
-        if type(block) is not int or not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
-            raise message.malformed(f"digests of block {block!r}", f"{trials * DIGEST_BYTES} bytes a block")
-        digests[block] = np.frombuffer(value, np.uint8).reshape(trials, DIGEST_BYTES)
     return Report(
         k,
         message.finite("x_hat", (c, n, trials)),
@@ -400,7 +476,7 @@ def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: i
         message.finite("P", (c, n, n, recorded)),
         message.finite("trace", (c, 2)),
         message.array("late", "<u2", (c, trials)) if message.has("late") else None,
-        digests,
+        _read_digests(message, trials),
         message.array("late_used", "<u2", (c, trials)) if message.has("late_used") else None,
     )
 

@@ -13,9 +13,10 @@ from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
-from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
 from emulator.runs.acknowledging import chart_of, way_back_of
 from emulator.runs.folder import new_folder
+from emulator.runs.loop_briefs import LoopBriefs
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
 
@@ -106,12 +107,14 @@ def briefs_of(
     """Process name → brief, with passwords and a run name made afresh."""
     run = f"r{secrets.token_hex(4)}"
     keys = StreamKeys.of(scenario)
-    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, OBSERVER, OPERATOR)}
+    steered = () if scenario.controller is None else (CONTROLLER,)
+    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)}
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d
     model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header))
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
+    loop = LoopBriefs(scenario)
 
     def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
         return Brief(
@@ -148,6 +151,7 @@ def briefs_of(
                 "users": users,
                 "leaks": leaks,
                 "acknowledgements": None if back is None else back._asdict(),
+                "controller": loop.wiring,
             },
         ),
         brief(
@@ -161,13 +165,15 @@ def briefs_of(
                 "holds": sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
                 "leaks": leaks,
                 "chart": None if chart is None else asdict(chart),
+                "plant": loop.plant,
+                "controller": loop.of_sensor,
             },
         ),
         brief(
             LEGITIMATE,
             "legitimate",
             keys.secret(scheme.estimator_streams),
-            {"scheme": spec, **_presence(scenario, LEGITIMATE)},
+            {"scheme": spec, **_presence(scenario, LEGITIMATE), "controller": loop.of_legitimate},
         ),
         brief(
             OBSERVER,
@@ -182,6 +188,8 @@ def briefs_of(
             },
         ),
     ]
+    if loop.of_controller is not None:
+        made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
     for name, table in scenario.eavesdroppers.items():
         part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
         made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))

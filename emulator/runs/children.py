@@ -18,7 +18,7 @@ from typing import Any
 
 from emulator.brief import Brief
 from emulator.errors import RunError
-from emulator.network.access import OBSERVER, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, ROUTER, SENSOR
 from emulator.runs.environment import own_environment
 
 News = Mapping[str, Any]
@@ -33,13 +33,24 @@ _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
 
 
+_SENDERS: Mapping[str, str] = {
+    "uplink": SENSOR,
+    "state": SENSOR,
+    "estimate": LEGITIMATE,
+    "input": CONTROLLER,
+    "journal": ROUTER,
+    "downlink": ROUTER,
+    "control": OBSERVER,
+}
+
+
 def _sender(complaint: str) -> str | None:
     """The process that sent what a complaint about a message is about (docs/protocol.md, keys)."""
     found = _REFUSED.search(complaint)
     if found is None:
         return None
     kind, _, name = found[1].partition("/")
-    return {"uplink": SENSOR, "journal": ROUTER, "downlink": ROUTER, "control": OBSERVER}.get(kind, name)
+    return _SENDERS.get(kind, name)
 
 
 @dataclass(frozen=True)

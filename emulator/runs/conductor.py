@@ -37,16 +37,17 @@ class Conductor:
     """Final. Its news are (source, payload): telemetry and journal as they come; everything else it keeps to itself."""
 
     def __init__(
-        self, session: Session, receivers: tuple[str, ...], stop: Stop, beat: Callable[[], None] = lambda: None
+        self, session: Session, reporters: tuple[str, ...], stop: Stop, beat: Callable[[], None] = lambda: None
     ) -> None:
+        """reporters: who reports besides router and sensor: the receivers, and a controller."""
         self._session = session
         self._stop = stop
         self._beat = beat
         self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
-        self._present = dict.fromkeys((ROUTER, SENSOR, *receivers), False)
+        self._present = dict.fromkeys((ROUTER, SENSOR, *reporters), False)
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
-        self.keys.update({name: keys.telemetry(name) for name in receivers})
+        self.keys.update({name: keys.telemetry(name) for name in reporters})
         for source, key in self.keys.items():
             session.funnel(key, lambda payload, source=source: self._news.put((source, payload)))  # type: ignore[misc]
         for name in self._present:

@@ -15,7 +15,17 @@ from emulator.model.digest import Digests
 from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
-from emulator.network.wire import Journal, Reader, Report, Truth, read_journal, read_report, read_truth
+from emulator.network.access import CONTROLLER
+from emulator.network.wire import (
+    Journal,
+    Reader,
+    Report,
+    Truth,
+    read_decisions,
+    read_journal,
+    read_report,
+    read_truth,
+)
 
 Message = TypeVar("Message")
 
@@ -123,17 +133,27 @@ _ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
 class Joiner:
     """Takes the messages of all processes as they come and gives back slots as soon as all have reported them. Final."""
 
-    def __init__(self, windows: Mapping[str, int], shape: tuple[int, int], recorded: int) -> None:
-        """windows: receiver → slots by which a packet may be late for it."""
+    def __init__(
+        self,
+        windows: Mapping[str, int],
+        shape: tuple[int, int],
+        recorded: int,
+        loop: tuple[int, int] | None = None,
+    ) -> None:
+        """windows: receiver → slots by which a packet may be late for it; loop: a controller's inputs, and its period."""
         self._windows = windows
         self._shape = shape
         self._recorded = recorded
+        self._loop = loop
+        self._decided = 0
         self._truth = _Column[Truth]()
         self._journal = _Column[Journal]()
         self._reports = {name: _Column[Report]() for name in windows}
         self._done = 0
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
-        """Receiver → block, by its first slot → digests."""
+        """Receiver, or controller → block, by its first slot → digests."""
+        if loop is not None:
+            self.digests[CONTROLLER] = {}
 
     @property
     def done(self) -> int:
@@ -149,9 +169,20 @@ class Joiner:
         """The first slot that a receiver has not reported."""
         return self._reports[name].end
 
+    def complete(self, slots: int) -> bool:
+        """Whether so many slots have been given back, and a controller has reported them."""
+        return self._done == slots and (self._loop is None or self._decided == slots)
+
+    def decisions(self, telemetry: Reader) -> Floats:
+        """Take the controller's telemetry; what its decisions took."""
+        message = read_decisions(telemetry, self._decided, self._shape[1], 1 if self._loop is None else self._loop[1])
+        self._decided += message.count
+        self.digests[CONTROLLER].update(message.digests)
+        return message.seconds
+
     def truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
-        message = read_truth(telemetry, self._truth.end, self._shape)
+        message = read_truth(telemetry, self._truth.end, self._shape, 0 if self._loop is None else self._loop[0])
         self._truth.add(message, message.count)
 
     def report(self, name: str, telemetry: Reader) -> None:
@@ -203,7 +234,11 @@ class Joiner:
             else _rows(truth, [_all(getattr(part, name), part.nu) for part, _ in truth])
             for name in ("sent", "alarms")
         )
-        return Slots(first, x, nu, receivers, sent, alarms)
+        inputs = None
+        if self._loop is not None:
+            u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
+            inputs = InputSlots(u, failed)
+        return Slots(first, x, nu, receivers, sent, alarms, inputs)
 
 
 def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:

@@ -26,13 +26,14 @@ from emulator.brief import Brief
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
-from emulator.network.access import LEGITIMATE, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, LEGITIMATE, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.session import Question, Session
 from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
+from emulator.runs.loop_tally import SolveTimes
 from emulator.runs.orders import Order
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
@@ -108,7 +109,10 @@ class Observation:
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials)
+        table, plant = scenario.controller, scenario.driven
+        loop = None if table is None or plant is None else (plant.inputs, table.period)
+        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop)
+        self._solve_times = SolveTimes()
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -128,7 +132,7 @@ class Observation:
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
         with Session(self._brief) as session:
-            conductor = Conductor(session, self._scenario.receivers, stop, self._beat)
+            conductor = Conductor(session, self._scenario.digested, stop, self._beat)
             if self._brief.part["recording"]:
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
@@ -141,7 +145,7 @@ class Observation:
                 self._control.write(self.folder)
                 conductor.start()
                 tell("started")
-                while self._joiner.done < self._scenario.slots:
+                while not self._joiner.complete(self._scenario.slots):
                     news = conductor.news()
                     if news is not None:
                         self._take(conductor, *news)
@@ -219,6 +223,8 @@ class Observation:
         if source == ROUTER:
             for name, account in self._joiner.journal(message).items():
                 self._keeper.tallies[name].count(account)
+        elif source == CONTROLLER:
+            self._solve_times.add(self._joiner.decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
@@ -285,6 +291,7 @@ class Observation:
             ending,
             events=self._events,
             detection=self._keeper.detection,
+            loop=None if self._keeper.loop is None else (self._keeper.loop, self._solve_times),
         )
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
@@ -307,6 +314,7 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
     """All rows of some slots."""
     for name, one in scored.items():
         writer.slot_rows(slots.first, name, one.sums, one.expected)
+    writer.input_rows(slots, first_trial)
     writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
     writer.journal_rows(slots)
 

@@ -110,7 +110,7 @@ def _inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
             ("slot", pa.int64()),
             ("trial", pa.int64()),
             ("u", pa.list_(pa.float64(), inputs)),
-            ("d", pa.list_(pa.float64(), disturbances)),
+            *([("d", pa.list_(pa.float64(), disturbances))] if disturbances else []),
             ("failed", pa.bool_()),
             ("clipped", pa.bool_()),
         ]
@@ -301,7 +301,7 @@ class ResultsWriter:
                 np.repeat(np.arange(some.start, some.stop), recorded),
                 np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
                 np.stack([plant.limited(one) for one in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
-                np.repeat(disturbances[some], recorded, axis=0),
+                *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
                 slots.inputs.failed[:, :recorded].reshape(-1),
                 plant.clips(u).reshape(-1),
             ]
@@ -410,9 +410,10 @@ class Results:
         path = self.folder / "inputs.parquet"
         try:
             schema = pq.read_schema(path)
-            widths = [int(schema.field(name).type.list_size) for name in ("u", "d")]
-        except (OSError, pa.ArrowException, KeyError, AttributeError):
-            widths = [0, 0]  # whatever it is, reading it with this schema says what is wrong
+            widths = [int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d")]
+        except (OSError, pa.ArrowException, AttributeError):
+            widths = [0, 0]
+        widths[0] = max(1, widths[0])  # whatever it is, reading it with this schema says what is wrong
         return self._table("inputs", _inputs_schema(*widths))
 
     @property

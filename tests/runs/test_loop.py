@@ -10,18 +10,34 @@ import numpy as np
 import pytest
 import tomli_w
 
+from emulator.api import run
 from emulator.errors import UsageError
+from emulator.runs.diff import difference
 from emulator.runs.montecarlo import Plan, simulate
 from emulator.runs.results import Results, load_results
 from emulator.runs.simulation import Mode
-from emulator.scenario import Scenario, checked
+from emulator.scenario import Scenario, checked, load
+from tests.conftest import Evedrop
 
 TITLE = "A tank that is steered over a lossy network"
 
 
+DRAUGHT = {
+    "disturbances": ["draught"],
+    "disturbance_matrix": [[-0.05], [0.0]],
+    "disturbance_values": (np.random.default_rng(4).random((300, 1)) - 0.5).tolist(),
+}
+
+
+CALM = dict.fromkeys((f"plant__{name}" for name in DRAUGHT), None)
+"""No draught, for as many slots as one likes."""
+
+
 def tables(**changes: Any) -> dict[str, Any]:
-    """A marginal plant with a disturbance, a regulator and two eavesdroppers; changes by dotted key, `__` for the dot."""
-    random = np.random.default_rng(4)
+    """A marginal plant with a disturbance, a regulator and two eavesdroppers.
+
+    changes: by dotted key, `__` for the dot; None leaves the entry out.
+    """
     made: dict[str, Any] = {
         "title": TITLE,
         "slots": 300,
@@ -39,9 +55,7 @@ def tables(**changes: Any) -> dict[str, Any]:
             "input_matrix": [[0.1], [0.0]],
             "input_lower": [-2.0],
             "input_upper": [2.0],
-            "disturbances": ["draught"],
-            "disturbance_matrix": [[-0.05], [0.0]],
-            "disturbance_values": (random.random((300, 1)) - 0.5).tolist(),
+            **DRAUGHT,
             "noise": [[1e-6, 0.0], [0.0, 0.0]],
             "start": [54.0, 50.5],
         },
@@ -63,6 +77,8 @@ def tables(**changes: Any) -> dict[str, Any]:
         for name in path:
             inner = inner[name]
         inner[last] = value
+        if value is None:
+            del inner[last]
     return made
 
 
@@ -104,6 +120,72 @@ def test_the_loop_is_closed_over_the_estimate(tmp_path: Path) -> None:
     assert summary["decisions"] == 300
     assert summary["failed_fraction"] == 0.0
     assert summary["clipped_fraction"] == 0.0
+
+
+LIVE: dict[str, dict[str, Any]] = {
+    "one trial": {"trials": 1, "record_trials": 1, "legitimate__knows_input": True},
+    "twenty trials": {"trials": 20, "controller__period": 3, "controller__rate_limits": [0.2]},
+    "the truth": {"trials": 2, "controller__acts_on": "truth", "event": [{"from": 50, "to": 90, "kill": "legitimate"}]},
+    "late and held": {
+        "trials": 3,
+        "legitimate__knows_input": True,
+        "legitimate__window": 3,
+        "legitimate__link": {"quality": 0.8, "delay": {"model": "normal", "mean": 1.0, "deviation": 1.0}},
+        "event": [{"from": 101, "to": 120, "cut": "legitimate"}, {"from": 150, "to": 160, "kill": "smart"}],
+    },
+}
+
+
+@pytest.mark.parametrize("case", LIVE)
+def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
+    """Digests of all, the controller's too, and every recorded input: whatever the links and events are."""
+    live = run(scenario_of(**LIVE[case]), out=tmp_path / "live")
+    memory = in_memory(tmp_path / "memory", **LIVE[case])
+    assert live.summary["ended"] == "complete"
+    assert None not in digests(live).values()
+    assert digests(live) == digests(memory)
+    assert live.inputs.equals(memory.inputs)
+    assert difference(live, memory).same
+    timed = {"mean_solve_seconds", "longest_solve_seconds"}
+    for name, value in memory.summary["controller"].items():
+        if name not in {*timed, "mean_squared_errors", "mean_trace_covariance"}:
+            assert live.summary["controller"][name] == value, name
+    errors = memory.summary["controller"]["mean_squared_errors"]
+    for name, value in live.summary["controller"]["mean_squared_errors"].items():
+        assert (value is None) == (errors[name] is None)
+        assert value is None or value == pytest.approx(errors[name], rel=1e-12)
+    assert live.summary["controller"]["mean_solve_seconds"] > 0.0
+
+
+def test_a_killed_controller_is_named(evedrop: Evedrop) -> None:
+    """The run fails, says who is at fault, and keeps what was measured."""
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables(slots=200_000, **CALM)))
+    live = evedrop.live("loop.toml", "--trials", "1", "--record-trials", "1")
+    live.running()
+    live.kill("controller")
+    done = live.end()
+    assert done.status == 3
+    assert "controller was ended by signal 9" in done.err
+    assert "logs/controller.log" in done.err
+    live.nothing_left()
+    assert live.results.summary["controller"]["digest"] is None
+    assert live.results.inputs.num_rows == live.results.summary["slots"]
+
+
+def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
+    """The operator holds the run between two slots, changes a link, and lets it go on: as in any run."""
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables(pace=0.005, slots=600, **CALM)))
+    live = evedrop.live("loop.toml")
+    live.running()
+    for words in (("pause",), ("link", "cut"), ("step",), ("resume",)):
+        more = {"link": ("legitimate", "cut"), "step": ("20",)}.get(words[0], ())
+        said = evedrop(words[0], "run", *more)
+        assert (said.status, said.err) == (0, ""), words
+    assert live.end().status == 0
+    results = live.results
+    assert results.summary["ended"] == "complete"
+    simulate(load(live.folder), evedrop.folder / "memory", lambda _: None, Plan(workers=1))
+    assert digests(load_results(evedrop.folder / "memory")) == digests(results)
 
 
 def test_a_trial_is_the_same_alone_and_in_any_batch(tmp_path: Path) -> None:
