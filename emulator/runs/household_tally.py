@@ -21,6 +21,17 @@ from emulator.scenario.disturbances import disturbances_of
 from emulator.scenario.household import HouseholdTable
 
 
+def guesses_of(scenario: Scenario, table: HouseholdTable, trials: int) -> dict[str, LoadGuess]:
+    """Receiver → who guesses the load from its estimates."""
+    plant, controller, assignment = scenario.plant, scenario.controller, scenario.assignment
+    assert plant is not None and controller is not None and assignment is not None  # noqa: S101, PT018 - a house has them
+    names, strategy = plant.disturbances, CONTROLLERS[controller.strategy]
+    sun = None if table.sun is None else names.index(table.sun)
+    house = House((scenario.process.states or []).index(table.battery), names.index(table.load), sun)
+    shone = np.zeros(scenario.slots) if sun is None else disturbances_of(scenario)[:, sun]
+    return {name: LoadGuess(assignment, strategy(assignment, trials), house, shone) for name in scenario.receivers}
+
+
 class HouseholdTally:
     """A house's totals over a set of trials, whose slots come in order. Final."""
 
@@ -35,13 +46,8 @@ class HouseholdTally:
         strategy = CONTROLLERS[controller.strategy]
         own = strategy(assignment, trials)
         self._perfect = PerfectLoop(scenario.process.process, plant, own, self._period, self._disturbances)
-        names = scenario.plant.disturbances
-        sun = None if table.sun is None else names.index(table.sun)
-        self._house = House((scenario.process.states or []).index(table.battery), names.index(table.load), sun)
-        shone = np.zeros(scenario.slots) if sun is None else self._disturbances[:, sun]
-        self._guesses = {
-            name: LoadGuess(assignment, strategy(assignment, trials), self._house, shone) for name in scenario.receivers
-        }
+        self._load = scenario.plant.disturbances.index(table.load)
+        self._guesses = guesses_of(scenario, table, trials)
         self._guessed: dict[str, list[Floats]] = {name: [] for name in scenario.receivers}
         self.meter = Meter.zero(trials)
         self.done = 0
@@ -99,7 +105,7 @@ class HouseholdTally:
     def _activity(self) -> dict[str, Any]:
         """How well each receiver's guesses tell active windows, of those that are over."""
         table = self._table
-        load = privacy.means(self._disturbances[:, self._house.load], self._period)
+        load = privacy.means(self._disturbances[:, self._load], self._period)
         periods = min(len(loads) for loads in self._guessed.values())
         active = privacy.active(load[:periods], self._window, table.active_above)
         told = {}
