@@ -143,6 +143,27 @@ class Downlink:
             self._put(hold(k), 0.0)
 
 
+class Burst:
+    """Deliveries to who keeps nobody waiting, passed on many at a time. Final.
+
+    Where the sensor waits for somebody in every slot, a message by itself costs a receiver's waking up, and most of the time.
+    """
+
+    def __init__(self, put: Callable[[bytes], None]) -> None:
+        self._put = put
+        self._held: list[bytes] = []
+
+    def hold(self, payload: bytes, _: float) -> None:
+        """Take one."""
+        self._held.append(payload)
+
+    def flush(self) -> None:
+        """Pass on all that are held."""
+        for payload in self._held:
+            self._put(payload)
+        self._held.clear()
+
+
 class WayBackLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and who attacks it. Final."""
 
@@ -191,9 +212,13 @@ class Routing:
         self._uplink = session.inbox(session.keys.uplink)
         self._put_journal = session.outlet(session.keys.journal)
         postman = Postman() if brief.part["pace"] else None
+        self._bursts: list[Burst] = []
 
         def outlet(name: str, course: Mapping[str, Any]) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
+            if postman is None and brief.part["controller"] is not None and not self._is_waited_for(name):
+                self._bursts.append(Burst(put))
+                return self._bursts[-1].hold
             delays = any(
                 "delay" in (one or {}) for one in (course["settings"], *(c["settings"] for c in course["changes"]))
             )
@@ -204,6 +229,14 @@ class Routing:
         }
         acknowledgements = brief.part["acknowledgements"]
         self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
+
+    def _is_waited_for(self, receiver: str) -> bool:
+        """Whether the sensor waits in some slots for what a receiver makes of them."""
+        part = self._brief.part
+        wiring = Wiring(**part["controller"])
+        return receiver == LEGITIMATE and (
+            not wiring.on_truth or wiring.knows_input or part["acknowledgements"] is not None
+        )
 
     def carry_on(self) -> None:
         """Route all slots, then wait for the conductor's end."""
@@ -233,7 +266,12 @@ class Routing:
                 downlink.deliver(k, z, whole, beside)
             if self._way_back is not None:
                 self._way_back.carry(k, beside.sent, self._downlinks)
+        self._flush()
         self._journal(range(journaled, slots.stop))
+
+    def _flush(self) -> None:
+        for burst in self._bursts:
+            burst.flush()
 
     def _next(self) -> Reader:
         return Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes())
@@ -247,6 +285,7 @@ class Routing:
         """Pass a mark on, and do what the conductor says until it lets us go on."""
         for downlink in self._downlinks.values():
             downlink.mark(k)
+        self._flush()
         while (command := self._session.command()).text("do") != "go":
             if command.text("do") == "change":
                 changes = [_change(one) for one in command.maps("changes")]

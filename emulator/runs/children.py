@@ -19,7 +19,7 @@ from typing import Any
 from emulator.brief import Brief
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, ROUTER, SENSOR
-from emulator.runs.environment import own_environment
+from emulator.runs.environment import lock_step_environment, own_environment
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -71,8 +71,10 @@ class Exit:
 class Children:
     """The processes of a run. Final; on leaving the block all are gone."""
 
-    def __init__(self, logs: Path, private: Path) -> None:
+    def __init__(self, logs: Path, private: Path, lock_step: bool = False) -> None:
+        """lock_step: the processes wait for each other in every slot, or every few."""
         self._logs = logs
+        self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
@@ -114,6 +116,7 @@ class Children:
             state_file = str((self._private / f"{brief.process}.state").absolute())
             brief = replace(brief, part={**brief.part, "state_file": state_file})
         environment = {
+            **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",

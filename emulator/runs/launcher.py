@@ -53,7 +53,7 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
         try:
             briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None))
             observer = briefs.pop(OBSERVER)
-            with Children(folder / "logs", private) as children:
+            with Children(folder / "logs", private, scenario.controller is not None) as children:
                 for brief in briefs.values():
                     children.start(brief)
                 # The others find their feet while the viewer does; only the observer must know it.

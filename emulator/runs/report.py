@@ -131,6 +131,8 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
                 f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
             )
+    if summary["controller"] is not None:
+        console.print(_loop_line(summary["controller"]))
     for verdict in summary["secrecy"].values():
         console.print(verdict["sentence"])
     for name, peer in summary["peers"].items():
@@ -177,6 +179,22 @@ def household_lines(house: Mapping[str, Any]) -> list[str]:
         windows = f"{house['active_windows']} active windows of {house['windows']}"
         lines.append(f"who can tell the {windows} (1 is certainty, 0.5 a coin): {told}")
     return lines
+
+
+def _loop_line(controller: News) -> str:
+    """What became of a closed loop."""
+    errors = ", ".join(
+        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller["mean_squared_errors"].items()
+    )
+    line = (
+        f"controller {controller['strategy']}, {controller['decisions']:,} decisions; the estimator's error is {errors}"
+    )
+    failed, clipped = controller["failed_fraction"], controller["clipped_fraction"]
+    if failed:
+        line += f"; {failed:.2%} of inputs were held because a decision failed"
+    if clipped:
+        line += f"; {clipped:.2%} were clipped by the plant"
+    return line
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:

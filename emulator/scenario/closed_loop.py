@@ -97,7 +97,9 @@ def _rows(plant: Mapping[str, Any], slots: Any) -> Iterator[str]:
 def _beside_plant(tables: Mapping[str, Any], process: ProcessTable) -> Iterator[str]:
     """Weights of the wrong number, and what the strategy objects to."""
     try:
-        plant = PlantTable.model_validate(tables["plant"])
+        rows = tables["plant"].get("disturbance_values")
+        few = {"disturbance_values": rows[:1]} if isinstance(rows, list) else {}
+        plant = PlantTable.model_validate({**tables["plant"], **few})
         controller = ControllerTable.model_validate(tables.get("controller"))
     except ValidationError:
         return

@@ -188,6 +188,26 @@ def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
     assert digests(load_results(evedrop.folder / "memory")) == digests(results)
 
 
+def test_what_the_controller_did_differently_is_found(tmp_path: Path) -> None:
+    """By slot and trial, with both values, where only its weights differ; and by its digests where nothing is recorded."""
+    one, other = (in_memory(tmp_path / str(weight), controller__input_weights=[weight]) for weight in (0.1, 0.2))
+    found = difference(one, other)
+    assert not found.same
+    assert found.text.startswith("first difference: slot 0, trial 0, controller: u [")
+    assert " against [" in found.text
+
+
+def test_the_closing_report_has_a_line_on_the_loop(evedrop: Evedrop) -> None:
+    """Both errors, and what was clipped."""
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables()))
+    done = evedrop("montecarlo", "loop.toml", "--trials", "5", "--out", "run")
+    assert done.status == 0
+    line = next(line for line in done.out.splitlines() if line.startswith("controller "))
+    assert line.startswith("controller lqr, 300 decisions; the estimator's error is ")
+    assert "ignoring the input, " in line
+    assert line.endswith("knowing the input")
+
+
 def test_a_trial_is_the_same_alone_and_in_any_batch(tmp_path: Path) -> None:
     """Digests of every receiver and of the controller, trial by trial."""
     many = in_memory(tmp_path / "many").digests.to_pylist()
