@@ -5,7 +5,7 @@ Source: docs/results.md, controller.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from emulator.model.plant import Plant
 from emulator.model.process import Floats, Process
 from emulator.model.receiver import Codes
 from emulator.network.access import LEGITIMATE
+from emulator.runs.household_tally import HouseholdTally
 from emulator.runs.joined import InputSlots
 from emulator.scenario import Scenario
 
@@ -29,15 +30,16 @@ class Acted:
     inputs: InputSlots
     x: Floats
     """(c, n, R)."""
-    x_hat: Floats
-    """Of the legitimate estimator, (c, n, R)."""
+    estimates: Mapping[str, Floats]
+    """Receiver → x̂, (c, n, R)."""
     action: Codes
-    """The same's, (c, R)."""
+    """The legitimate estimator's, (c, R)."""
 
     def part(self, trials: slice) -> Acted:
         """Of some trials."""
         inputs = InputSlots(self.inputs.u[..., trials], self.inputs.failed[:, trials])
-        return Acted(inputs, self.x[..., trials], self.x_hat[..., trials], self.action[:, trials])
+        estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
+        return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials])
 
 
 @dataclass
@@ -82,6 +84,8 @@ class LoopTally:
         self.clipped = 0
         """Trial-slots in which the plant clips an input."""
         self.other_error = 0.0
+        self.household: HouseholdTally | None = None
+        """Of a plant that is a house."""
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> LoopTally | None:
@@ -90,17 +94,21 @@ class LoopTally:
             return None
         comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
         process = scenario.process.process
-        return cls(process, scenario.driven, trials, scenario.legitimate.knows_input, comparable)
+        tally = cls(process, scenario.driven, trials, scenario.legitimate.knows_input, comparable)
+        tally.household = HouseholdTally.of(scenario, trials)
+        return tally
 
     def add(self, acted: Acted) -> None:
         """Take the next slots."""
         inputs = acted.inputs
+        if self.household is not None:
+            self.household.add(acted.x, inputs.u, acted.estimates)
         self.slots += inputs.failed.size
         self.failed += int(np.count_nonzero(inputs.failed))
         self.clipped += int(np.count_nonzero(self._plant.clips(inputs.u)))
         if self._offset is None:
             return
-        error = acted.x - acted.x_hat
+        error = acted.x - acted.estimates[LEGITIMATE]
         for row, (action, u) in enumerate(zip(acted.action, inputs.u, strict=True)):
             error[row] -= self._sign * self._offset.next(action, u)
         error *= error
@@ -118,6 +126,7 @@ class LoopTally:
             whole.failed += part.failed
             whole.clipped += part.clipped
             whole.other_error += part.other_error
+        whole.household = HouseholdTally.merged([part.household for part in known])
         return whole
 
     def summary(

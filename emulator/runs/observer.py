@@ -45,6 +45,7 @@ from emulator.runs.steering import Steering
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
+    from emulator.runs.showing import Showing
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
@@ -123,6 +124,7 @@ class Observation:
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
+        self._showing: Showing | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = self._beaten = time.monotonic()
         self._suspects: list[str] = []
@@ -141,6 +143,7 @@ class Observation:
         with Session(self._brief) as session:
             conductor = Conductor(session, self._scenario.digested, stop, self._beat)
             if self._brief.part["recording"]:
+                self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
                 )
@@ -258,7 +261,7 @@ class Observation:
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         if self._recording is not None:
-            self._recording.add(shown(slots, scored, self._scenario.process.around))
+            self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
         conductor.report(self._joiner.done)
         self._progress(scored)
 
@@ -358,8 +361,16 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
     writer.journal_rows(slots)
 
 
+def showing_of(scenario: Scenario) -> Showing | None:
+    """Who follows the shown trial of a closed loop."""
+    from emulator.runs.showing import Showing  # noqa: PLC0415 - only with a view
+
+    return Showing.of(scenario)
+
+
 def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -> Recording:
     """The run's recording, on disk and, with the address of a viewer, live."""
+    from emulator.runs.showing import driven_scene  # noqa: PLC0415 - only with a view
     from emulator.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
     from emulator.view.scene import Scene, Shown  # noqa: PLC0415 - the same
 
@@ -383,14 +394,15 @@ def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -
         pace=scenario.pace,
         receivers=tuple(receivers),
         noise=float(np.trace(scenario.process.process.Q)),
+        **driven_scene(scenario),
     )
     return Recording(path, scene, live)
 
 
-def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float]) -> Any:
+def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
     """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
 
-    around: the reference from which states are deviations, (n,).
+    around: the reference from which states are deviations, (n,); showing: of a closed loop, who follows the same trial.
     """
     from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
     from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
@@ -406,4 +418,8 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float]) -
         )
         for name, receiver in slots.receivers.items()
     }
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0] + around, nu=slots.nu[:, 0], peers=peers)
+    moved = None
+    if showing is not None and slots.inputs is not None:
+        estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
+        moved = showing.take(slots.inputs.u[:, :, 0], estimates)
+    return ShownSlots(first=slots.first, x=slots.x[:, :, 0] + around, nu=slots.nu[:, 0], peers=peers, moved=moved)

@@ -142,6 +142,9 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"{name}: its error has infinite variance, so the mean over trials is no measure; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
+    if summary["household"] is not None:
+        for line in household_lines(summary["household"]):
+            console.print(line)
     for expectation in summary["expectations"]:
         console.print(told(expectation))
         if "replay" in expectation:
@@ -155,6 +158,27 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def household_lines(house: Mapping[str, Any]) -> list[str]:
+    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it."""
+    seen = house["knowing_truth"]
+    lines = [
+        f"the house buys {_figure(house['bought_energy'], '.3f')} kWh and sells {_figure(house['sold_energy'], '.3f')} kWh; a "
+        f"controller that sees the truth, {_figure(seen['bought_energy'], '.3f')} and {_figure(seen['sold_energy'], '.3f')} kWh"
+    ]
+    shares = [house[f"{name}_difference"] for name in ("net", "total", "summed")]
+    if None not in shares:
+        net, total, summed = (f"{100 * share:.2g} %" for share in shares)
+        lines.append(
+            f"grid power differs from that one's by {net} in net energy, {total} in total, {summed} slot by slot"
+        )
+    areas = {name: one["activity_area"] for name, one in house["receivers"].items()}
+    if None not in areas.values():
+        told = ", ".join(f"{name} {area:.3f}" for name, area in areas.items())
+        windows = f"{house['active_windows']} active windows of {house['windows']}"
+        lines.append(f"who can tell the {windows} (1 is certainty, 0.5 a coin): {told}")
+    return lines
 
 
 def _loop_line(controller: News) -> str:

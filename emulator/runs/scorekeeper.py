@@ -68,8 +68,8 @@ class Scorekeeper:
             x_hats = {name: one.x_hat for name, one in slots.receivers.items()}
             self.filter.add(true_errors(slots.true, slots.x, x_hats))
         if slots.inputs is not None and self.loop is not None:
-            user = slots.receivers[LEGITIMATE]
-            self.loop.add(Acted(slots.inputs, slots.x, user.x_hat, user.action))
+            estimates = {name: one.x_hat for name, one in slots.receivers.items()}
+            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action))
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(
@@ -133,10 +133,12 @@ def summary_of(
     if mode == "covariance-only":
         for peer in peers.values():
             peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
+    house = None if loop is None else loop[0].household
+    household = None if house is None else house.summary()
     user = tallies[LEGITIMATE]
     links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
-    evidence = Evidence(scenario, peers, links, tallies, expected, secret)
+    evidence = Evidence(scenario, peers, links, tallies, expected, secret, household)
     return {
         "scenario": scenario.title,
         "mode": mode,
@@ -157,6 +159,7 @@ def summary_of(
         if loop is None
         else loop[0].summary(scenario, peers[LEGITIMATE], loop[1], digests[CONTROLLER]),
         "filter": None if filtered is None else filtered.summary(scenario),
+        "household": household,
         "surprising": _surprising(scenario, tallies),
         "expectations": evidence.judged(ending.replay),
     }
@@ -222,7 +225,10 @@ def write_resolved(folder: Path, scenario: Scenario) -> None:
     texts = {"scenario.toml": resolved(scenario)}
     plant = scenario.plant
     if plant is not None and plant.disturbance_values:
-        texts = {DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_values), **texts}
+        texts = {
+            DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values),
+            **texts,
+        }
     for name, text in texts.items():
         unfinished = folder / f"{name}.new"
         unfinished.write_text(text, encoding="utf-8")

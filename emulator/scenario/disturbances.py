@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import TraceError
+from emulator.errors import DisturbanceError
 from emulator.model.process import Floats
 from emulator.plant_data import found_file, read_disturbances
 from emulator.scenario.tables import Scenario
@@ -35,21 +35,18 @@ def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
     names = plant.get("disturbances")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         names = []
+    units, slots, seconds = plant.get("disturbance_units"), tables.get("slots"), tables.get("slot_seconds")
+    if not isinstance(units, list) or not all(isinstance(unit, str) for unit in units):
+        units = None
+    slots = slots if type(slots) is int else None
+    seconds = float(seconds) if isinstance(seconds, (int, float)) and seconds > 0 else 1.0
     file = plant.pop("disturbance_file")
     try:
-        plant["disturbance_values"] = read_disturbances(found_file(file, Path()), names)
-    except TraceError as error:
+        plant["disturbance_values"] = read_disturbances(found_file(file, Path()), names, units, slots, seconds)
+    except DisturbanceError as error:
         plant["disturbance_values"] = []
-        return [f"plant.disturbance_file: {file} {error.what}"]
-    few = _few(len(plant["disturbance_values"]), tables.get("slots"))
-    return [f"plant.disturbance_file: {file} {few}"] if few else []
-
-
-def _few(rows: int, slots: Any) -> str | None:
-    """What is wrong with so many rows, if they are too few."""
-    if type(slots) is not int or rows >= slots:
-        return None
-    return f"has {rows} rows; expected slots, which is {slots}, or more"
+        return [f"plant.disturbance_file: {file} {what}" for what in error.mistakes]
+    return []
 
 
 def disturbances_of(scenario: Scenario) -> Floats:

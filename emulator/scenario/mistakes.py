@@ -27,6 +27,7 @@ from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
 from emulator.scenario.filter_noise import filter_mistakes
+from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from emulator.scenario.link_table import CorrelationTable, LinkTable
 from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.table import Found
@@ -110,6 +111,7 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "acknowledgements": AcknowledgementsTable,
         "plant": PlantTable,
         "controller": ControllerTable,
+        "household": HouseholdTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -143,6 +145,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         found += _strategy_mistakes(tables, slots)
     found += acknowledgement_mistakes(tables)
     found += loop_mistakes(tables)
+    found += household_mistakes(tables)
     found += filter_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
@@ -160,6 +163,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
             lambda name: _no_theory(
                 name, tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name], encoding, sound
             ),
+            isinstance(tables.get(HOUSEHOLD), dict),
         )
         for i, expectation in enumerate(expectations):
             if isinstance(expectation, dict):

@@ -26,6 +26,7 @@ from emulator.modules import elsewhere, look_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import ExpectTable
+from emulator.scenario.household import HouseholdTable
 from emulator.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
 from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
 from emulator.scenario.table import (
@@ -284,6 +285,9 @@ class Scenario(Table):
     ] = Field(default_factory=dict)
     plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
+    household: Annotated[
+        HouseholdTable | None, Field(examples=[{"grid": "P_grid", "load": "P_load", "battery": "SOC"}])
+    ] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from emulator.errors import UsageError
 from emulator.model.process import Floats
 from emulator.model.receiver import Action
-from emulator.runs.observer import open_recording
+from emulator.runs.observer import open_recording, showing_of
 from emulator.runs.results import Results, load_results
 from emulator.runs.scorekeeper import event_line
 from emulator.scenario import load
@@ -41,10 +41,17 @@ def replay(folder: Path) -> Path:
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again without --covariance-only or the like")
     _check_shapes(folder, len(scenario.process.A), x, peers)
+    inputs, showing = _inputs(results), showing_of(scenario)
+    if showing is not None and len(inputs) != len(x):
+        raise UsageError(f"{folder}: inputs.parquet has not the slots of trials.parquet; run the scenario again")
+    around = np.array(scenario.process.around)
     recording = open_recording(scenario, folder.name, path, None)
     for first in range(0, len(x), _CHUNK):
         rows = slice(first, min(first + _CHUNK, len(x)))
-        recording.add(Slots(first, x[rows], nu[rows], {name: _cut(peer, rows) for name, peer in peers.items()}))
+        deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
+        moved = None if showing is None else showing.take(inputs[rows], deviations)
+        shown = {name: _cut(peer, rows) for name, peer in peers.items()}
+        recording.add(Slots(first, x[rows], nu[rows], shown, moved))
     for event in results.summary.get("events", ()):
         recording.note(event["slot"], "INFO", event_line(event))
     recording.close()
@@ -77,6 +84,14 @@ def _truth(results: Results, name: str) -> tuple[Floats, np.ndarray[tuple[int, .
     rows = _first_trial(results, name)
     sent = rows["sent"].cast(pa.string()).to_pylist()
     return _matrix(rows["x"]), np.array([word == "innovation" for word in sent], np.bool_)
+
+
+def _inputs(results: Results) -> Floats:
+    """Inputs of the first recorded trial, (slots, m); none without a controller."""
+    rows = results.inputs
+    if rows is None or not rows.num_rows:
+        return np.empty((0, 0))
+    return _matrix(rows.filter(pc.field("trial") == pc.min(rows["trial"])).sort_by("slot")["u"])
 
 
 def _peer(results: Results, name: str) -> PeerSlots:

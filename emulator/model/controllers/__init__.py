@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 from emulator.model.controllers.controller import Assignment, Controller
 from emulator.model.controllers.lqr import Lqr
+from emulator.model.controllers.mpc import Mpc
 
-CONTROLLERS: Mapping[str, type[Controller]] = {"lqr": Lqr}
+CONTROLLERS: Mapping[str, type[Controller]] = {"lqr": Lqr, "mpc": Mpc}
 
 __all__ = ["CONTROLLERS", "Assignment", "Controller"]

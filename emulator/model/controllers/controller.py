@@ -98,6 +98,6 @@ class Controller(ABC):
     def decide(self, k: int, x_hat: Floats, d: Floats) -> Floats:
         """The inputs (m, R) from slot k on, which is a multiple of the period; slots come in order.
 
-        x_hat: estimate of the state of slot k, (n, R); d: the disturbances of slot k, (q,). Sets `failed`. A trial's
-        inputs must not depend on what other trials there are.
+        x_hat: estimate of the state of slot k, (n, R); d: the disturbances of slot k, (q,), or (q, R) where trials differ.
+        Sets `failed`. A trial's inputs must not depend on what other trials there are.
         """

@@ -42,9 +42,12 @@ def gain(assignment: Assignment) -> Floats:
     return K
 
 
-def held(assignment: Assignment) -> tuple[Floats, Floats]:
-    """A and B from one decision to the next, (n, n) and (n, m), the inputs being held between them."""
-    A, B = assignment.process.A, assignment.plant.input_matrix
+def held(assignment: Assignment, entry: Floats | None = None) -> tuple[Floats, Floats]:
+    """A and B from one decision to the next, (n, n) and (n, m), the inputs being held between them.
+
+    entry: instead of B how something else enters the states that is held as long, such as B_d.
+    """
+    A, B = assignment.process.A, assignment.plant.input_matrix if entry is None else entry
     power, driven = np.eye(len(A)), np.zeros(B.shape)
     for _ in range(assignment.period):
         power, driven = product(A, power), product(A, driven) + B
