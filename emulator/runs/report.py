@@ -120,7 +120,7 @@ def closing_table(summary: News, width: int) -> Table:
 
 def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
     """The closing report on standard output; replay: the command that shows one trial live, to complete."""
-    console = _console()
+    console = terminal()
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
     console.print(closing_table(summary, console.width))
@@ -172,14 +172,14 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
             f"{row['mean_trace_covariance']:.4g}",
             row["relative_secrecy"] or "–",
         )
-    console = _console()
+    console = terminal()
     console.print(shown)
     console.print(f"results: {folder}/sweep.parquet, sweep.png")
 
 
 def print_design(design: Design) -> None:
     """Bounds, intervals, optima and the price of secrecy, for people."""
-    console = _console()
+    console = terminal()
     console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
     if design.remark is not None:
         console.print(design.remark)
@@ -240,7 +240,8 @@ class _Console(Console):
         raise  # noqa: PLE0704 - rich calls this where it has caught the error
 
 
-def _console() -> Console:
+def terminal() -> Console:
+    """Standard output; wide where it is no terminal."""
     return _Console(
         highlight=False,
         markup=False,
