@@ -1,10 +1,10 @@
-"""The Python calls: `run`, `montecarlo`, `design`, `load_results`. They do what the commands of the same name do."""
+"""The Python calls: `run`, `montecarlo`, `compare`, `design`, `load_results`. They do what the commands of the same name do."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from emulator.scenario import Scenario, checked, load
 
 if TYPE_CHECKING:
     from emulator.model.design import Design
+    from emulator.runs.compare import Comparison
     from emulator.runs.montecarlo import Plan
 
 Tell = Callable[[Mapping[str, Any]], None]
@@ -85,6 +86,40 @@ def montecarlo(
     made, folder = _prepared(scenario, out, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
     simulate(made, folder, tell, plan)
     return load_results(folder)
+
+
+def compare(
+    scenario: str | Path | Scenario,
+    *,
+    schemes: Sequence[str] | None = None,
+    adversaries: Sequence[str] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    trials: int = 200,
+    out: str | Path | None = None,
+    plan: Plan | None = None,
+    tell: Tell = _silent,
+    **changes: Any,
+) -> Comparison:
+    """Every scheme against every adversary, on a scenario's process and links.
+
+    schemes, adversaries: names, all of them unless said; parameters: of schemes that are not the scenario's own, such as
+    `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
+
+    Raises UsageError with every name that is none, ScenarioError with every mistake of the scenario, RunError if a worker
+    fails, Interrupted on Ctrl-C; after the last two the folder holds the schemes that were done.
+
+    >>> found = compare("acknowledged", schemes=["acknowledged", "innovation"])        # doctest: +SKIP
+    >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
+    >>> found.table.to_pandas()                                                        # doctest: +SKIP
+    """
+    from emulator.runs.compare import compare_all  # noqa: PLC0415 - no other call needs it
+    from emulator.runs.matchups import matchups_of  # noqa: PLC0415 - the same
+    from emulator.runs.montecarlo import Plan  # noqa: PLC0415 - the same
+
+    made, _ = _prepared(scenario, None, {**changes, "trials": trials})
+    name = "scenario" if isinstance(scenario, Scenario) else Path(scenario).name
+    place = Path(out) if out is not None else default_folder(f"compare-{name}")
+    return compare_all(matchups_of(made, schemes, adversaries, parameters), place, tell, plan or Plan())
 
 
 def design(

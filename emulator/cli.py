@@ -135,6 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     add("step", operate.step, "let some slots of a run pass, and hold it again", _going_on, _slots)
     add("status", operate.status, "how a run that goes on is doing", _going_on, _as_json)
     add("sweep", commands.sweep, "Monte Carlo over a grid of values of any entries", _scenario, _over, *_MEMORY)
+    add("compare", commands.compare, "every scheme against every adversary", _scenario, _entries, _output, _compares)
     add("design", commands.design, "admissible μ_d, secrecy, optimum, per eavesdropper", _scenario, _set, _designs)
     add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view)
@@ -290,6 +291,20 @@ def _over(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUES",
         help="an entry and its values, first:last:step or a,b,c; repeatable",
     )
+
+
+def _compares(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--schemes", metavar="A,B", help="default all")
+    parser.add_argument("--adversaries", metavar="X,Y", help="default all")
+    parser.add_argument(
+        "--with",
+        dest="parameters",
+        action="append",
+        default=[],
+        metavar="SCHEME.PARAMETER=VALUE",
+        help="a parameter of a scheme that is not the scenario's own; repeatable",
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="worker processes; the results do not depend on them")
 
 
 def _designs(parser: argparse.ArgumentParser) -> None:

@@ -195,6 +195,47 @@ def sweep(options: argparse.Namespace) -> int:
     return 0
 
 
+def compare(options: argparse.Namespace) -> int:
+    """Compare schemes and adversaries."""
+    from emulator.api import compare as compare_all
+    from emulator.api import default_folder
+    from emulator.runs.compare_report import print_comparison
+    from emulator.runs.montecarlo import Plan
+    from emulator.runs.report import ProgressLine
+    from emulator.scenario import value_of
+
+    changes = _changes(options)
+    parameters = {}
+    for text in options.parameters:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(
+                f"--with {text}: expected SCHEME.PARAMETER=VALUE, such as innovation.state_probability=0.7"
+            )
+        parameters[key] = value_of(value)
+    folder = options.out or default_folder(f"compare-{Path(options.scenario).name}")
+    with ProgressLine(0, "trial-slots", options.json) as line:
+        found = compare_all(
+            options.scenario,
+            schemes=_names(options.schemes),
+            adversaries=_names(options.adversaries),
+            parameters=parameters,
+            out=folder,
+            plan=Plan(workers=options.workers),
+            tell=line.tell,
+            **{"trials": 200, **changes},
+        )
+    if options.json:
+        print(found.as_json(indent=None))
+    else:
+        print_comparison(found, str(folder))
+    return 0
+
+
+def _names(listed: str | None) -> list[str] | None:
+    return None if listed is None else [name.strip() for name in listed.split(",")]
+
+
 def design(options: argparse.Namespace) -> int:
     """Say which μ_d may be chosen, and what each costs and gives."""
     from emulator.api import design as design_of

@@ -20,7 +20,7 @@ GENIE_SCHEMES = ("innovation", "plain")
 
 
 _CLOSED = {
-    ("acknowledged", "reference"): "reference",
+    **{("acknowledged", reader): "reference" for reader in ("legitimate", "reference")},
     ("encrypted-schedule", "selective"): "selective",
     **{("scheduled", reader): "scheduled" for reader in ("legitimate", "naive", "reference", "selective")},
 }

@@ -277,10 +277,15 @@ class Merger:
             covariances = self._mode is Mode.COVARIANCE_ONLY
             writer.slot_rows(0, name, sums, expected[name][:count], quantiles[:count], covariances)
 
+    @property
+    def totals(self) -> dict[str, Tally]:
+        """Receiver → the tally of all that was added."""
+        return {name: merged(tallies) for name, tallies in self._tallies.items()}
+
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> dict[str, Any]:
         """The summary of all that was added."""
-        totals = {name: merged(tallies) for name, tallies in self._tallies.items()}
+        totals = self.totals
         whole = self._whole and self.complete
         digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
         detection = Detection.merged(self._detections) if self._mode is Mode.EXACT else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -120,17 +120,12 @@ def closing_table(summary: News, width: int) -> Table:
 
 def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
     """The closing report on standard output; replay: the command that shows one trial live, to complete."""
-    console = _console()
+    console = terminal()
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
     console.print(closing_table(summary, console.width))
-    for name, link in summary["links"].items():
-        if link.get("within_interval") is False:
-            low, high = link["interval"]
-            console.print(
-                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
-                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
-            )
+    for line in _link_lines(summary["links"]):
+        console.print(line)
     if summary["controller"] is not None:
         console.print(_loop_line(summary["controller"]))
     for verdict in summary["secrecy"].values():
@@ -158,6 +153,17 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
+    """Which links let other shares through than their models say."""
+    for name, link in links.items():
+        if link.get("within_interval") is False:
+            low, high = link["interval"]
+            yield (
+                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
+                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
+            )
 
 
 def household_lines(house: Mapping[str, Any]) -> list[str]:
@@ -214,14 +220,14 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
             f"{row['mean_trace_covariance']:.4g}",
             row["relative_secrecy"] or "–",
         )
-    console = _console()
+    console = terminal()
     console.print(shown)
     console.print(f"results: {folder}/sweep.parquet, sweep.png")
 
 
 def print_design(design: Design) -> None:
     """Bounds, intervals, optima and the price of secrecy, for people."""
-    console = _console()
+    console = terminal()
     console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
     if design.remark is not None:
         console.print(design.remark)
@@ -282,7 +288,8 @@ class _Console(Console):
         raise  # noqa: PLE0704 - rich calls this where it has caught the error
 
 
-def _console() -> Console:
+def terminal() -> Console:
+    """Standard output; wide where it is no terminal."""
     return _Console(
         highlight=False,
         markup=False,

@@ -349,15 +349,16 @@ def seen_actions(action: Codes, nu: Flags) -> Codes:
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json; infinite and undefined numbers as strings, which JSON lacks."""
     unfinished = folder / "summary.json.new"
-    unfinished.write_text(json.dumps(_plain(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    unfinished.write_text(json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     os.replace(unfinished, folder / "summary.json")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The same with infinite and undefined numbers as strings, which JSON lacks."""
     if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(inner) for inner in value]
+        return [plain(inner) for inner in value]
     if isinstance(value, float) and not np.isfinite(value):
         return str(value)
     return value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from emulator.model.link_law import law_of
 from emulator.model.outcomes import closed_form, eavesdropper_outcomes, legitimate_outcomes
 from emulator.model.process import Process
 from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.model.schemes.scheme import Scheme
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.across import acknowledgement_mistakes, away_in, event_mistakes, link_mistakes
 from emulator.scenario.closed_loop import loop_mistakes
@@ -223,8 +224,7 @@ def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
         except ValidationError:
             continue
         strategy = STRATEGIES[table.strategy]
-        needed = [stream for stream in strategy.streams(table.parameters) if stream != "coin"]
-        lacking = [stream for stream in needed if scheme is not None and stream not in scheme.secret_streams]
+        lacking = [] if scheme is None else lacking_streams(strategy.streams(table.parameters), scheme)
         if lacking:
             entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
             able = [one for one in READERS if not READERS[one].streams({})]
@@ -241,6 +241,11 @@ def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
                 f"eavesdroppers.{name}.learns_at: is {betrayed}, when {away}; expected a slot in which it is there"
             )
     return found
+
+
+def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
+    """Of the streams whose keys a strategy must be given, those that a scheme has not."""
+    return [stream for stream in streams if stream != "coin" and stream not in scheme.secret_streams]
 
 
 def _secret_mistakes(file: str) -> list[str]:
