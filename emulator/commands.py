@@ -43,11 +43,13 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
-    """A line for each shipped scenario."""
-    from emulator.scenario import load, shipped
+    """A line for each shipped scenario, also for those that need an extra which is not there."""
+    import tomllib
 
-    for name in shipped():
-        print(f"{name:<16}{load(name).title}")
+    from emulator.scenario import shipped
+
+    for name, path in shipped().items():
+        print(f"{name:<16}{tomllib.loads(path.read_text(encoding='utf-8'))['title']}")
     return 0
 
 

@@ -27,7 +27,7 @@ from emulator.scenario.tables import Scenario
 def shipped() -> dict[str, Path]:
     """The scenarios inside the package: name → file."""
     folder = Path(str(resources.files("scenarios")))
-    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"))}
+    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"), key=lambda path: path.stem)}
 
 
 def write_new(path: Path) -> None:

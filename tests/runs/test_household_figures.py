@@ -10,9 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from emulator import cli
 from emulator.api import montecarlo
 from emulator.errors import ScenarioError
 from emulator.model import privacy
+from emulator.model.controllers import mpc
 from emulator.model.energy import Meter, energy
 from emulator.runs.montecarlo import Plan
 from emulator.scenario import checked, load
@@ -60,6 +62,21 @@ def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], said: str) 
     with pytest.raises(ScenarioError) as caught:
         checked(tables(**changes), "file")
     assert [line for line in caught.value.mistakes if line.startswith(said)], caught.value.mistakes
+
+
+def test_without_the_solver_one_line_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the scenario that needs it; the list of scenarios, and those that do not, need no extra."""
+    monkeypatch.setattr(mpc, "find_spec", lambda _: None)
+    assert cli.main(["check", "microgrid-mpc"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("evedrop[microgrid]") == 1
+    assert "microgrid-mpc: 1 mistake" in told
+    assert "controller.strategy: is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first" in told
+    assert cli.main(["check", "microgrid"]) == 0
+    assert cli.main(["list"]) == 0
+    assert "microgrid-mpc" in capsys.readouterr().out
 
 
 def test_a_house_needs_a_plant() -> None:
