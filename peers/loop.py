@@ -10,8 +10,9 @@ import numpy as np
 
 from emulator.brief import Brief
 from emulator.model.informed import Informed
+from emulator.model.local_filter import LocalFilter
 from emulator.model.plant import Drive, Plant
-from emulator.model.process import Floats
+from emulator.model.process import Floats, Trajectory
 from emulator.model.receiver import Belief, Flags, Receiver
 from emulator.network.session import Session
 from emulator.network.wire import Reader, known, read_decided
@@ -47,6 +48,9 @@ class Actuator:
         self.inputs = 0 if loop is None else plant.inputs
         """How many are decided."""
         self._drive = Drive(plant, disturbances_in(brief.part["plant"]["disturbances"], brief.slots))
+        key = brief.stream_keys.get("measurement", b"")
+        measures = plant.output_matrix is not None
+        self._local = LocalFilter(brief.model.process, plant, key, brief.batch) if measures else None
         self._decided: Decided | None = None
         self._period = 1
         self._put = None
@@ -58,6 +62,17 @@ class Actuator:
     def pushed(self, k: int) -> Floats:
         """What moves the state into slot k, as `Trajectory.advance` takes it."""
         return self._drive.pushed(k)
+
+    def transmitted(self, k: int, x: Floats, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """What is transmitted as the state x (n, R) of slot k, and what its innovation is measured against, (n, R)."""
+        if self._local is None:
+            return x, trajectory.predicted
+        return self._local.take(k, x, self.pushed(k)), self._local.predicted
+
+    @property
+    def measures(self) -> bool:
+        """Whether the sensor filters what it measures."""
+        return self._local is not None
 
     def wait(self, k: int, x: Floats) -> tuple[Floats, Flags] | None:
         """The inputs of slot k, whose state is x (n, R), and where their decision failed; None without a controller."""

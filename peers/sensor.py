@@ -55,12 +55,15 @@ class Window:
 class Holds:
     """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
 
-    def __init__(self, brief: Brief, session: Session, window: Window, scheme: Scheme, inputs: int) -> None:
+    def __init__(
+        self, brief: Brief, session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
+    ) -> None:
         self._session, self._window = session, window
         self._holds = set(brief.part["holds"])
         self._telemetry = session.outlet(session.keys.telemetry(SENSOR))
         watches = brief.part["chart"] is not None
-        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches, inputs)
+        inputs, measures = (0, False) if actuator is None else (actuator.inputs, actuator.measures)
+        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches, inputs, measures)
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
@@ -114,7 +117,7 @@ def sense(brief: Brief) -> None:
         send = session.outlet(session.keys.uplink)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
         actuator = Actuator(brief, session) if plant is not None else None
-        holds = Holds(brief, session, window, scheme, 0 if actuator is None else actuator.inputs)
+        holds = Holds(brief, session, window, scheme, actuator)
         session.ready()
         session.wait_for("start")
         start = time.monotonic()
@@ -129,11 +132,14 @@ def sense(brief: Brief) -> None:
                 holds.hold(k)
                 start += time.monotonic() - began
                 time.sleep(max(0.0, start + k * pace - time.monotonic()) if pace else 0.0)
-            x = trajectory.advance(None if actuator is None else actuator.pushed(k))
-            packet = encoder.encode(k, x, trajectory.predicted)
+            true = trajectory.advance(None if actuator is None else actuator.pushed(k))
+            x, predicted = true, trajectory.predicted
+            if actuator is not None:
+                x, predicted = actuator.transmitted(k, true, trajectory)
+            packet = encoder.encode(k, x, predicted)
             beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
             send(uplink(k, packet.z, **beside.given))
             alarms = back.wait(k, packet) if back is not None else None
-            steered = actuator.wait(k, x) if actuator is not None else None
-            holds.reporter.add(k, x, packet.nu, packet.sent, alarms, steered)
+            steered = actuator.wait(k, true) if actuator is not None else None
+            holds.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
         session.wait_for("end")

@@ -172,6 +172,33 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"event": [{"from": 1, "to": 2, "pause": "legitimate"}], "controller__acts_on": "truth"},
         "event.0.pause: is legitimate, but it is told the inputs, and the loop would stand still; expected a cut",
     ),
+    "no filter": (
+        {"process__Q": "filter"},
+        'process.Q: is "filter", but the sensor has none; expected a matrix, or output_matrix and measurement_noise in [p',
+    ),
+    "measured without noise": (
+        {"plant__output_matrix": [[1.0, 0.0]]},
+        "plant.measurement_noise: is missing beside output_matrix; expected measurement_noise = [[0.01]], or neither",
+    ),
+    "measured states": (
+        {"plant__output_matrix": [[1.0]], "plant__measurement_noise": [[0.01]]},
+        "plant.output_matrix: has a row of 1 numbers; expected 2, one for each state",
+    ),
+    "noise of measurements": (
+        {"plant__output_matrix": [[1.0, 0.0]], "plant__measurement_noise": [[0.01, 0.0]]},
+        "plant.measurement_noise: has rows of [2] numbers; expected 1 × 1, as output_matrix has rows",
+    ),
+    "unseen": (
+        {"plant__output_matrix": [[1.0, 0.0]], "plant__measurement_noise": [[0.01]]},
+        "plant.output_matrix: leaves the sensor's filter without an end: what it measures must show every state",
+    ),
+    "inverse of Q": (
+        {
+            "process__singular_noise": True,
+            "eavesdroppers": {"eve": {"strategy": "bayesian", "link": {"quality": 0.5}}},
+        },
+        "eavesdroppers.eve.strategy: is bayesian, which reckons with the inverse of Q, and Q may be singular",
+    ),
     "reserved": (
         {"eavesdroppers": {"controller": {"strategy": "smart", "link": {"quality": 0.5}}}},
         'eavesdroppers.controller: is "controller"; expected any name but',

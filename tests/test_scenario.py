@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from emulator.errors import ScenarioError, UsageError
 from emulator.runs.estimates import warnings_of
-from emulator.runs.scorekeeper import resolved
+from emulator.runs.scorekeeper import resolved, write_resolved
 from emulator.scenario import Scenario, load, parse, shipped, value_of, write_new
 
 GOOD: dict[str, Any] = {

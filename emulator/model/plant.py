@@ -37,6 +37,10 @@ class Plant:
     state_lower: Floats
     """(n,)."""
     state_upper: Floats
+    output_matrix: Floats | None = None
+    """C, (p, n), of a sensor that measures y = C x + v and filters; None of one that knows x."""
+    measurement_noise: Floats | None = None
+    """Covariance of v, (p, p)."""
 
     @property
     def inputs(self) -> int:
@@ -51,7 +55,8 @@ class Plant:
             for name in ("input_lower", "input_upper", "state_lower", "state_upper")
         }
         matrices = ("input_matrix", "disturbance_matrix", "noise", "start")
-        return {**{name: getattr(self, name).tolist() for name in matrices}, **limits}
+        measured = ("output_matrix", "measurement_noise") if self.output_matrix is not None else ()
+        return {**{name: getattr(self, name).tolist() for name in (*matrices, *measured)}, **limits}
 
     @classmethod
     def of(cls, spec: Mapping[str, Any]) -> Plant:
@@ -66,7 +71,8 @@ class Plant:
         matrices = {
             name: np.array(spec[name], np.float64).reshape(n, -1) for name in ("input_matrix", "disturbance_matrix")
         }
-        return cls(**matrices, noise=np.array(spec["noise"]), start=np.array(spec["start"]), **limits)
+        measured = {name: np.array(spec[name]) for name in ("output_matrix", "measurement_noise") if name in spec}
+        return cls(**matrices, noise=np.array(spec["noise"]), start=np.array(spec["start"]), **limits, **measured)
 
     def limited(self, u: Floats) -> Floats:
         """What the plant makes of inputs u (m, R): within its limits."""

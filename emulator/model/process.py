@@ -8,6 +8,7 @@ Source: docs/mathematics.md, model.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -67,6 +68,13 @@ class Process:
     A: Floats
     Q: Floats
     initial_covariance: Floats
+    singular_noise: bool = False
+    """Whether Q may be singular, as that of a filter's innovations is."""
+
+    @cached_property
+    def noise_factor(self) -> Floats:
+        """Lower triangular G with G Gᵀ = Q, (n, n)."""
+        return semidefinite_factor(self.Q) if self.singular_noise else cholesky(self.Q)
 
     @property
     def n(self) -> int:
@@ -116,7 +124,7 @@ class ProcessNoise:
         self._initial = initial
         self._reader = BlockReader(key, batch, process.n)
         self._initial_factor = cholesky(process.initial_covariance)
-        self._factor = cholesky(process.Q) if covariance is None else semidefinite_factor(covariance)
+        self._factor = process.noise_factor if covariance is None else semidefinite_factor(covariance)
         self._slots = range(0)
         self._noise: Floats
 
@@ -180,7 +188,7 @@ class StateFactors:
 
     def __init__(self, process: Process) -> None:
         self._A: Rows = process.A.tolist()
-        self._noise_factor: Rows = cholesky(process.Q).tolist()
+        self._noise_factor: Rows = process.noise_factor.tolist()
         self._initial = self._times_A(cholesky(process.initial_covariance).tolist())
         self._k = 1
         self._carried = self._initial
@@ -208,8 +216,12 @@ class StateFactors:
         return product_rows
 
 
-def mistakes_of(A: Floats, Q: Floats, initial_covariance: Floats) -> list[tuple[str, str]]:
+def mistakes_of(
+    A: Floats, Q: Floats, initial_covariance: Floats, singular_noise: bool = False
+) -> list[tuple[str, str]]:
     """Everything that keeps the three from being a process: (entry, sentence) for each mistake, none if it is one.
+
+    singular_noise: Q may be singular.
 
     Source: docs/mathematics.md, model (assumptions).
     """
@@ -220,6 +232,12 @@ def mistakes_of(A: Floats, Q: Floats, initial_covariance: Floats) -> list[tuple[
         return found
     for name, M in (("Q", Q), ("initial_covariance", initial_covariance)):
         found += [(name, sentence) for sentence in _covariance_mistakes(M)]
+    if singular_noise:
+        found = [entry for entry in found if entry[0] != "Q" or "positive definite" not in entry[1]]
+        with suppress(ValueError):
+            semidefinite_factor(Q)
+            return found
+        return [*found, ("Q", "has an eigenvalue below 0; expected a covariance")]
     if any(name == "Q" and "positive definite" in sentence for name, sentence in found):
         reached = _reachable(A, Q)
         if reached < A.shape[0]:

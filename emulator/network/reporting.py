@@ -26,7 +26,7 @@ def is_due(brief: Brief, k: int) -> bool:
 class TruthReporter:
     """The sensor's reports: states and schedule; what was sent at all, alarms, and inputs, where there are such things. Final.
 
-    inputs: how many a controller decides.
+    inputs: how many a controller decides; measures: whether the sensor filters what it measures.
     """
 
     def __init__(
@@ -36,6 +36,7 @@ class TruthReporter:
         may_be_silent: bool = False,
         watches: bool = False,
         inputs: int = 0,
+        measures: bool = False,
     ) -> None:
         self._brief = brief
         self._put = put
@@ -45,6 +46,7 @@ class TruthReporter:
         self._alarms = np.zeros_like(self._nu) if watches else None
         self._u = np.empty((brief.flow.batch, inputs, brief.trials)) if inputs else None
         self._failed = np.zeros_like(self._nu) if inputs else None
+        self._true = np.empty_like(self._x) if measures else None
         self._first = 0
 
     def add(
@@ -55,8 +57,12 @@ class TruthReporter:
         sent: Flags | None = None,
         alarms: Flags | None = None,
         steered: tuple[Floats, Flags] | None = None,
+        true: Floats | None = None,
     ) -> None:
-        """Take slot k, and report if it is time; steered: its inputs (m, R), and where their decision failed, (R,)."""
+        """Take slot k, and report if it is time.
+
+        steered: its inputs (m, R), and where their decision failed, (R,); true: its true state, (n, R), if x is a filter's.
+        """
         row = k % self._brief.flow.batch
         self._x[row] = x
         self._nu[row] = nu
@@ -65,6 +71,8 @@ class TruthReporter:
                 column[row] = values
         if steered is not None and self._u is not None and self._failed is not None:
             self._u[row], self._failed[row] = steered
+        if true is not None and self._true is not None:
+            self._true[row] = true
         if is_due(self._brief, k):
             self.flush(k + 1)
 
@@ -76,8 +84,8 @@ class TruthReporter:
             sent, alarms, failed = (
                 None if column is None else column[rows] for column in (self._sent, self._alarms, self._failed)
             )
-            u = None if self._u is None else self._u[rows]
-            self._put(Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed).pack())
+            u, true = (None if column is None else column[rows] for column in (self._u, self._true))
+            self._put(Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed, true).pack())
         self._first = end
 
 

@@ -347,6 +347,8 @@ class Truth:
     """The inputs as they were decided, (c, m, R); None without a controller."""
     failed: Flags | None = None
     """Where their decision failed, (c, R)."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters: x is what it makes of them; None where they are x."""
 
     @property
     def count(self) -> int:
@@ -364,11 +366,13 @@ class Truth:
             fields["u"] = self.u.tobytes()
         if self.failed is not None and self.failed.any():
             fields["failed"] = packed_flags(self.failed).tobytes()
+        if self.true is not None:
+            fields["true"] = self.true.tobytes()
         return pack(fields)
 
 
-def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int = 0) -> Truth:
-    """The sensor's telemetry that must begin at slot `first`, with so many inputs."""
+def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int = 0, measures: bool = False) -> Truth:
+    """The sensor's telemetry that must begin at slot `first`, with so many inputs, and of one that filters or not."""
     k, c = message.slot(first), message.integer("c", 1)
     n, trials = shape
     flags = {
@@ -384,6 +388,7 @@ def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int 
         flags["alarms"],
         message.finite("u", (c, inputs, trials)) if inputs else None,
         _failed(message, (c, trials)) if inputs else None,
+        message.finite("true", (c, n, trials)) if measures else None,
     )
 
 

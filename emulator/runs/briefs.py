@@ -68,6 +68,11 @@ class StreamKeys:
         return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
 
     @property
+    def measurement(self) -> bytes:
+        """Of the noise of what the sensor measures."""
+        return stream_key(self.seed_root, "measurement")
+
+    @property
     def way_back(self) -> bytes:
         """Of the losses of acknowledgements."""
         return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
@@ -112,7 +117,7 @@ def briefs_of(
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d
-    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header))
+    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
     loop = LoopBriefs(scenario)
 
@@ -157,7 +162,7 @@ def briefs_of(
         brief(
             SENSOR,
             "sensor",
-            {"process": keys.process, **keys.secret(scheme.secret_streams)},
+            {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)},
             {
                 "scheme": spec,
                 "pace": scenario.pace,

@@ -82,6 +82,8 @@ class Slots:
     """As in `Truth`."""
     inputs: InputSlots | None = None
     """None without a controller."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters; None where they are x."""
 
     @property
     def count(self) -> int:
@@ -139,8 +141,13 @@ class Joiner:
         shape: tuple[int, int],
         recorded: int,
         loop: tuple[int, int] | None = None,
+        measures: bool = False,
     ) -> None:
-        """windows: receiver → slots by which a packet may be late for it; loop: a controller's inputs, and its period."""
+        """windows: receiver → slots by which a packet may be late for it; loop: a controller's inputs, and its period.
+
+        measures: whether the sensor filters what it measures.
+        """
+        self._measures = measures
         self._windows = windows
         self._shape = shape
         self._recorded = recorded
@@ -182,7 +189,8 @@ class Joiner:
 
     def truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
-        message = read_truth(telemetry, self._truth.end, self._shape, 0 if self._loop is None else self._loop[0])
+        inputs = 0 if self._loop is None else self._loop[0]
+        message = read_truth(telemetry, self._truth.end, self._shape, inputs, self._measures)
         self._truth.add(message, message.count)
 
     def report(self, name: str, telemetry: Reader) -> None:
@@ -238,7 +246,8 @@ class Joiner:
         if self._loop is not None:
             u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
             inputs = InputSlots(u, failed)
-        return Slots(first, x, nu, receivers, sent, alarms, inputs)
+        true = _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._measures else None
+        return Slots(first, x, nu, receivers, sent, alarms, inputs, true)
 
 
 def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:

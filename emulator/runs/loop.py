@@ -6,6 +6,7 @@ Source: docs/mathematics.md, closed loop.
 from __future__ import annotations
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,9 +14,11 @@ from emulator.model.controllers import CONTROLLERS
 from emulator.model.digest import Digests, InputLog
 from emulator.model.informed import Informed
 from emulator.model.plant import Drive
-from emulator.model.process import Floats
+from emulator.model.process import Floats, Trajectory
 from emulator.model.receiver import Receiver
 from emulator.network.access import LEGITIMATE
+from emulator.runs.briefs import StreamKeys
+from emulator.runs.filtering import local_filter_of
 from emulator.runs.joined import InputSlots
 from emulator.runs.loop_tally import SolveTimes
 from emulator.scenario import Scenario
@@ -30,16 +33,40 @@ def informed(scenario: Scenario, estimator: Receiver) -> Receiver:
     return Informed(estimator, scenario.driven, scenario.window(LEGITIMATE))
 
 
+class Made(NamedTuple):
+    """A slot's states, (n, R) each."""
+
+    true: Floats
+    x: Floats
+    """What is transmitted as the state: the true one, or what the sensor's filter makes of it."""
+    predicted: Floats
+    """A times that of the slot before."""
+
+
+class Source(NamedTuple):
+    """What the states of a batch are drawn from."""
+
+    keys: StreamKeys
+    initial: Floats | None
+    """As of `Trajectory`."""
+    batch: Batch
+
+
 class Loop:
-    """What moves the states of a batch besides their process, slot by slot: plant and controller, or nothing. Final.
+    """The states of a batch and what moves them, slot by slot: plant and controller, or their process alone. Final.
 
     digests: is given the controller's, block by its first slot → (R, 32); times: what decisions take.
     """
 
     def __init__(
-        self, scenario: Scenario, estimator: Receiver, batch: Batch, digests: dict[int, Digests], times: SolveTimes
+        self, scenario: Scenario, source: Source, estimator: Receiver, digests: dict[int, Digests], times: SolveTimes
     ) -> None:
         self._estimator, self._digests, self._times = estimator, digests, times
+        keys, initial, batch = source
+        process, driven = scenario.process.process, scenario.driven
+        noise = None if driven is None else driven.noise
+        self._trajectory = Trajectory(process, keys.process, batch, initial, noise)
+        self._local = local_filter_of(scenario, keys.measurement, batch)
         self._trials = batch.trials
         plant, self._table, assignment = scenario.driven, scenario.controller, scenario.assignment
         self._disturbances = disturbances_of(scenario)
@@ -61,9 +88,21 @@ class Loop:
         """Those of the slots that were begun with; None without a controller."""
         return None if self._table is None else self._rows
 
-    def pushed(self, k: int) -> Floats | None:
-        """What moves the state into slot k besides A and w, as `Trajectory.advance` takes it."""
-        return None if self._drive is None else self._drive.pushed(k)
+    @property
+    def filters(self) -> bool:
+        """Whether the sensor filters what it measures."""
+        return self._local is not None
+
+    def advance(self, k: int) -> Made:
+        """The states of slot k; slots come in order."""
+        if self._drive is None:
+            true = self._trajectory.advance()
+            return Made(true, true, self._trajectory.predicted)
+        pushed = self._drive.pushed(k)
+        true = self._trajectory.advance(pushed)
+        if self._local is None:
+            return Made(true, true, self._trajectory.predicted)
+        return Made(true, self._local.take(k, true, pushed), self._local.predicted)
 
     def act(self, k: int, row: int, x: Floats, x_hat: Floats) -> None:
         """Decide the inputs of slot k, which is one of those begun with, from the state and its estimate, (n, R)."""

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from base64 import b64encode
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from emulator.network.access import Wiring
 from emulator.scenario import Scenario
 from emulator.scenario.disturbances import disturbances_of
+
+if TYPE_CHECKING:
+    from emulator.runs.briefs import StreamKeys
 
 
 class LoopBriefs:
@@ -34,6 +37,12 @@ class LoopBriefs:
     def plant(self) -> dict[str, Any] | None:
         """What moves the states: for the sensor."""
         return None if self._plant is None else {**self._plant, "disturbances": self._disturbances}
+
+    def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
+        """The streams that the sensor owns, those of the secret aside."""
+        driven = self._scenario.driven
+        measures = driven is not None and driven.output_matrix is not None
+        return {"process": keys.process, **({"measurement": keys.measurement} if measures else {})}
 
     @property
     def of_sensor(self) -> dict[str, Any] | None:

@@ -23,6 +23,7 @@ from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.schemes import scheme_of
 from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
+from emulator.runs.filtering import FilterTally
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
@@ -220,6 +221,7 @@ class Merger:
         self._detections: list[Detection] = []
         self._loops: list[LoopTally | None] = []
         self._solve_times = SolveTimes()
+        self._filters: list[FilterTally | None] = []
         self.trials = 0
 
     @property
@@ -235,6 +237,7 @@ class Merger:
             self.trials += block.trials
             self._detections.append(block.detection)
             self._loops.append(block.loop)
+            self._filters.append(block.filter)
             for name in self._scenario.receivers:
                 self._sums[name].add(0, block.sums[name])
                 self._tallies[name][block.start] = block.tallies[name]
@@ -284,4 +287,7 @@ class Merger:
         events = events_of(self._scenario, min(total.done for total in totals.values()))
         loop = LoopTally.merged(self._loops) if self._mode is Mode.EXACT else None
         looped = None if loop is None else (loop, self._solve_times)
-        return summary_of(self._scenario, totals, digests, ending, self._mode.value, events, detection, looped)
+        filtered = FilterTally.merged(self._filters) if self._mode is Mode.EXACT else None
+        return summary_of(
+            self._scenario, totals, digests, ending, self._mode.value, events, detection, looped, filtered
+        )

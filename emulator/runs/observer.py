@@ -112,7 +112,8 @@ class Observation:
         windows = {name: scenario.window(name) for name in scenario.receivers}
         table, plant = scenario.controller, scenario.driven
         loop = None if table is None or plant is None else (plant.inputs, table.period)
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop)
+        measures = plant is not None and plant.output_matrix is not None
+        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
         self._solve_times = SolveTimes()
         self._confirmations = confirmations
         self._steering: Steering
@@ -294,6 +295,7 @@ class Observation:
             ending,
             events=self._events,
             detection=self._keeper.detection,
+            filtered=self._keeper.filter,
             loop=None if self._keeper.loop is None else (self._keeper.loop, self._solve_times),
         )
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):

@@ -21,6 +21,7 @@ from emulator.plant_data import disturbances_text
 from emulator.runs.acknowledging import Detection
 from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
+from emulator.runs.filtering import FilterTally, true_errors
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
@@ -52,6 +53,7 @@ class Scorekeeper:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self.detection = Detection(trials)
         self.loop = LoopTally.of(scenario, trials)
+        self.filter = FilterTally.of(scenario)
         self.tallies = {
             name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches_of(scenario).items()
         }
@@ -61,9 +63,13 @@ class Scorekeeper:
         scored = {}
         if slots.alarms is not None:
             self.detection.add(slots.first, slots.alarms)
+        if slots.true is not None and self.filter is not None:
+            x_hats = {name: one.x_hat for name, one in slots.receivers.items()}
+            self.filter.add(true_errors(slots.true, slots.x, x_hats))
         if slots.inputs is not None and self.loop is not None:
             estimates = {name: one.x_hat for name, one in slots.receivers.items()}
-            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action))
+            true = slots.x if slots.true is None else slots.true
+            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(
@@ -110,6 +116,7 @@ def summary_of(
     events: Sequence[Mapping[str, Any]] = (),
     detection: Detection | None = None,
     loop: tuple[LoopTally, SolveTimes] | None = None,
+    filtered: FilterTally | None = None,
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
     expected = expectations_of(scenario)
@@ -150,6 +157,7 @@ def summary_of(
         if loop is None
         else loop[0].summary(scenario, peers[LEGITIMATE], loop[1], digests[CONTROLLER]),
         "household": household,
+        "filter": None if filtered is None else filtered.summary(scenario),
         "surprising": _surprising(scenario, tallies),
         "expectations": evidence.judged(ending.replay),
     }

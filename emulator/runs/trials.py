@@ -18,6 +18,7 @@ from emulator.model.digest import Digests
 from emulator.model.process import Floats
 from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
+from emulator.runs.filtering import FilterTally
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import Slots
 from emulator.runs.loop_tally import LoopTally, SolveTimes
@@ -53,6 +54,7 @@ class Block:
     digests: dict[str, dict[int, Digests]]
     detection: Detection
     loop: LoopTally | None = None
+    filter: FilterTally | None = None
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,7 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
             for block in result.blocks:
                 place = block.start - result.start
                 block.detection.add(chunk.first, chunk.alarms[:, place : place + block.trials])
-        if chunk.acted is not None:
-            for block in result.blocks:
-                place = block.start - result.start
-                if block.loop is not None:
-                    block.loop.add(chunk.acted.part(slice(place, place + block.trials)))
+        _add_plant(result, chunk)
         if chunk.recorded is not None:
             result.recorded.append(chunk.recorded.copied())
         tell(len(trials) * _count(chunk))
@@ -133,6 +131,7 @@ def _empty_block(scenario: Scenario, start: int, stop: int) -> Block:
         {},
         Detection(trials),
         LoopTally.of(scenario, trials),
+        FilterTally.of(scenario),
     )
 
 
@@ -156,6 +155,16 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
                 block.tallies[name].account_late(account.late, *part.late)
         result.errors[name].add(chunk.first, measured.error)
         result.traces[name].add(chunk.first, measured.trace)
+
+
+def _add_plant(result: BatchResult, chunk: Chunk) -> None:
+    """Take what a chunk says of a plant's controller and filter."""
+    for block in result.blocks:
+        rows = slice(block.start - result.start, block.start - result.start + block.trials)
+        if block.loop is not None and chunk.acted is not None:
+            block.loop.add(chunk.acted.part(rows))
+        if block.filter is not None and chunk.true_errors is not None:
+            block.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
 
 
 def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tuple[Block, Measured]]:

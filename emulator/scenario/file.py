@@ -19,6 +19,7 @@ from pydantic import (
 
 from emulator.errors import ScenarioError, UsageError
 from emulator.scenario.disturbances import disturbances_beside, disturbances_read
+from emulator.scenario.filter_noise import filter_noise_read
 from emulator.scenario.mistakes import across_tables, sentences
 from emulator.scenario.recordings import beside, read_recordings
 from emulator.scenario.tables import Scenario
@@ -104,7 +105,7 @@ def checked(
     """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake."""
     for key, value in (changes or {}).items():
         _set(tables, key, value)
-    recordings = [*read_recordings(tables), *disturbances_read(tables)]
+    recordings = [*read_recordings(tables), *disturbances_read(tables), *filter_noise_read(tables)]
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:

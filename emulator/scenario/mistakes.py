@@ -27,6 +27,7 @@ from emulator.scenario.across import acknowledgement_mistakes, event_mistakes, l
 from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.filter_noise import filter_mistakes
 from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.table import Found
@@ -157,6 +158,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
     found += acknowledgement_mistakes(tables)
     found += loop_mistakes(tables)
     found += household_mistakes(tables)
+    found += filter_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)

@@ -35,6 +35,8 @@ class PlantTable(Table):
     disturbance_file: Annotated[str | None, Field(strict=True, examples=["day.csv"])] = None
     disturbance_values: Annotated[Matrix | None, Field(examples=[[[0.0, 0.4], [0.0, 0.4]]])] = None
     noise: Annotated[Matrix | None, Field(examples=[[[1e-6, 0.0], [0.0, 1e-6]]])] = None
+    output_matrix: Annotated[Matrix | None, Field(examples=[[[1.0, 0.0]]])] = None
+    measurement_noise: Annotated[Matrix | None, Field(examples=[[[0.01]]])] = None
     start: Annotated[Numbers | None, Field(examples=[[55.0, 50.0]])] = None
     state_lower: Annotated[Numbers | None, Field(examples=[[20.0, 10.0]])] = None
     state_upper: Annotated[Numbers | None, Field(examples=[[90.0, 90.0]])] = None
@@ -69,6 +71,10 @@ class PlantTable(Table):
         inputs = table.get("inputs") or []
         if isinstance(inputs, list):
             found += limit_mistakes(table, "input", len(inputs), "one for each of inputs", {})
+        for one, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
+            if table.get(one) is not None and table.get(other) is None:
+                example = as_toml((cls.model_fields[other].examples or [0])[0])
+                found.append((other, f"is missing beside {one}; expected {other} = {example}, or neither"))
         rows, disturbances = table.get("disturbance_values"), table.get("disturbances") or []
         if isinstance(disturbances, list):
             if disturbances and rows is None:
@@ -169,6 +175,8 @@ def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:
         limits(table.input_upper, np.inf, m),
         limits(table.state_lower, -np.inf, n) - around,
         limits(table.state_upper, np.inf, n) - around,
+        None if table.output_matrix is None else np.array(table.output_matrix),
+        None if table.measurement_noise is None else np.array(table.measurement_noise),
     )
 
 

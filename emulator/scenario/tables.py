@@ -53,6 +53,7 @@ class ProcessTable(Table):
     A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
     Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
     initial_covariance: Annotated[Matrix, Field(examples=[[[1.0, 0.0], [0.0, 1.0]]])]
+    singular_noise: Annotated[bool, Field(strict=True, examples=[True])] = False
     reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
     states: Annotated[
         list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
@@ -81,8 +82,9 @@ class ProcessTable(Table):
         if matrices:
             known = matrices.get("A", next(iter(matrices.values())))
             stand_in = np.eye(len(known))
-            all_three = [matrices.get(name, stand_in) for name in _MATRICES]
-            found += [(name, what) for name, what in mistakes_of(*all_three) if name in matrices]
+            A, Q, initial = (matrices.get(name, stand_in) for name in _MATRICES)
+            singular = table.get("singular_noise") is True
+            found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
             for name in ("reference", "states", "units"):
                 values = table.get(name)
                 if isinstance(values, list) and len(values) != len(known):
@@ -97,7 +99,7 @@ class ProcessTable(Table):
     @property
     def process(self) -> Process:
         """The process it describes."""
-        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
+        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
 
 
 class EncodingTable(Table):

@@ -73,7 +73,10 @@ def test_without_the_solver_one_line_says_what_to_install(
     told = capsys.readouterr().err
     assert told.count("evedrop[microgrid]") == 1
     assert "microgrid-mpc: 1 mistake" in told
-    assert "controller.strategy: is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first" in told
+    assert (
+        "controller.strategy: is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first"
+        in told
+    )
     assert cli.main(["check", "microgrid"]) == 0
     assert cli.main(["list"]) == 0
     assert "microgrid-mpc" in capsys.readouterr().out

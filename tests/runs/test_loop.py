@@ -135,6 +135,37 @@ LIVE: dict[str, dict[str, Any]] = {
     },
 }
 
+MEASURED: dict[str, Any] = {
+    "process__Q": "filter",
+    "plant__output_matrix": [[1.0, 0.0], [0.0, 1.0]],
+    "plant__measurement_noise": [[0.01, 0.0], [0.0, 0.01]],
+    "plant__noise": [[1e-3, 0.0], [0.0, 1e-3]],
+}
+LIVE["filtered"] = {"trials": 2, **MEASURED}
+
+
+def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted(tmp_path: Path) -> None:
+    """They add up, for x − x̂ˢ is orthogonal to all that anybody is told; the filter's error is its covariance's."""
+    summary = in_memory(tmp_path / "run", trials=400, **MEASURED).summary
+    found = summary["filter"]
+    assert found["mean_squared_error"] == pytest.approx(found["mean_trace_covariance"], rel=0.03)
+    for name in ("legitimate", "smart"):
+        transmitted = summary["peers"][name]["mean_squared_error"]
+        both = transmitted + found["mean_squared_error"]
+        assert found["mean_true_squared_errors"][name] == pytest.approx(both, rel=0.03)
+        assert found["mean_true_squared_errors"][name] > transmitted
+
+
+def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
+    """One measurement of two states: Q has rank one, and the warning says what that gives away."""
+    one = {"plant__output_matrix": [[0.0, 1.0]], "plant__measurement_noise": [[0.01]]}
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables(**{**MEASURED, **one})))
+    done = evedrop("montecarlo", "loop.toml", "--trials", "5", "--out", "run")
+    assert done.status == 0
+    assert "warning: process.Q is singular: two states one after the other differ" in done.err
+    Q = np.array(load(evedrop.folder / "run").process.Q)
+    assert np.linalg.matrix_rank(Q, tol=1e-12) == 1
+
 
 @pytest.mark.parametrize("case", LIVE)
 def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:

@@ -51,7 +51,11 @@ def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
 
 def test_what_is_summed_slot_by_slot_depends_on_the_weights(tmp_path: Path) -> None:
     """The same two hours with a grid power that may change at will: the third measure is beyond what the paper says."""
-    eager = {"controller__input_weights": [0.02, 0.001], "controller__rate_weights": [1.0, 0.0], "controller__period": 5}
+    eager = {
+        "controller__input_weights": [0.02, 0.001],
+        "controller__rate_weights": [1.0, 0.0],
+        "controller__period": 5,
+    }
     scenario = part_of_day("microgrid", 36_000, 7200, **NO_PACKETS, **eager)
     found = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
     assert found["net"] < PAPER < found["summed"]

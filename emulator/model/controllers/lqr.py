@@ -3,7 +3,7 @@
 It minimises Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) over decisions, u′ being the inputs before, as if there were neither
 limits nor disturbances: u = −K [x; u′]. The Riccati equation is solved by the structured doubling algorithm.
 
-Source: Chu, Fan and Lin (2005), Linear Algebra and its Applications 396; docs/mathematics.md, closed loop.
+Source: Chu, Fan and Lin (2005), Linear Algebra and its Applications 396; docs/mathematics.md, regulator.
 """
 
 from __future__ import annotations
