@@ -137,9 +137,8 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"{name}: its error has infinite variance, so the mean over trials is no measure; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
-    if summary["household"] is not None:
-        for line in household_lines(summary["household"]):
-            console.print(line)
+    for line in household_lines(summary["household"]):
+        console.print(line)
     for expectation in summary["expectations"]:
         console.print(told(expectation))
         if "replay" in expectation:
@@ -166,8 +165,10 @@ def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def household_lines(house: Mapping[str, Any]) -> list[str]:
-    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it."""
+def household_lines(house: Mapping[str, Any] | None) -> list[str]:
+    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it; or nothing."""
+    if house is None:
+        return []
     seen = house["knowing_truth"]
     lines = [
         f"the house buys {_figure(house['bought_energy'], '.3f')} kWh and sells {_figure(house['sold_energy'], '.3f')} kWh; a "
