@@ -29,6 +29,7 @@ from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
 from emulator.scenario.filter_noise import filter_mistakes
 from emulator.scenario.plant import ControllerTable, PlantTable
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
     SECRET_BYTES,
@@ -38,7 +39,6 @@ from emulator.scenario.tables import (
     EncodingTable,
     LegitimateTable,
     LinkTable,
-    ProcessTable,
     Scenario,
 )
 from emulator.scenario.words import as_toml, listed
