@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from emulator.model.follower import Follower
 from emulator.model.receiver import Belief, Receiver
 from emulator.network.reporting import BeliefReporter
 from emulator.network.resending import Due
-from emulator.network.session import Session
+from emulator.network.session import Inbox, Session
 from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_acknowledgement, read_delivery
 
 
@@ -59,7 +61,7 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
                 k = stop
             if found != k:
                 if found < k and put_acknowledgement is not None:
-                    put_acknowledgement(acknowledgement(found, read_acknowledgement(message, found, brief.trials)))
+                    put_acknowledgement(_acknowledged(message, brief.trials))
                 due.missed(k, found)
                 continue
             arrival = read_delivery(message, k, shape, brief.model.header)
@@ -68,7 +70,28 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
             belief = follower.take(k, arrival)
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
+        if put_acknowledgement is not None:
+            # Who has all it needs may still be asked for its acknowledgements; the thread ends with the session.
+            _acknowledge_again(deliveries, put_acknowledgement, downlink, brief.trials)
         session.wait_for("end")
+
+
+def _acknowledge_again(deliveries: Inbox, put: Callable[[bytes], None], key: str, trials: int) -> None:
+    """Acknowledge whatever still comes, on a thread of its own."""
+
+    def go_on() -> None:
+        for delivery in deliveries:
+            message = Reader(key, delivery.payload.to_bytes())
+            if not is_hold(message):
+                put(_acknowledged(message, trials))
+
+    threading.Thread(target=go_on, name="acknowledges", daemon=True).start()
+
+
+def _acknowledged(delivery: Reader, trials: int) -> bytes:
+    """The acknowledgement of a delivery, whose γ is where a delivery has its own."""
+    k = delivery.integer("k")
+    return acknowledgement(k, read_acknowledgement(delivery, k, trials))
 
 
 def _save(brief: Brief, belief: Belief) -> None:
