@@ -13,12 +13,14 @@ import signal
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.errors import BriefError, Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
+    from emulator.brief import Brief
     from emulator.runs.montecarlo import Plan
     from emulator.runs.viewer import Viewer
     from emulator.scenario import Scenario
@@ -331,8 +333,12 @@ def fit_link(options: argparse.Namespace) -> int:
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
+    from emulator.runs.ports import meeting_at
 
-    for path in write_briefs(_loaded(options), options.listen, options.results, options.out):
+    if not 1 <= options.wait <= 30 * 86_400:
+        raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
+    meeting = meeting_at(options.listen, options.connect, options.insecure)
+    for path in write_briefs(_loaded(options), meeting, options.results, options.out, options.wait):
         print(path)
     return 0
 
@@ -343,7 +349,21 @@ def process(options: argparse.Namespace) -> int:
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
-    match options.role:
+    if getattr(options, "out", None) is not None:
+        brief = replace(brief, part={**brief.part, "results": str(options.out)})
+    try:
+        return _play(brief)
+    except BriefError as error:
+        raise BriefError(f"{options.brief}: {error}") from error
+
+
+def _play(brief: Brief) -> int:
+    """Be the process of a brief; the exit status."""
+    if brief.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        check_identity(brief.identity, brief.process)
+    match brief.role:
         case "router":
             from emulator.network.router import route as play
         case "sensor":
@@ -357,6 +377,6 @@ def process(options: argparse.Namespace) -> int:
 
             return observe(brief)
         case _:
-            raise BriefError(f"no role {options.role}; give one of those that `evedrop --help` lists")
+            raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     play(brief)
     return 0

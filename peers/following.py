@@ -36,7 +36,7 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
         put_progress = session.kept(session.keys.progress(name), 0)
         put_acknowledgement = session.outlet(session.keys.acknowledged) if acknowledges else None
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
-        due = Due(downlink, brief.flow.patience)
+        due = Due(downlink, brief.flow.longest_outage)
         session.ready()
         k = brief.first
         while k < brief.slots:

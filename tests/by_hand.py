@@ -16,6 +16,7 @@ from typing import Any
 from emulator import montecarlo
 from emulator.brief import read_brief
 from emulator.runs.briefs import write_briefs
+from emulator.runs.ports import meeting_at
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario
 from tests.conftest import wait_until
@@ -32,12 +33,15 @@ class ByHand:
     endpoint: str
     entered: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Process → the words before its command line, such as those that enter a network namespace."""
+    insecure: bool = False
+    """Whether it may be in clear although others could listen."""
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     _done: list[int] = field(default_factory=list)
 
     def write(self, **endpoints: str) -> None:
         """Write the briefs; endpoints: process → where it finds the router, if that is elsewhere."""
-        for path in write_briefs(self.scenario, self.endpoint, self.folder / "run", self.folder / "briefs"):
+        meeting = meeting_at(self.endpoint, insecure=self.insecure)
+        for path in write_briefs(self.scenario, meeting, self.folder / "run", self.folder / "briefs", int(LONG)):
             if path.stem in endpoints:
                 brief = json.loads(path.read_text())
                 path.write_text(json.dumps({**brief, "router": endpoints[path.stem]}))
@@ -101,9 +105,9 @@ class ByHand:
 
 
 @contextmanager
-def by_hand(scenario: Scenario, folder: Path, endpoint: str, **entered: tuple[str, ...]) -> Iterator[ByHand]:
-    """A run in a folder, whose processes are gone when the block ends."""
-    run = ByHand(scenario, folder, endpoint, entered)
+def by_hand(scenario: Scenario, folder: Path, endpoint: str, **given: Any) -> Iterator[ByHand]:
+    """A run in a folder, whose processes are gone when the block ends; given: fields of `ByHand`."""
+    run = ByHand(scenario, folder, endpoint, **given)
     try:
         yield run
     finally:

