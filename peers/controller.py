@@ -31,7 +31,7 @@ def steer(brief: Brief) -> None:
         # Slots are joined without its reports, so all that is kept is sent again.
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
-        due = Due(key, brief.flow.patience)
+        due = Due(key, brief.flow.longest_outage)
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):

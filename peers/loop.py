@@ -64,7 +64,7 @@ class Actuator:
         self._put = None
         if loop is not None:
             self._period = loop["period"]
-            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.patience)
+            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.longest_outage)
             self._put = (
                 kept_decisive(session, session.keys.state, brief, self._period) if loop["acts_on"] == "truth" else None
             )
@@ -111,7 +111,7 @@ class Consultation:
         self._told: tuple[Informed, Decided] | None = None
         if isinstance(receiver, Informed):
             shape = (len(loop["plant"]["input_lower"]), brief.trials)
-            self._told = receiver, Decided(session, self._period, shape, brief.flow.patience)
+            self._told = receiver, Decided(session, self._period, shape, brief.flow.longest_outage)
 
     def before(self, k: int) -> None:
         """Learn the inputs that led into slot k."""

@@ -182,7 +182,7 @@ class WayBackLink:
         self._jammer: str | None = spec["jammer"]
         self._trials = brief.trials
         self._key = session.keys.acknowledged
-        self._due = Due(self._key, brief.flow.patience)
+        self._due = Due(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
         """What the legitimate estimator acknowledges; None: the conductor has said something that may end the waiting."""
         session.funnel(self._key, self.sent.put)
@@ -215,7 +215,7 @@ def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
     wiring = brief.part["controller"]
     table = grants(brief.run, tuple(brief.part["links"]), None if wiring is None else Wiring(**wiring))
-    with _opened(brief, access_control(table)) as session:
+    with _opened(brief, access_control(table, brief.identity is not None)) as session:
         present = {grant.process: False for grant in table if grant.token is not None}
         for name in present:
             session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
@@ -232,7 +232,7 @@ class Routing:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
         self._uplink = session.inbox(session.keys.uplink)
-        self._due = Due(session.keys.uplink, brief.flow.patience)
+        self._due = Due(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
         postman = Postman() if brief.part["pace"] else None
         self._bursts: list[Burst] = []
@@ -383,7 +383,7 @@ def _change(found: Reader) -> Change:
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:
     with _users_file(brief.part["users"]) as users:
-        return Session(brief, router_config(brief.router, str(users), access))
+        return Session(brief, router_config(brief, str(users), access))
 
 
 @contextmanager

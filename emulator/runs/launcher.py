@@ -19,7 +19,7 @@ from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import Children, Exit, News
 from emulator.runs.folder import new_folder
-from emulator.runs.ports import check_endpoint, free_port
+from emulator.runs.ports import loopback_meeting
 from emulator.runs.private import private_folder
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
@@ -45,8 +45,6 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
     last two cases what was measured is in the folder and no process is left.
     """
     view = choose(view)
-    if listen is not None:
-        check_endpoint(listen)
     with stop_on_signals() as stop:
         if scenario.shards == 1:
             return launch_one(scenario, folder, view, listen, tell, stop)
@@ -65,13 +63,13 @@ def launch_one(
     shard: bool = False,
 ) -> Ended:
     """Run a scenario as `launch` does, on one router, until `stop` is set; shard: whether others carry further trials."""
-    endpoint = listen or f"tcp/127.0.0.1:{free_port()}"
+    meeting = loopback_meeting(listen)
     with private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None, shard))
+            briefs = briefs_of(scenario, meeting, Observation(folder.absolute(), view != "off", None, shard))
             observer = briefs.pop(OBSERVER)
             with Children(folder / "logs", private, scenario.controller is not None) as children:
                 for brief in briefs.values():

@@ -84,7 +84,7 @@ class Recovery:
         usual = 3.0 * max(self._batch_seconds, self._longest)
         if self._done < self._target:
             return max(_SOON_SECONDS, usual)
-        return max(min(_IDLE_SECONDS, max(1.0, self._flow.patience / 3.0)), usual)
+        return max(min(_IDLE_SECONDS, max(1.0, self._flow.longest_outage / 3.0)), usual)
 
     def _go_on(self, done: int, now: float) -> None:
         if not self._missing and not self._wait:
@@ -104,13 +104,15 @@ class Recovery:
         for name in self._conductor.missing:
             self._missing.setdefault(name, (done, self._conductor.lost.get(name, now)))
         gone = [
-            name for name in self._conductor.missing if now - self._conductor.lost.get(name, now) > self._flow.patience
+            name
+            for name in self._conductor.missing
+            if now - self._conductor.lost.get(name, now) > self._flow.longest_outage
         ]
         if gone:
             # Without the router nobody else can be seen either.
             gone = [ROUTER] if ROUTER in gone else gone
             self.give_up(done)
-            self._conductor.despair(gone, self._flow.patience)
+            self._conductor.despair(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
         found = self._missing
