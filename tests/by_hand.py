@@ -49,7 +49,7 @@ class ByHand:
     @property
     def names(self) -> tuple[str, ...]:
         """All processes."""
-        return ("router", "sensor", *self.scenario.receivers, "observer")
+        return ("router", "sensor", *self.scenario.digested, "observer")
 
     def start(self, *names: str) -> None:
         """Start these processes, or all."""
@@ -125,3 +125,5 @@ def as_if_undisturbed(summary: Mapping[str, Any], scenario: Scenario, folder: Pa
         assert link["unexplained"] == 0
         assert link == expected["links"][name]
         assert summary["peers"][name]["digest"] == expected["peers"][name]["digest"]
+    if expected["controller"] is not None:
+        assert summary["controller"]["digest"] == expected["controller"]["digest"]
