@@ -10,12 +10,7 @@ on the uplink it journals all slots before, and waits until the conductor lets i
 
 from __future__ import annotations
 
-import os
-import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,6 +23,8 @@ from emulator.model.process import Floats
 from emulator.model.receiver import Flags
 from emulator.model.transit import Late, Transit
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, access_control, grants
+from emulator.network.doorkeeping import until_all_left, users_file
+from emulator.network.linked import at_router
 from emulator.network.postman import Postman
 from emulator.network.session import Session, router_config
 from emulator.network.wire import (
@@ -44,8 +41,6 @@ from emulator.network.wire import (
     read_beside,
     read_uplink,
 )
-
-_FAREWELL_SECONDS = 10.0
 
 
 class Downlink:
@@ -171,14 +166,11 @@ class WayBackLink:
 def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
     table = grants(brief.run, tuple(brief.part["links"]))
-    with _opened(brief, access_control(table, brief.identity is not None)) as session:
-        present = {grant.process: False for grant in table if grant.token is not None}
-        for name in present:
-            session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+    let_in = table if brief.part["zid"] is None else at_router(brief.run, table)
+    with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
+        present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
-        deadline = time.monotonic() + _FAREWELL_SECONDS
-        while any(present.values()) and time.monotonic() < deadline:
-            time.sleep(0.005)
+        until_all_left(present, session.linked)
 
 
 class Routing:
@@ -258,18 +250,5 @@ def _change(found: Reader) -> Change:
 
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:
-    with _users_file(brief.part["users"]) as users:
-        return Session(brief, router_config(brief, str(users), access))
-
-
-@contextmanager
-def _users_file(users: Mapping[str, str]) -> Iterator[Path]:
-    """The dictionary of users and passwords that Zenoh reads once, when the session opens; then it must not stay."""
-    handle, name = tempfile.mkstemp(prefix="evedrop-users-")
-    path = Path(name)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.writelines(f"{user}:{password}\n" for user, password in users.items())
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
+    with users_file(brief.part["users"]) as users:
+        return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

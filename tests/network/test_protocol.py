@@ -159,6 +159,8 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
     """As processes read it."""
     message = wire.Reader(KEY, raw)
     found: dict[str, Any] = {"do": message.text("do")}
+    if message.has("why"):
+        found["why"] = message.text("why")
     if message.has("absent"):
         found["absent"] = list(message.names("absent"))
     if message.has("until"):
