@@ -1,7 +1,7 @@
 """Speed of live runs, side by side with raw Zenoh carrying the same messages. Prints a table; about three minutes.
 
     python benchmarks/live.py [--quick]
-    python benchmarks/live.py tls       # what certificates and a second router cost; about a minute
+    python benchmarks/live.py tls       # what certificates and a second router cost; about two minutes
 
 Machines are noisy: compare the columns of one table, not tables; every pair is measured in turn, the median is quoted.
 """
@@ -163,7 +163,7 @@ def connections(rounds: int) -> None:
         "with certificates": lambda: ("--listen", f"tls/127.0.0.1:{free_port()}"),
         "two routers, with certificates": lambda: ("--set", "network.routers=2"),
     }
-    for slots, trials in ((20_000, 1), (2_000, 1000)):
+    for slots, trials in ((10_000, 1), (1_000, 1000)):
         found: dict[str, list[float]] = {name: [] for name in ways}
         for _ in range(rounds):
             for name, options in ways.items():
@@ -214,7 +214,7 @@ if __name__ == "__main__":
     from emulator.brief import read_brief
 
     if sys.argv[1:] == ["tls"]:
-        connections(5)
+        connections(3)
     elif len(sys.argv) > 2:
         {"send": _send, "receive": _receive, "watch": _watch}[sys.argv[1]](read_brief(Path(sys.argv[2])))
     else:
