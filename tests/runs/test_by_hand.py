@@ -86,6 +86,9 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     assert control["router"] == endpoint
     assert "PRIVATE KEY" in control["identity"]["key"]
     assert evedrop("status", "run").status == 0
+    (evedrop.folder / "copy").mkdir()
+    (evedrop.folder / "copy" / "control.json").write_text(json.dumps({**control, "user": "observer"}))
+    told(evedrop("status", "copy"), 2, "copy/control.json: identity.certificate is that of operator, not of observer")
     assert evedrop("pause", "run").out.startswith("held before slot")
     live.process.terminate()
     assert live.end().status == 130
