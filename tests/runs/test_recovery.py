@@ -115,6 +115,23 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
     assert all(one["seconds"] > 0.0 and 0 < one["slot"] <= one["until"] for one in outages)
 
 
+@pytest.mark.parametrize("name", ["router", "relay"])
+def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
+    """With a closed loop over both of them: digests and links are those in memory, and the one that was killed is named."""
+    more = LOOP.format("period = 2") + "[network]\nrouters = 2"
+    path, scenario = scenario_in(tmp_path, slots=3000, more=more, more_of_legitimate="knows_input = true")
+    live = evedrop.live(str(path), "--json")
+    live.running(more_than=300)
+    before = live.child(name)
+    live.kill(name)
+    wait_until(lambda: live.children().get(name) not in {None, before}, f"another {name}")
+    done = live.end(120)
+    assert done.status == 0, done.err
+    live.nothing_left()
+    as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
+    assert [one["process"] for one in done.summary["outages"]] == [name]
+
+
 def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path: Path) -> None:
     """A router that is started while the run is paused knows the changes that were made; the folder gives the same again."""
     path, _ = scenario_in(tmp_path, slots=3000, pace=0.002, more=CHANGING)
