@@ -9,9 +9,10 @@ from emulator.model.controllers import CONTROLLERS
 from emulator.model.controllers.controller import Assignment
 from emulator.model.plant import Plant
 from emulator.network.access import CONTROLLER
+from emulator.network.loop_wire import decided, read_known
 from emulator.network.reporting import DecisionReporter
 from emulator.network.session import Session
-from emulator.network.wire import Reader, decided, read_known
+from emulator.network.wire import Reader
 from peers.loop import disturbances_in
 
 

@@ -14,8 +14,9 @@ from emulator.model.local_filter import LocalFilter
 from emulator.model.plant import Drive, Plant
 from emulator.model.process import Floats, Trajectory
 from emulator.model.receiver import Belief, Flags, Receiver
+from emulator.network.loop_wire import known, read_decided
 from emulator.network.session import Session
-from emulator.network.wire import Reader, known, read_decided
+from emulator.network.wire import Reader
 
 
 def disturbances_in(text: str, slots: int) -> Floats:

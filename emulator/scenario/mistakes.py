@@ -30,6 +30,7 @@ from emulator.scenario.expect import Around, ExpectTable
 from emulator.scenario.filter_noise import filter_mistakes
 from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from emulator.scenario.plant import ControllerTable, PlantTable
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
     SECRET_BYTES,
@@ -39,7 +40,6 @@ from emulator.scenario.tables import (
     EncodingTable,
     LegitimateTable,
     LinkTable,
-    ProcessTable,
     Scenario,
 )
 from emulator.scenario.words import as_toml, listed
