@@ -26,13 +26,14 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements", "zid"),
+    "relay": ("users", "receivers", "listen", "zid"),
     "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart"),
     "legitimate": ("scheme", "window", "outages"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
     "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity"),
 }
-ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "observer")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.errors import UsageError
+from emulator.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
     from emulator.network.operator import Answer, Request
@@ -70,6 +70,13 @@ def _answer(run: Path, request: Request, what: str, patience: float) -> Answer:
     from emulator.network.operator import ask
 
     control, began = read_control(run), time.monotonic()
+    if control.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        try:
+            check_identity(control.identity, control.user)
+        except BriefError as error:
+            raise UsageError(f"{run / 'control.json'}: {error}") from error
     try:
         found = ask(control, request, patience)
     except zenoh.ZError as error:

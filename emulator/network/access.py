@@ -18,7 +18,8 @@ OBSERVER = "observer"
 OPERATOR = "operator"
 ACKNOWLEDGEMENTS = "acknowledgements"
 """No process: the name of their way back, whose random stream is `link/acknowledgements`."""
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR, ACKNOWLEDGEMENTS)
+RELAY = "relay"
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, OBSERVER, OPERATOR, ACKNOWLEDGEMENTS)
 
 
 @dataclass(frozen=True)
@@ -92,13 +93,21 @@ class Grant:
     answers: tuple[str, ...] = ()
     """Keys at which it may be asked."""
     asks: tuple[str, ...] = ()
+    further_tokens: tuple[str, ...] = ()
+    """Of those on whose behalf it speaks."""
+    zid: str | None = None
+    """Its Zenoh id, of who has no user: the router, which does not ask to be let in."""
 
 
-def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
-    """The table of docs/protocol.md for a run; the router itself needs no grant."""
+def grants(run: str, receivers: tuple[str, ...], relayed: bool = False) -> list[Grant]:
+    """The table of docs/protocol.md for a run; router and relay themselves need no grant.
+
+    relayed: whether there is a relay, which the observer watches and tells the end.
+    """
     keys = Keys(run)
     followers = (*receivers, OBSERVER)
     processes = (SENSOR, *receivers)
+    routers = (ROUTER, RELAY) if relayed else (ROUTER,)
     table = [
         Grant(
             SENSOR,
@@ -108,10 +117,10 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
         ),
         Grant(
             OBSERVER,
-            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, ROUTER))),
+            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, *routers))),
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
             token=keys.alive(OBSERVER),
-            watches=tuple(keys.alive(name) for name in (*processes, ROUTER)),
+            watches=tuple(keys.alive(name) for name in (*processes, *routers)),
             answers=(keys.control(OBSERVER),),
         ),
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
@@ -142,16 +151,14 @@ def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [
-            {
-                "id": grant.process,
-                "usernames": [grant.process],
-                **({"cert_common_names": [grant.process]} if certified else {}),
-            }
-            for grant in table
-        ],
+        "subjects": [_subject(grant, certified) for grant in table],
         "policies": [{"subjects": [grant.process], "rules": [rule["id"] for rule in _rules(grant)]} for grant in table],
     }
+
+
+def _subject(grant: Grant, certified: bool) -> dict[str, Any]:
+    shown = {"usernames": [grant.process]} if grant.zid is None else {"zids": [grant.zid]}
+    return {"id": grant.process, **shown, **({"cert_common_names": [grant.process]} if certified else {})}
 
 
 def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
@@ -161,7 +168,7 @@ def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
         ("reader", "egress", "declare_subscriber", grant.writes),
         ("subscribe", "ingress", "declare_subscriber", grant.reads),
         ("read", "egress", "put", grant.reads),
-        ("token", "ingress", "liveliness_token", () if grant.token is None else (grant.token,)),
+        ("token", "ingress", "liveliness_token", (*grant.further_tokens, *filter(None, [grant.token]))),
         ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),
         ("watched", "egress", "liveliness_token", grant.watches),
         ("offer", "ingress", "declare_queryable", grant.answers),

@@ -112,8 +112,8 @@ class Children:
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUNBUFFERED": "1",
         }
-        if brief.role == "router":
-            environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
+        if brief.role in {"router", "relay"}:
+            environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
             with (self._logs / f"{brief.process}.log").open("ab" if again else "wb") as log:

@@ -20,7 +20,7 @@ from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import Children, Exit, News
 from emulator.runs.folder import new_folder
-from emulator.runs.ports import loopback_meeting
+from emulator.runs.ports import loopback_places
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
 from emulator.scenario import Scenario
@@ -38,20 +38,29 @@ class Ended:
     viewer: Viewer | None
 
 
-def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell: Callable[[News], None]) -> Ended:
+def launch(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Callable[[News], None],
+    relay: str | None = None,
+) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
+
+    listen, relay: the endpoints of router and, if there is one, relay; free ports by default.
 
     Raises UsageError before anything is started, RunError when the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases what was measured is in the folder and no process is left.
     """
     view = choose(view)
-    meeting = loopback_meeting(listen)
+    places = loopback_places(listen, relay, scenario.relayed)
     with stop_on_signals() as stop, _private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, meeting, Observation(folder.absolute(), view != "off", None))
+            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None))
             observer = briefs.pop(OBSERVER)
             with Children(folder / "logs", private) as children:
                 for brief in briefs.values():

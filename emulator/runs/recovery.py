@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from emulator.brief import Flow
-from emulator.network.access import OBSERVER, ROUTER
+from emulator.network.access import OBSERVER, RELAY, ROUTER
 from emulator.runs.conductor import Conductor
 from emulator.runs.steering import Steering
 
@@ -116,9 +116,12 @@ class Recovery:
 
     def _all_back(self, now: float) -> None:
         found = self._missing
-        if ROUTER in found:
-            # All vanish with the router, and with our own connection to it.
-            found = {ROUTER if self._conductor.router_changed() else OBSERVER: found[ROUTER]}
+        if len(found) == len(self._conductor.processes) - len(self._conductor.absent):
+            # All vanish with the router that this process is connected to, and with the connection.
+            nearest = RELAY if RELAY in found else ROUTER
+            found = {nearest if self._conductor.router_changed() else OBSERVER: found[nearest]}
+        elif ROUTER in found:
+            found = {ROUTER: found[ROUTER]}
         for name, beginning in found.items():
             self._back.setdefault(name, beginning)
         self._missing = {}
@@ -132,7 +135,7 @@ class Recovery:
         self._moved = now
         self._number += 1
         for name, there in self._conductor.processes.items():
-            if there:
+            if there and name != RELAY:
                 links = {"links": self._steering.changes} if name == ROUTER else {}
                 self._conductor.command(name, "again", n=self._number, k=self._done, **links)
         if self._done == 0:

@@ -303,6 +303,12 @@ class AcknowledgementsTable(Table):
         return []
 
 
+class NetworkTable(Table):
+    """`[network]`: how the processes of a live run are connected; the trials are the same."""
+
+    routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
+
+
 class Scenario(Table):
     """One scenario, checked."""
 
@@ -324,6 +330,7 @@ class Scenario(Table):
         Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
     ] = Field(default_factory=dict)
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
+    network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
     )
@@ -331,6 +338,11 @@ class Scenario(Table):
         list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
     ] = Field(default_factory=list)
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
+
+    @property
+    def relayed(self) -> bool:
+        """Whether there are two routers, of which the second is a relay."""
+        return self.network is not None and self.network.routers > 1
 
     @property
     def receivers(self) -> tuple[str, ...]:

@@ -45,10 +45,12 @@ def scenario_of(**changes: Any) -> Scenario:
 @contextmanager
 def apart(folder: Path, scenario: Scenario, protocol: str = "tls") -> Iterator[tuple[Lan, ByHand]]:
     """A network, and a run whose briefs are written, a host for each process."""
-    with lan(*HOSTS) as network:
-        entered = {host: network.entering(host) for host in HOSTS}
-        endpoint = f"{protocol}/{network.addresses['router']}:{PORT}"
-        with by_hand(scenario, folder, endpoint, entered=entered, insecure=protocol == "tcp") as run:
+    hosts = (*HOSTS, "relay") if scenario.relayed else HOSTS
+    with lan(*hosts) as network:
+        entered = {host: network.entering(host) for host in hosts}
+        endpoints = {host: f"{protocol}/{address}:{PORT}" for host, address in network.addresses.items()}
+        given = {"entered": entered, "insecure": protocol == "tcp", "relay": endpoints.get("relay")}
+        with by_hand(scenario, folder, endpoints["router"], **given) as run:
             run.write()
             yield network, run
 
@@ -112,14 +114,17 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
     with apart(tmp_path, scenario) as (network, run), captured(network, "router", tmp_path / "capture"):
         run.start()
         run.running()
+        evedrop = (sys.executable, "-m", "emulator")
+        network.run("observer", *evedrop, "pause", str(run.folder / "run"))  # however long the scan takes
         router = network.addresses["router"]
         found = network.run("eve", sys.executable, "-c", SCAN, "65535", router)
         assert found.split() == [router, str(PORT)]
         others = [network.addresses[host] for host in HOSTS if host != "router"]
-        assert network.run("eve", sys.executable, "-c", SCAN, "10000", *others) == ""
+        assert network.run("eve", sys.executable, "-c", SCAN, str(PORT), *others) == ""
         for host in HOSTS:  # what listens at all, of any protocol, is what was scanned for
             listening = network.run(host, "ss", "-Hlntu").splitlines()
             assert [line.split()[4] for line in listening] == [f"{router}:{PORT}"] * (host == "router")
+        network.run("observer", *evedrop, "resume", str(run.folder / "run"))
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert run.summary["outages"] == []
@@ -166,6 +171,23 @@ def test_a_killed_router_is_started_again_on_its_host(tmp_path: Path) -> None:
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert [outage["process"] for outage in run.summary["outages"]] == ["router"]
+
+
+def test_two_routers_lose_each_other(tmp_path: Path) -> None:
+    """The router's cable is pulled, and later the router is killed: sensor and relay find it again, and the bits are the same."""
+    scenario = scenario_of(network={"routers": 2})
+    with apart(tmp_path, scenario) as (network, run):
+        run.start()
+        run.running(50)
+        network.unplug("router")
+        time.sleep(6.0)  # how long it is out is what is tested
+        network.plug("router")
+        run.running(run.done())
+        run.kill("router")
+        run.start("router")
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert {outage["process"] for outage in run.summary["outages"]} == {"router"}
 
 
 KNOCK = """
