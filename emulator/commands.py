@@ -224,8 +224,9 @@ def figures(options: argparse.Namespace) -> int:
 
 def view(options: argparse.Namespace) -> int:
     """Open a finished run, or draw it."""
-    from emulator.runs.viewer import open_run
+    from emulator.runs.viewer import Stand, open_run
 
+    stand = None if options.serve is None else Stand.of(options.serve)
     recording = options.run / "recording.rrd"
     if recording.is_file() and not (options.run / "summary.json").is_file():
         raise UsageError(
@@ -236,7 +237,7 @@ def view(options: argparse.Namespace) -> int:
 
         recording = replay(options.run)
     if options.picture is None:
-        viewer = open_run(options.run, options.view)
+        viewer = open_run(options.run, options.view, stand)
         print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
         _hold(viewer)
         return 0
@@ -355,8 +356,19 @@ def process(options: argparse.Namespace) -> int:
         case "observer":
             from emulator.runs.observer import observe
 
-            return observe(brief)
+            return observe(brief, options.serve)
         case _:
             raise BriefError(f"no role {options.role}; give one of those that `evedrop --help` lists")
     play(brief)
     return 0
+
+
+def health(options: argparse.Namespace) -> int:
+    """Say whether a process is there."""
+    from emulator.brief import read_brief
+    from emulator.network.health import is_there
+
+    brief = read_brief(options.brief)
+    there = is_there(brief)
+    print(f"{brief.process} is {'' if there else 'not '}on the network of {brief.run}")
+    return 0 if there else 1

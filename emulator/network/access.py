@@ -84,10 +84,12 @@ class Grant:
     answers: tuple[str, ...] = ()
     """Keys at which it may be asked."""
     asks: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    """Liveliness tokens that it may ask for: its own, and so learns no more than that it is there."""
 
 
 def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
-    """The table of docs/protocol.md for a run; the router itself needs no grant."""
+    """The table of docs/protocol.md for a run; the router itself needs no grant but to ask whether it is there."""
     keys = Keys(run)
     followers = (*receivers, OBSERVER)
     processes = (SENSOR, *receivers)
@@ -97,16 +99,19 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
             writes=(keys.uplink, keys.telemetry(SENSOR)),
             reads=(*(keys.progress(name) for name in followers), keys.control(SENSOR), keys.acknowledgements),
             token=keys.alive(SENSOR),
+            checks=(keys.alive(SENSOR),),
         ),
         Grant(
             OBSERVER,
             writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, ROUTER))),
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
             token=keys.alive(OBSERVER),
+            checks=(keys.alive(OBSERVER),),
             watches=tuple(keys.alive(name) for name in (*processes, ROUTER)),
             answers=(keys.control(OBSERVER),),
         ),
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
+        Grant(ROUTER, writes=(), reads=(), token=None, checks=(keys.alive(ROUTER),)),
     ]
     for name in receivers:
         table.append(
@@ -119,6 +124,7 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
                 ),
                 reads=(keys.downlink(name), keys.control(name)),
                 token=keys.alive(name),
+                checks=(keys.alive(name),),
             )
         )
     return table
@@ -144,6 +150,8 @@ def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
         ("subscribe", "ingress", "declare_subscriber", grant.reads),
         ("read", "egress", "put", grant.reads),
         ("token", "ingress", "liveliness_token", () if grant.token is None else (grant.token,)),
+        ("check", "ingress", "liveliness_query", grant.checks),
+        ("checked", "egress", "liveliness_token", grant.checks),
         ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),
         ("watched", "egress", "liveliness_token", grant.watches),
         ("offer", "ingress", "declare_queryable", grant.answers),

@@ -106,7 +106,7 @@ def briefs_of(
     """Process name → brief, with passwords and a run name made afresh."""
     run = f"r{secrets.token_hex(4)}"
     keys = StreamKeys.of(scenario)
-    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, OBSERVER, OPERATOR)}
+    users = {name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, OBSERVER, OPERATOR)}
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d

@@ -38,6 +38,7 @@ from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
+from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -48,8 +49,12 @@ _BEAT_SECONDS = 1.0
 _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 
-def observe(brief: Brief) -> int:
-    """Run the observer of a brief; the exit status of the run."""
+def observe(brief: Brief, serve: str | None = None) -> int:
+    """Run the observer of a brief; the exit status of the run.
+
+    serve: HOST:PORT where browsers may see it, if any. Raises UsageError if nothing can be served there.
+    """
+    stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
@@ -59,6 +64,7 @@ def observe(brief: Brief) -> int:
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario, confirmations)
+    viewer = None if stand is None else observation.show(stand)
     status, how = 0, "complete"
     try:
         observation.folder.mkdir(parents=True, exist_ok=True)  # on another host than that of the briefs it is not there
@@ -76,6 +82,8 @@ def observe(brief: Brief) -> int:
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
     status, how = observation.finish(status, how)
+    if viewer is not None:
+        viewer.stop()
     if by_hand and status not in {0, 1}:
         print(f"evedrop: {how}", file=sys.stderr)  # noqa: T201 - nobody else says it
     return status
@@ -115,10 +123,18 @@ class Observation:
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
+        self._live: str | None = brief.part["live"]
         self._writer: ResultsWriter
         self._started = self._ended = self._told = self._beaten = time.monotonic()
         self._suspects: list[str] = []
         self._recent: tuple[float, int] = (self._started, 0)
+
+    def show(self, stand: Stand) -> Viewer:
+        """A viewer for browsers, which the run will be streamed to."""
+        viewer = Viewer.serve(stand, self.folder / "logs")
+        tell("view", address=viewer.address)
+        self._live = viewer.url
+        return viewer
 
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
@@ -131,7 +147,7 @@ class Observation:
             conductor = Conductor(session, self._scenario.receivers, stop, self._beat)
             if self._brief.part["recording"]:
                 self._recording = open_recording(
-                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
+                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._live
                 )
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             try:

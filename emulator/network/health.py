@@ -1,0 +1,30 @@
+"""Whether a process is on the network now: asked of the router, for only what it says holds for everybody else."""
+
+from __future__ import annotations
+
+import json
+
+import zenoh
+
+from emulator.brief import Brief
+from emulator.network.access import Keys
+from emulator.network.session import client_config
+
+_CONNECT_SECONDS = 3.0
+_ANSWER_SECONDS = 3.0
+
+
+def is_there(brief: Brief) -> bool:
+    """Whether the router knows the process of a brief to be there: connected, ready, and not lost since.
+
+    It is asked with the credentials of the process itself, which may ask for nobody else.
+    """
+    zenoh.init_log_from_env_or("off")
+    config = client_config(brief)
+    config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
+    try:
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+            answers = session.liveliness().get(Keys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
+            return any(answer.ok is not None for answer in answers)
+    except zenoh.ZError:
+        return False

@@ -1,0 +1,169 @@
+"""docker-compose.yml brought up for real: the run it makes, who can reach what in it, and what befalls it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emulator.api import montecarlo
+from tests.conftest import wait_until
+from tests.containers.machine import Docker
+from tests.containers.project import ROLES, Project
+
+pytestmark = pytest.mark.containers
+
+SHORT = "--slots 600 --pace 0"
+ENDLESS = "--slots 1000000 --pace 0.002"
+
+Make = Callable[..., Project]
+
+
+@pytest.fixture(scope="session")
+def digests(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Receiver → digest of a short run, computed here in memory."""
+    folder = tmp_path_factory.mktemp("memory") / "run"
+    results = montecarlo("two-eavesdroppers", slots=600, trials=1, out=folder)
+    return {name: peer["digest"] for name, peer in results.summary["peers"].items()}
+
+
+def complete(project: Project, digests: dict[str, str]) -> None:
+    """Check that the newest results are those of the run that was asked for."""
+    summary = project.results().summary
+    assert summary["ended"] == "complete"
+    assert {name: peer["digest"] for name, peer in summary["peers"].items()} == digests
+    assert not any(link["unexplained"] for link in summary["links"].values())
+
+
+def test_up_alone_runs_the_demo(project: Make, digests: dict[str, str]) -> None:
+    """It ends by itself, with the digests of the same trials in memory; and again, without anything taken down before."""
+    demo = project(EVEDROP_OPTIONS=SHORT, EVEDROP_USER="4321:4321")
+    for runs in (1, 2):
+        demo.compose("up")
+        assert {service: demo.state(service)["ExitCode"] for service in ROLES} == dict.fromkeys(ROLES, 0)
+        complete(demo, digests)
+        assert len(list((demo.folder / "runs").iterdir())) == runs
+    assert {path.stat().st_uid for path in (demo.folder / "runs").rglob("*")} == {4321}
+
+
+def test_a_scenario_of_ones_own(project: Make) -> None:
+    """A file beside docker-compose.yml; of three eavesdroppers nothing is started, and it is said why."""
+    own = project(EVEDROP_OPTIONS=SHORT, EVEDROP_SCENARIO="mine/two.toml")
+    (own.folder / "mine").mkdir()
+    text = Path("scenarios/two-eavesdroppers.toml").read_text()
+    (own.folder / "mine" / "two.toml").write_text(text)
+    own.compose("up")
+    assert own.results().folder.name.startswith("two-")
+    (own.folder / "mine" / "two.toml").write_text(
+        text + '[eavesdroppers.third]\nstrategy = "naive"\nlink.quality = 0.5\n'
+    )
+    done = own.compose("up", may_fail=True)
+    assert done.returncode != 0
+    assert "mine/two.toml has 3 eavesdroppers: suspicious smart third" in own.said("briefs")
+    assert len(list((own.folder / "runs").iterdir())) == 1
+
+
+PROBE = """
+import json, pathlib, socket, sys
+found = {"names": [], "reached": []}
+for name in sys.argv[1].split():
+    try:
+        socket.getaddrinfo(name, 7447)
+        found["names"].append(name)
+    except OSError:
+        pass
+for address in sys.argv[2].split():
+    host, port = address.split(":")
+    try:
+        socket.create_connection((host, int(port)), 1.0)
+        found["reached"].append(address)
+    except OSError:
+        pass
+found["files"] = sorted(str(path) for path in pathlib.Path("/brief").rglob("*"))
+found["briefs"] = [json.loads(pathlib.Path(path).read_text())["process"] for path in found["files"]]
+print(json.dumps(found))
+"""
+"""What a process of a container can look up and connect to, and which briefs it has."""
+
+
+@pytest.fixture
+def going(project: Make) -> Project:
+    """A run that does not end by itself."""
+    one = project(EVEDROP_OPTIONS=ENDLESS)
+    one.compose("up", "--detach")
+    one.running()
+    return one
+
+
+def addresses(going: Project, service: str) -> dict[str, str]:
+    """Network → address of a service."""
+    networks = going.docker.inspected("container", going.container(service))["NetworkSettings"]["Networks"]
+    return {name.rpartition("_")[2]: network["IPAddress"] for name, network in networks.items()}
+
+
+def test_who_can_reach_what(going: Project) -> None:
+    """Every role reaches the router and no other, has its own brief alone, and no rights; all come to be healthy."""
+    everybody = {service: addresses(going, service) for service in ROLES}
+    others = [f"{host}:{port}" for found in everybody.values() for host in found.values() for port in (7447, 17450)]
+    for service in ROLES[1:]:
+        container = going.container(service)
+        said = going.docker("exec", container, "python", "-c", PROBE, " ".join(ROLES), " ".join(others))
+        found = json.loads(said)
+        assert found["names"] == sorted({"router", service}, key=ROLES.index)
+        own = {f"{everybody['router'][f'to-{service}']}:7447"}
+        if service == "observer":
+            own |= {f"{host}:17450" for host in everybody[service].values()}
+        assert set(found["reached"]) == own
+        assert found["files"] == ["/brief/brief.json"]
+        process = {"eavesdropper-1": "suspicious", "eavesdropper-2": "smart"}.get(service, service)
+        assert found["briefs"] == [process]
+        rights = going.docker(
+            "exec", container, "sh", "-c", "id -u; grep CapEff /proc/self/status; touch /opt/x || true"
+        )
+        assert rights.split() == ["1000", "CapEff:", "0" * 16]
+    for service in ROLES:
+        wait_until(
+            lambda service=service: going.state(service)["Health"]["Status"] == "healthy", f"a healthy {service}"
+        )
+
+
+def test_the_view_is_on_loopback_alone(going: Project) -> None:
+    """The page answers at the address that the observer tells, and nothing else of the machine's listens for others."""
+    address = next(line for line in going.said("observer").splitlines() if '"view"' in line)
+    assert "http://127.0.0.1:17450/?url=" in address
+    page = "import urllib.request; print(urllib.request.urlopen('http://127.0.0.1:17450/').read())"
+    assert "Rerun" in going.docker.inside("python3", "-c", page)
+    table = going.docker.inside("cat", "/proc/net/tcp").splitlines()[1:]
+    listening = {line.split()[1].split(":")[0] for line in table if line.split()[3] == "0A"}
+    assert listening == {"0100007F"}
+
+
+def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Make, digests: dict[str, str]) -> None:
+    """It is named, what was measured is on disk, everybody leaves; and `up` once more makes a whole run."""
+    one = project(EVEDROP_OPTIONS=ENDLESS)
+    one.compose("up", "--detach")
+    one.running()
+    one.docker("kill", one.container("eavesdropper-2"))
+    assert one.ended("observer") == 3
+    assert "smart left the network" in one.said("observer")
+    assert one.results().slots.num_rows > 0
+    for service in ROLES:
+        assert (one.ended(service) != 0) or service == "router"
+    again = project(EVEDROP_OPTIONS=SHORT)
+    again.compose("up")
+    complete(again, digests)
+
+
+def test_nothing_is_left(project: Make, docker: Docker) -> None:
+    """Down takes containers, networks and volumes along, of a run in the middle as well."""
+    one = project(EVEDROP_OPTIONS=ENDLESS)
+    one.compose("up", "--detach")
+    one.running()
+    one.down()
+    name = one.environment["COMPOSE_PROJECT_NAME"]
+    label = f"label=com.docker.compose.project={name}"
+    for kind in (("container", "--all"), ("network",), ("volume",)):
+        assert docker(kind[0], "ls", *kind[1:], "--quiet", "--filter", label) == ""
+    assert one.results().summary["ended"] == "interrupted"
