@@ -30,7 +30,7 @@ _PARTS: Mapping[str, tuple[str, ...]] = {
     "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart"),
     "legitimate": ("scheme", "window", "outages"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
-    "observer": ("scenario", "results", "recording", "live", "operator"),
+    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity"),
 }
 ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
 
@@ -64,6 +64,17 @@ class Model:
 
 
 @dataclass(frozen=True)
+class Identity:
+    """Who a process is where that must be shown, and who else to believe; each in PEM."""
+
+    authority: str
+    """The certificate of the run's authority, which made everybody's."""
+    certificate: str
+    key: str
+    """The private key of the certificate."""
+
+
+@dataclass(frozen=True)
 class Brief:
     """Everything one process may know."""
 
@@ -89,6 +100,10 @@ class Brief:
     """The first slot that this process sees: of one that is started again, where it goes on."""
     ends_with_stdin: bool = False
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
+    patience: int = 30
+    """Seconds that it waits for the others to be there."""
+    identity: Identity | None = None
+    """Of a run whose router takes certificates."""
 
     @property
     def batch(self) -> Batch:
@@ -145,13 +160,20 @@ def _parsed(found: Any) -> Brief:
     for name, key in found["keys"].items():
         if not isinstance(key, str) or len(bytes.fromhex(key)) != KEY_BYTES:
             raise ValueError(f"the key of {name} is not {KEY_BYTES} bytes")
-    brief = Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"])})
+    identity = found.get("identity")
+    if identity is not None:
+        identity = Identity(**identity)
+        if not all(isinstance(value, str) for value in asdict(identity).values()):
+            raise TypeError("identity has an entry that is no str")
+    brief = Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"]), "identity": identity})
     _check_numbers(brief)
     return brief
 
 
 def _check_numbers(brief: Brief) -> None:
     """Raise ValueError or TypeError for numbers that no run has."""
+    if type(brief.patience) is not int or brief.patience < 1:
+        raise ValueError("patience must be a whole number of seconds, at least 1")
     if min(brief.slots, brief.trials, brief.recorded, brief.flow.window, brief.flow.batch) < 1 or brief.first_trial < 0:
         raise ValueError("slots, trials, recorded, flow.window and flow.batch must be at least 1")
     model = brief.model

@@ -149,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
     add("health", commands.health, "whether the process of a brief is on the network", _argument("brief", "BRIEF"))
     for role in ("router", "sensor", "legitimate", "eavesdropper", "observer"):
-        of_role = (_role(role), _served) if role == "observer" else (_role(role),)
+        of_role = (_role(role), _observed, _served) if role == "observer" else (_role(role),)
         add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser
 
@@ -232,6 +232,10 @@ def _entries(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that does not derive from the seed")
 
 
+def _observed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
+
+
 def _output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
     parser.add_argument("--json", action="store_true", help="the summary alone on standard output")
@@ -239,7 +243,7 @@ def _output(parser: argparse.ArgumentParser) -> None:
 
 def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
-    parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint, such as tcp/127.0.0.1:17447")
+    parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint: tcp or tls, /127.0.0.1:PORT")
 
 
 def _finished_view(parser: argparse.ArgumentParser) -> None:
@@ -309,8 +313,26 @@ def _fits(parser: argparse.ArgumentParser) -> None:
 
 def _briefs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the briefs go")
-    parser.add_argument("--results", type=Path, default=Path("results"), metavar="DIR", help="the observer's folder")
-    parser.add_argument("--listen", default="tcp/127.0.0.1:17447", metavar="ENDPOINT", help="the router's endpoint")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="the observer's folder, on its host; relative to where it is started",
+    )
+    parser.add_argument(
+        "--listen",
+        default="tcp/127.0.0.1:17447",
+        metavar="ENDPOINT",
+        help="where the router listens, such as tls/router.lan:7447",
+    )
+    parser.add_argument("--connect", metavar="ENDPOINT", help="what the others connect to; default as --listen says")
+    parser.add_argument(
+        "--wait", type=int, default=600, metavar="SECONDS", help="how long everybody waits for the others; default 600"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen in clear although others than this machine can get at it"
+    )
 
 
 class _Version(argparse.Action):

@@ -13,12 +13,14 @@ import signal
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.errors import BriefError, Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
+    from emulator.brief import Brief
     from emulator.runs.montecarlo import Plan
     from emulator.runs.viewer import Viewer
     from emulator.scenario import Scenario
@@ -332,8 +334,12 @@ def fit_link(options: argparse.Namespace) -> int:
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
+    from emulator.runs.ports import meeting_at
 
-    for path in write_briefs(_loaded(options), options.listen, options.results, options.out):
+    if not 1 <= options.wait <= 30 * 86_400:
+        raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
+    meeting = meeting_at(options.listen, options.connect, options.insecure)
+    for path in write_briefs(_loaded(options), meeting, options.results, options.out, options.wait):
         print(path)
     return 0
 
@@ -344,7 +350,21 @@ def process(options: argparse.Namespace) -> int:
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
-    match options.role:
+    if getattr(options, "out", None) is not None:
+        brief = replace(brief, part={**brief.part, "results": str(options.out)})
+    try:
+        return _play(brief, getattr(options, "serve", None))
+    except BriefError as error:
+        raise BriefError(f"{options.brief}: {error}") from error
+
+
+def _play(brief: Brief, serve: str | None) -> int:
+    """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    if brief.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        check_identity(brief.identity, brief.process)
+    match brief.role:
         case "router":
             from emulator.network.router import route as play
         case "sensor":
@@ -356,9 +376,9 @@ def process(options: argparse.Namespace) -> int:
         case "observer":
             from emulator.runs.observer import observe
 
-            return observe(brief, options.serve)
+            return observe(brief, serve)
         case _:
-            raise BriefError(f"no role {options.role}; give one of those that `evedrop --help` lists")
+            raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     play(brief)
     return 0
 

@@ -71,6 +71,14 @@ class Keys:
         return self._under(f"alive/{process}")
 
 
+def reader_of(key: str) -> str:
+    """The process that reads a key: all of them have one reader."""
+    kind, _, name = key.split("/", 2)[2].partition("/")
+    if kind == "ack":
+        return ROUTER if name == "sent" else SENSOR
+    return {"uplink": ROUTER, "journal": OBSERVER, "telemetry": OBSERVER, "progress": SENSOR}.get(kind, name)
+
+
 @dataclass(frozen=True)
 class Grant:
     """What one user may do; everything else is denied."""
@@ -130,14 +138,24 @@ def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
     return table
 
 
-def access_control(table: list[Grant]) -> dict[str, Any]:
-    """The `access_control` section of the router's Zenoh configuration."""
+def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any]:
+    """The `access_control` section of the router's Zenoh configuration.
+
+    certified: whether who says to be a user must have that user's certificate, too.
+    """
     rules = [rule for grant in table for rule in _rules(grant)]
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [{"id": grant.process, "usernames": [grant.process]} for grant in table],
+        "subjects": [
+            {
+                "id": grant.process,
+                "usernames": [grant.process],
+                **({"cert_common_names": [grant.process]} if certified else {}),
+            }
+            for grant in table
+        ],
         "policies": [{"subjects": [grant.process], "rules": [rule["id"] for rule in _rules(grant)]} for grant in table],
     }
 

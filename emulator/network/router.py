@@ -171,7 +171,7 @@ class WayBackLink:
 def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
     table = grants(brief.run, tuple(brief.part["links"]))
-    with _opened(brief, access_control(table)) as session:
+    with _opened(brief, access_control(table, brief.identity is not None)) as session:
         present = {grant.process: False for grant in table if grant.token is not None}
         for name in present:
             session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
@@ -259,7 +259,7 @@ def _change(found: Reader) -> Change:
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:
     with _users_file(brief.part["users"]) as users:
-        return Session(brief, router_config(brief.router, str(users), access))
+        return Session(brief, router_config(brief, str(users), access))
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,32 +18,39 @@ from typing import Any, Protocol, Self
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from emulator.brief import Brief
+from emulator.brief import Brief, Identity
 from emulator.errors import BriefError, RunError
 from emulator.launched import when_launcher_is_gone
-from emulator.network.access import Keys
+from emulator.network.access import OBSERVER, Keys, reader_of
+from emulator.network.connecting import Door, connected, endpoint_of
 from emulator.network.wire import Reader
 
-CONNECT_SECONDS = 20.0
 READY_SECONDS = 30.0
 _INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
 _POLL_SECONDS = 0.004
+_LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
 
 Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 
 
-def _transport() -> dict[str, Any]:
+def _transport(identity: Identity | None, listens: bool = False) -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
+    link: dict[str, Any] = {"tx": {"queue": {"congestion_control": wait}}, "rx": {"buffer_size": 1 << 20}}
+    if identity is not None:
+        from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
+
+        link |= {"protocols": ["tls"], "tls": tls_section(identity, listens, connects=not listens)}
     # Shared memory would put what the router sends to one receiver into the memory of all.
-    return {
-        "link": {"tx": {"queue": {"congestion_control": wait}}, "rx": {"buffer_size": 1 << 20}},
-        "shared_memory": {"enabled": False},
-    }
+    return {"link": link, "shared_memory": {"enabled": False}}
 
 
 class Credentials(Protocol):
     """Where the router is, and who asks to be let in: a brief, or the operator's control file."""
+
+    @property
+    def run(self) -> str:
+        """Name of the run."""
 
     @property
     def router(self) -> str:
@@ -56,6 +64,10 @@ class Credentials(Protocol):
     def password(self) -> str:
         """The user's."""
 
+    @property
+    def identity(self) -> Identity | None:
+        """Its certificate, if the router takes any."""
+
 
 def client_config(entry: Credentials) -> dict[str, Any]:
     """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
@@ -64,24 +76,52 @@ def client_config(entry: Credentials) -> dict[str, Any]:
         "mode": "client",
         "connect": {
             "endpoints": [entry.router],
-            "timeout_ms": int(CONNECT_SECONDS * 1000),
+            "timeout_ms": 0,
             "exit_on_failure": True,
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(), "auth": auth},
+        "transport": {**_transport(entry.identity), "auth": auth},
     }
 
 
-def router_config(endpoint: str, users_file: str, access: dict[str, Any]) -> dict[str, Any]:
+def door_of(entry: Credentials) -> Door:
+    """The way in for a brief, or for the operator."""
+    return Door(entry.router, entry.run, client_config(entry), entry.identity)
+
+
+def router_config(brief: Brief, users_file: str, access: dict[str, Any]) -> dict[str, Any]:
     """Configuration of the router: it listens, asks for user and password, and denies what is not granted."""
     return {
         "mode": "router",
-        "listen": {"endpoints": [endpoint], "exit_on_failure": True},
+        "listen": {"endpoints": [brief.router], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(), "auth": {"usrpwd": {"dictionary_file": users_file}}},
+        "transport": {**_transport(brief.identity, listens=True), "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
     }
+
+
+def _listening(brief: Brief, config: dict[str, Any]) -> zenoh.Session:
+    """The router's session. Raises BriefError if it cannot listen where its brief says."""
+    endpoint = endpoint_of(brief.router, brief.identity)
+    try:
+        endpoint.try_to_listen()
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except socket.gaierror as error:
+        raise BriefError(
+            f"the host of {brief.router} is not known here ({error.strerror}); write it into /etc/hosts, or write the "
+            f"briefs again with --listen {endpoint.protocol}/0.0.0.0:{endpoint.port} and --connect"
+        ) from error
+    except OSError as error:
+        other = f"--listen {endpoint.protocol}/HOST:PORT"
+        raise BriefError(
+            f"the router cannot listen at {brief.router} ({error.strerror}); end the program that does, or write the briefs "
+            f"again with another {other}, of the host that the router is started on"
+        ) from error
+    except zenoh.ZError as error:
+        raise BriefError(
+            f"the router cannot listen at {brief.router} ({error}); write the briefs again with another --listen"
+        ) from error
 
 
 class Question:
@@ -98,22 +138,28 @@ class Question:
         self._query.drop()  # type: ignore[no-untyped-call]
 
 
+def _matched(publisher: zenoh.Publisher) -> bool:
+    return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+
+
 class Session:
     """A process's session. Final; use it as a context manager, or its threads outlive the program."""
 
-    def __init__(self, brief: Brief, config: dict[str, Any] | None = None) -> None:
-        zenoh.init_log_from_env_or("error")
+    def __init__(
+        self, brief: Brief, config: dict[str, Any] | None = None, meanwhile: Callable[[], None] = lambda: None
+    ) -> None:
+        """config: the router's own, who waits for nobody; meanwhile: called while there is no router yet."""
+        zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
         self.keys = Keys(brief.run)
         self._process = brief.process
-        try:
-            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config or client_config(brief))))
-        except zenoh.ZError as error:
-            raise BriefError(
-                f"no session with the router at {brief.router}: {error}. Check that it runs, that the brief is of this "
-                "run, and that nothing else listens there"
-            ) from error
+        self.patience = float(brief.patience)
+        """Seconds that are waited for the others."""
+        if config is None:
+            self._session = connected(door_of(brief), self.patience, meanwhile)
+        else:
+            self._session = _listening(brief, config)
         self._publishers: list[zenoh.Publisher] = []
         self._token: zenoh.LivelinessToken | None = None
         self._control = self.inbox(self.keys.control(self._process))
@@ -142,6 +188,10 @@ class Session:
         self._publishers.append(publisher)
         return publisher.put
 
+    def reaches(self, key: str) -> bool:
+        """Whether somebody reads a key that this process has a publisher for: who does has opened its session."""
+        return any(str(publisher.key_expr) == key and _matched(publisher) for publisher in self._publishers)
+
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Be asked at one exact key; `receive` is called on a thread of Zenoh's and must only hand the question on."""
         self._session.declare_queryable(key, lambda query: receive(Question(key, query)))
@@ -155,16 +205,21 @@ class Session:
     def ready(self) -> None:
         """Wait until every publisher has a reader, then show that this process is there.
 
-        Raises RunError after 30 s, naming the keys that nobody reads.
+        Raises RunError after the brief's patience, naming who is missing and the keys that they do not read; but while the
+        observer is there it is left to that one to say who is missing.
         """
-        deadline = time.monotonic() + READY_SECONDS
+        deadline = time.monotonic() + self.patience
         waiting = list(self._publishers)
         while waiting:
-            waiting = [publisher for publisher in waiting if not publisher.matching_status.matching]  # type: ignore[attr-defined]  # the stub says bool
+            waiting = [publisher for publisher in waiting if not _matched(publisher)]
+            unread = [str(publisher.key_expr) for publisher in waiting]
+            missing = dict.fromkeys(reader_of(key) for key in unread)
+            if OBSERVER not in missing and self._process != OBSERVER:
+                deadline = time.monotonic() + self.patience
             if waiting and time.monotonic() > deadline:
-                unread = ", ".join(str(publisher.key_expr) for publisher in waiting)
                 raise RunError(
-                    f"{self._process}: after {READY_SECONDS:.0f} s nobody reads {unread}; look at the other logs"
+                    f"{self._process}: {', '.join(missing)} did not appear within {self.patience:.0f} s, and nobody reads "
+                    f"{', '.join(unread)}; start them, or look at their logs"
                 )
             if waiting:
                 time.sleep(_POLL_SECONDS)

@@ -8,20 +8,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from emulator.brief import Brief, Flow, Model
+from emulator.brief import Brief, Flow, Identity, Model
 from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
 from emulator.runs.acknowledging import chart_of, way_back_of
-from emulator.runs.folder import new_folder
+from emulator.runs.ports import Meeting, meeting_at
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
 
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 1024
 _REPORT_SECONDS = 0.04
+_LAUNCHED_PATIENCE = 30  # seconds
 
 
 @dataclass(frozen=True)
@@ -101,10 +102,19 @@ class Observation:
 
 
 def briefs_of(
-    scenario: Scenario, endpoint: str, observation: Observation, ends_with_stdin: bool = True
+    scenario: Scenario,
+    meeting: Meeting | str,
+    observation: Observation,
+    ends_with_stdin: bool = True,
+    patience: int = _LAUNCHED_PATIENCE,
 ) -> dict[str, Brief]:
-    """Process name → brief, with passwords and a run name made afresh."""
+    """Process name → brief, with run name, passwords and, where the router takes them, certificates made afresh.
+
+    meeting: a text is an endpoint that is both listened on and connected to.
+    """
     run = f"r{secrets.token_hex(4)}"
+    if isinstance(meeting, str):
+        meeting = meeting_at(meeting)
     keys = StreamKeys.of(scenario)
     users = {name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, OBSERVER, OPERATOR)}
     spec = scenario.encoding.spec
@@ -112,13 +122,14 @@ def briefs_of(
     public, mu_d = scenario.process, scenario.encoding.mu_d
     model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header))
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
+    identities = _identities(run, meeting, tuple(users))
 
     def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
         return Brief(
             run=run,
             process=process,
             role=role,
-            router=endpoint,
+            router=str(meeting.listen if role == "router" else meeting.connect),
             user=process,
             password=users.get(process, ""),
             slots=scenario.slots,
@@ -130,6 +141,8 @@ def briefs_of(
             keys={name: key.hex() for name, key in owned.items()},
             part=part,
             ends_with_stdin=ends_with_stdin,
+            patience=patience,
+            identity=identities.get(process),
         )
 
     courses = {name: scenario.course(name) for name in scenario.receivers}
@@ -175,10 +188,11 @@ def briefs_of(
             {},
             {
                 "scenario": scenario.model_dump(mode="json"),
-                "results": str(observation.results.absolute()),
+                "results": str(observation.results),
                 "recording": observation.recording,
                 "live": observation.live,
                 "operator": users[OPERATOR],
+                "operator_identity": asdict(identities[OPERATOR]) if identities else None,
             },
         ),
     ]
@@ -188,23 +202,37 @@ def briefs_of(
     return {one.process: one for one in made}
 
 
+def _identities(run: str, meeting: Meeting, users: tuple[str, ...]) -> dict[str, Identity]:
+    """Process name, or operator → its certificate; nobody has one of a router that listens in clear."""
+    if not meeting.secure:
+        return {}
+    from emulator.runs.authority import Authority  # noqa: PLC0415 - 50 ms that most runs need not
+
+    authority = Authority(run)
+    return {
+        **{user: authority.identity(user) for user in users},
+        ROUTER: authority.identity(ROUTER, hosts=meeting.names),
+    }
+
+
 def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
     """What a receiver is told of late packets, and of its own outages alone."""
     outages = [[one.start, one.stop, one.keeps_state] for one in scenario.timeline.outages[receiver]]
     return {"window": scenario.window(receiver), "outages": outages}
 
 
-def write_briefs(scenario: Scenario, endpoint: str, results: Path, folder: Path) -> list[Path]:
-    """Write the briefs into a folder, for processes that are started by hand; the observer's results go to `results`.
+def write_briefs(scenario: Scenario, meeting: Meeting, results: Path, folder: Path, patience: int) -> list[Path]:
+    """Write the briefs into a folder, for processes that are started by hand, on whichever hosts.
 
-    Raises UsageError if either folder has something in it or cannot be written.
+    results: the observer's folder, on its host; relative to where it is started. patience: seconds that everybody waits for
+    the others. Raises UsageError if the folder has something in it or cannot be written.
     """
-    new_folder(results)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty; give another --out, or empty it")
-        made = briefs_of(scenario, endpoint, Observation(results, True, None), ends_with_stdin=False)
+        observation = Observation(results, True, None)
+        made = briefs_of(scenario, meeting, observation, ends_with_stdin=False, patience=patience)
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

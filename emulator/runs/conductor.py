@@ -9,7 +9,7 @@ from typing import Any
 
 from emulator.errors import Interrupted, RunError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
-from emulator.network.session import READY_SECONDS, Question, Session
+from emulator.network.session import Question, Session
 from emulator.network.wire import control, progress
 
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
@@ -74,13 +74,16 @@ class Conductor:
         return dict(self._present)
 
     def assemble(self) -> None:
-        """Wait for every process. Raises RunError naming those that are missing after 30 s."""
-        deadline = time.monotonic() + READY_SECONDS
+        """Wait for every process. Raises RunError naming those that are missing after the brief's patience."""
+        deadline = time.monotonic() + self._session.patience
         while self.missing:
             self._stop.check()
             if time.monotonic() > deadline:
-                names = ", ".join(self.missing)
-                raise RunError(f"{names} did not appear within {READY_SECONDS:.0f} s; look at the logs")
+                # Who waits for somebody else is not the one to be named.
+                names = [name for name in self.missing if not self._session.reaches(self._session.keys.control(name))]
+                names = names or self.missing
+                do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
+                raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
             self._note(self._next())
         self._session.ready()
 

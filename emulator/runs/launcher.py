@@ -19,7 +19,7 @@ from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import GRACE_SECONDS, Children, Exit, News
 from emulator.runs.folder import new_folder
-from emulator.runs.ports import check_endpoint, free_port
+from emulator.runs.ports import loopback_meeting
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
 from emulator.scenario import Scenario
@@ -43,15 +43,13 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
     last two cases what was measured is in the folder and no process is left.
     """
     view = choose(view)
-    if listen is not None:
-        check_endpoint(listen)
-    endpoint = listen or f"tcp/127.0.0.1:{free_port()}"
+    meeting = loopback_meeting(listen)
     with stop_on_signals() as stop, _private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, endpoint, Observation(folder, view != "off", None))
+            briefs = briefs_of(scenario, meeting, Observation(folder.absolute(), view != "off", None))
             observer = briefs.pop(OBSERVER)
             with Children(folder / "logs", private) as children:
                 for brief in briefs.values():

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from emulator.brief import Brief
+from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
@@ -31,6 +31,7 @@ from emulator.network.operator import Answer, read_request
 from emulator.network.session import Question, Session
 from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
 from emulator.runs.conductor import Conductor, Stop
+from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
@@ -52,7 +53,8 @@ _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 def observe(brief: Brief, serve: str | None = None) -> int:
     """Run the observer of a brief; the exit status of the run.
 
-    serve: HOST:PORT where browsers may see it, if any. Raises UsageError if nothing can be served there.
+    serve: HOST:PORT where browsers may see it, if anywhere. Raises UsageError, BriefError, RunError or Interrupted, of one
+    started by hand, as long as nothing has begun.
     """
     stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
@@ -64,10 +66,14 @@ def observe(brief: Brief, serve: str | None = None) -> int:
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario, confirmations)
+    if by_hand:
+        # Before there is anything in it: what a brief that does not fit leaves behind would be in the next one's way.
+        new_folder(observation.folder)
+        with Session(brief, meanwhile=stop.check):
+            pass
     viewer = None if stand is None else observation.show(stand)
     status, how = 0, "complete"
     try:
-        observation.folder.mkdir(parents=True, exist_ok=True)  # on another host than that of the briefs it is not there
         write_resolved(observation.folder, scenario)
         with observation.writer():
             try:
@@ -143,7 +149,7 @@ class Observation:
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
-        with Session(self._brief) as session:
+        with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
             conductor = Conductor(session, self._scenario.receivers, stop, self._beat)
             if self._brief.part["recording"]:
                 self._recording = open_recording(
@@ -171,9 +177,16 @@ class Observation:
                 self._ended = time.monotonic()
             conductor.end()
 
+    def _wait(self, stop: Stop) -> None:
+        """What is done while there is no router yet."""
+        stop.check()
+        self._beat()
+
     @property
     def _control(self) -> Control:
-        return Control(self._brief.run, self._brief.router, OPERATOR, self._brief.part["operator"])
+        part = self._brief.part
+        identity = None if part["operator_identity"] is None else Identity(**part["operator_identity"])
+        return Control(self._brief.run, self._brief.router, OPERATOR, part["operator"], identity)
 
     def _keep(self, scenario: Scenario) -> None:
         """The run is of another scenario from now on, of which all slots so far are too."""

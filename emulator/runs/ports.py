@@ -1,11 +1,34 @@
-"""Ports on loopback: a free one, or whether the one that was asked for is."""
+"""Where the router of a run may listen: a free port on loopback, or what was asked for, if that is safe and can be had."""
 
 from __future__ import annotations
 
 import secrets
 import socket
+from dataclasses import dataclass
 
 from emulator.errors import UsageError
+from emulator.network.endpoint import Endpoint
+
+_EXAMPLE = "give one such as tls/router.lan:7447"
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Where the router listens, and what the others connect to."""
+
+    listen: Endpoint
+    connect: Endpoint
+
+    @property
+    def secure(self) -> bool:
+        """Whether it takes certificates."""
+        return self.listen.secure
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The hosts that the router is known by."""
+        found = (self.connect.host, *(() if self.listen.everywhere else (self.listen.host,)))
+        return tuple(dict.fromkeys(found))
 
 
 def free_port() -> int:
@@ -21,19 +44,60 @@ def free_port() -> int:
     raise UsageError("no free port between 10000 and 32000 on loopback; end some programs, or give --listen")
 
 
-def check_endpoint(endpoint: str) -> None:
-    """Raise UsageError unless the endpoint tcp/HOST:PORT can be listened on, on loopback."""
-    address = endpoint.removeprefix("tcp/")
-    host, _, port = address.rpartition(":")
-    named = port.isdecimal() and len(port) <= 5 and 0 < int(port) < 2**16
-    if not endpoint.startswith("tcp/") or not named or host not in {"127.0.0.1", "localhost", "[::1]"}:
-        raise UsageError(f"--listen {endpoint} is no loopback endpoint; give one such as tcp/127.0.0.1:17460")
-    family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
-    with socket.socket(family) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host.strip("[]"), int(port)))
-        except OSError as error:
-            raise UsageError(
-                f"--listen {endpoint}: {error.strerror}; leave it out, and a free port is found"
-            ) from error
+def meeting_at(listen: str, connect: str | None = None, insecure: bool = False) -> Meeting:
+    """The meeting that `--listen` and `--connect` name, on whichever host.
+
+    insecure: whether the user said that it may be in clear although others can get at it. Raises UsageError if it is no
+    place to meet at.
+    """
+    here = _endpoint("--listen", listen)
+    there = here if connect is None else _endpoint("--connect", connect)
+    if there.everywhere:
+        asked = "--listen" if connect is None else "--connect"
+        raise UsageError(
+            f"{asked} {there} is every address of a host, and none to connect to; add --connect {there.protocol}/HOST:"
+            f"{there.port} with the name or address that the others reach it by"
+        )
+    if here.protocol != there.protocol:
+        raise UsageError(f"--connect {there} is not what --listen {here} speaks; give both as tls/HOST:PORT")
+    if there.secure and there.address is not None and there.address.version == 6:
+        raise UsageError(
+            f"--connect {there}: no certificate can be checked against an address of IPv6; give the host's name"
+        )
+    if not here.secure and not insecure and not here.loopback:
+        raise UsageError(
+            f"--listen {here} is in clear, and others than this machine can get at it: they would read everything, and "
+            f"could pose as the router; give tls/{str(here).partition('/')[2]}, or add --insecure"
+        )
+    return Meeting(here, there)
+
+
+def _endpoint(option: str, text: str) -> Endpoint:
+    try:
+        return Endpoint.of(text)
+    except ValueError as error:
+        raise UsageError(f"{option} {error}; {_EXAMPLE}") from error
+
+
+def loopback_meeting(listen: str | None) -> Meeting:
+    """The meeting of a run whose processes are all here: what was asked for, or a free port.
+
+    Raises UsageError unless it can be listened on, on loopback.
+    """
+    if listen is None:
+        return meeting_at(f"tcp/127.0.0.1:{free_port()}")
+    try:
+        endpoint = Endpoint.of(listen)
+    except ValueError as error:
+        raise UsageError(f"--listen {error}; give one such as tcp/127.0.0.1:17460") from error
+    if not endpoint.loopback:
+        raise UsageError(
+            f"--listen {listen} is no loopback endpoint; give one such as tcp/127.0.0.1:17460, or start the processes by "
+            "hand: evedrop brief"
+        )
+    meeting = meeting_at(listen)
+    try:
+        endpoint.try_to_listen()
+    except OSError as error:
+        raise UsageError(f"--listen {listen}: {error.strerror}; leave it out, and a free port is found") from error
+    return meeting

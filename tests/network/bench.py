@@ -86,16 +86,18 @@ class Ear:
 
 
 def connect(brief: Brief, **changes: Any) -> zenoh.Session:
-    """A session with a brief's credentials; changes replace top-level entries of its configuration."""
-    return zenoh.open(zenoh.Config.from_json5(json.dumps({**client_config(brief), **changes})))
+    """A session with a brief's credentials, with a router that may not be up yet; changes replace top-level entries."""
+    config = client_config(brief)
+    config["connect"]["timeout_ms"] = int(1000 * LIMIT_SECONDS)
+    return zenoh.open(zenoh.Config.from_json5(json.dumps({**config, **changes})))
 
 
 class Bench:
     """A router process, and sessions with everybody else's credentials in the test's hands."""
 
-    def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack) -> None:
+    def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
         observation = Observation(folder / "results", False, None)
-        made = briefs_of(scenario, f"tcp/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
+        made = briefs_of(scenario, f"{protocol}/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
         self.briefs: Mapping[str, Brief] = {
             name: replace(brief, flow=Flow(window=32, batch=8)) for name, brief in made.items()
         }
@@ -159,7 +161,7 @@ class Bench:
 
 
 @contextmanager
-def bench_of(scenario: Scenario, folder: Path) -> Iterator[Bench]:
+def bench_of(scenario: Scenario, folder: Path, protocol: str = "tcp") -> Iterator[Bench]:
     """A bench that is gone when the block ends."""
     with ExitStack() as stack:
-        yield Bench(scenario, folder, stack)
+        yield Bench(scenario, folder, stack, protocol)

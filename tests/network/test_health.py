@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bench import Bench
+from bench import Bench, bench_of, scenario_of
 
 from emulator import cli
 from emulator.network.health import is_there
@@ -33,6 +33,13 @@ def test_who_is_ready_is_there_and_who_left_is_not(bench: Callable[..., Bench]) 
 def test_the_router_is_asked_for_itself(bench: Callable[..., Bench]) -> None:
     """It is ready once it has found the others; nobody else has its credentials."""
     assert is_there(bench().briefs["router"])
+
+
+def test_behind_certificates_it_is_no_different(tmp_path: Path) -> None:
+    """A router that listens everywhere is asked where it is found from its own machine, and has no name there."""
+    with bench_of(scenario_of(), tmp_path, protocol="tls") as stage:
+        assert is_there(replace(stage.briefs["router"], router=f"tls/0.0.0.0:{stage.briefs['router'].router[-5:]}"))
+        assert not is_there(stage.briefs[EVE])
 
 
 def test_the_command_says_so(bench: Callable[..., Bench], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
