@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,7 +20,7 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from emulator.brief import Brief, Identity
-from emulator.errors import BriefError, RunError
+from emulator.errors import BriefError, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
 from emulator.network.access import OBSERVER, Keys, reader_of
 from emulator.network.connecting import Door, connected, endpoint_of
@@ -163,6 +164,7 @@ class Session:
         self._publishers: list[zenoh.Publisher] = []
         self._token: zenoh.LivelinessToken | None = None
         self._control = self.inbox(self.keys.control(self._process))
+        self.funnel(self.keys.control(self._process), self._heed)
 
     def __enter__(self) -> Self:
         return self
@@ -224,6 +226,14 @@ class Session:
             if waiting:
                 time.sleep(_POLL_SECONDS)
         self._token = self._session.liveliness().declare_token(self.keys.alive(self._process))
+
+    def _heed(self, payload: bytes) -> None:
+        """End this process, whatever it is waiting for, when the conductor says that the run has failed."""
+        with suppress(MalformedMessage):  # whoever reads the commands says what is wrong with it
+            command = Reader(self.keys.control(self._process), payload)
+            if command.text("do") == "abandon":
+                print(f"evedrop: the run has failed: {command.text('why')}", file=sys.stderr, flush=True)  # noqa: T201
+                os._exit(RunError.exit_status)
 
     def wait_for(self, command: str) -> None:
         """Wait for one command of the conductor: `start` or `end`."""

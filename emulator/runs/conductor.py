@@ -13,6 +13,7 @@ from emulator.network.session import Question, Session
 from emulator.network.wire import control, progress
 
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
+_FAREWELL_SECONDS = 3.0  # for everybody to hear that the run has failed
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 
 
@@ -118,6 +119,16 @@ class Conductor:
         """Tell everybody that the run is over."""
         for command in self._commands.values():
             command(control("end"))
+
+    def abandon(self, why: str) -> None:
+        """Tell everybody that the run has failed: each ends at once, and the router when the others had time to hear it."""
+        for name, command in self._commands.items():
+            if name != ROUTER:
+                command(control("abandon", why=why))
+        deadline = time.monotonic() + _FAREWELL_SECONDS
+        while any(there for name, there in self._present.items() if name != ROUTER) and time.monotonic() < deadline:
+            self._note(self._next())
+        self._commands[ROUTER](control("abandon", why=why))
 
     def _next(self) -> tuple[str, bytes | bool] | None:
         self._beat()

@@ -65,7 +65,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
-    observation = Observation(brief, scenario, confirmations)
+    observation = Observation(brief, scenario, confirmations, by_hand)
     if by_hand:
         # Before there is anything in it: what a brief that does not fit leaves behind would be in the next one's way.
         new_folder(observation.folder)
@@ -116,9 +116,13 @@ def tell(event: str, **news: Any) -> None:
 class Observation:
     """One run as the observer sees it. Final."""
 
-    def __init__(self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes]) -> None:
+    def __init__(
+        self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
+    ) -> None:
+        """by_hand: whether there is no launcher to end the other processes when the run fails."""
         self.folder = Path(brief.part["results"])
         self._brief = brief
+        self._by_hand = by_hand
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
@@ -168,8 +172,11 @@ class Observation:
                     if news is not None:
                         self._take(conductor, *news)
                     self._steer(conductor)
-            except RunError:
-                self._suspects = conductor.missing
+            except EvedropError as error:
+                if isinstance(error, RunError):
+                    self._suspects = conductor.missing
+                if self._by_hand:
+                    conductor.abandon(str(error))
                 raise
             finally:
                 self._dismiss(conductor)

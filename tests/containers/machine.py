@@ -123,6 +123,8 @@ class Docker:
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [
+                    # However the tests end, it ends with them.
+                    *("setpriv", "--pdeathsig", "KILL"),
                     *("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", _INIT, "sh"),
                     *("dockerd", "--data-root", str(folder / "data"), "--exec-root", str(folder / "exec")),
                     *("--host", self.address, "--pidfile", str(folder / "docker.pid"), "--bridge", "none"),

@@ -50,8 +50,9 @@ class Project:
             raise AssertionError(f"{error}\n{said.stdout}") from error
 
     def container(self, service: str) -> str:
-        """The name of a service's container."""
-        found = self.compose("ps", "-q", service).stdout.strip()
+        """The id of a service's container."""
+        project = f"label=com.docker.compose.project={self.environment['COMPOSE_PROJECT_NAME']}"
+        found = self.docker("ps", "-aq", "-f", project, "-f", f"label=com.docker.compose.service={service}")
         assert found, f"no container of {service}"
         return found
 
@@ -66,12 +67,13 @@ class Project:
 
     def said(self, service: str) -> str:
         """All that a service has said so far."""
-        return self.compose("logs", "--no-color", service).stdout
+        done = run("docker", "-H", self.docker.address, "logs", self.container(service))
+        return done.stdout + done.stderr
 
     def progress(self) -> int:
         """The slots that the run has done."""
-        lines = [line.partition("{")[2] for line in self.said("observer").splitlines() if '"progress"' in line]
-        return max((json.loads("{" + line)["done"] for line in lines), default=0)
+        lines = [line for line in self.said("observer").splitlines() if line.startswith("{") and '"progress"' in line]
+        return max((json.loads(line)["done"] for line in lines), default=0)
 
     def running(self, more_than: int = 0) -> None:
         """Wait until more than so many slots are done."""
