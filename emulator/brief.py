@@ -27,7 +27,7 @@ _KINDS: Mapping[tuple[str, ...], type] = {
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
     "router": ("links", "pace", "users", "leaks", "acknowledgements"),
-    "sensor": ("scheme", "pace", "receivers", "holds", "leaks", "chart"),
+    "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart"),
     "legitimate": ("scheme", "window", "outages"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
     "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity"),
@@ -43,6 +43,8 @@ class Flow:
     """The sensor stays at most this far ahead of the slowest receiver and of the observer."""
     batch: int
     """Telemetry, journal and progress are sent at least this often."""
+    longest_outage: float = 30.0
+    """Seconds for which a process may be cut off before that ends the run."""
 
 
 @dataclass(frozen=True)

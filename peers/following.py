@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,16 @@ from emulator.brief import Brief
 from emulator.model.follower import Follower
 from emulator.model.receiver import Belief, Receiver
 from emulator.network.reporting import BeliefReporter
-from emulator.network.session import Session
-from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_delivery
+from emulator.network.resending import Due
+from emulator.network.session import Inbox, Session
+from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_acknowledgement, read_delivery
 
 
 def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None:
-    """Run a receiver over all slots of its brief, but for those in which it is away; it may acknowledge what it receives."""
+    """Run a receiver over all slots of its brief, but for those in which it is away; it may acknowledge what it receives.
+
+    What it has had already is acknowledged once more and else ignored: the first acknowledgement may have been lost.
+    """
     name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part["window"]
     outages = {start: (stop, keeps) for start, stop, keeps in brief.part["outages"]}
     follower = Follower(receiver, window, brief.first)
@@ -25,36 +31,67 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
     with Session(brief) as session:
         downlink = session.keys.downlink(name)
         deliveries = session.inbox(downlink)
-        put_telemetry = session.outlet(session.keys.telemetry(name))
+        put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in outages.items() for slot in (start, stop)]
-        put_progress = session.outlet(session.keys.progress(name))
+        put_progress = session.kept(session.keys.progress(name), 0)
         put_acknowledgement = session.outlet(session.keys.acknowledged) if acknowledges else None
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
+        due = Due(downlink, brief.flow.longest_outage)
         session.ready()
         k = brief.first
         while k < brief.slots:
             message = Reader(downlink, deliveries.recv().payload.to_bytes())
+            found = message.integer("k")
             if is_hold(message):
-                if message.slot(k) in outages:
+                if found != k:
+                    due.missed(k, found)
+                    continue
+                if k in outages:
                     # Before the report that the conductor waits for: it may end this process at once.
                     _save(brief, follower.belief)
-                    put_telemetry(leaving(k, follower.belief))
+                    put_telemetry(k, leaving(k, follower.belief))
                 reporter.flush(k)
                 if outages.get(k, (0, False))[0] >= brief.slots:
                     break
                 continue
-            if k in outages:  # back from a pause
+            if k in outages and found >= k:  # back from a pause
                 stop, _ = outages[k]
                 follower.miss(range(k, stop))
                 reporter.skip(stop)
                 k = stop
+            if found != k:
+                if found < k and put_acknowledgement is not None:
+                    put_acknowledgement(_acknowledged(message, brief.trials))
+                due.missed(k, found)
+                continue
             arrival = read_delivery(message, k, shape, brief.model.header)
             if put_acknowledgement is not None:
                 put_acknowledgement(acknowledgement(k, arrival.heard.gamma))
             belief = follower.take(k, arrival)
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
+        if put_acknowledgement is not None:
+            # Who has all it needs may still be asked for its acknowledgements; the thread ends with the session.
+            _acknowledge_again(deliveries, put_acknowledgement, downlink, brief.trials)
         session.wait_for("end")
+
+
+def _acknowledge_again(deliveries: Inbox, put: Callable[[bytes], None], key: str, trials: int) -> None:
+    """Acknowledge whatever still comes, on a thread of its own."""
+
+    def go_on() -> None:
+        for delivery in deliveries:
+            message = Reader(key, delivery.payload.to_bytes())
+            if not is_hold(message):
+                put(_acknowledged(message, trials))
+
+    threading.Thread(target=go_on, name="acknowledges", daemon=True).start()
+
+
+def _acknowledged(delivery: Reader, trials: int) -> bytes:
+    """The acknowledgement of a delivery, whose γ is where a delivery has its own."""
+    k = delivery.integer("k")
+    return acknowledgement(k, read_acknowledgement(delivery, k, trials))
 
 
 def _save(brief: Brief, belief: Belief) -> None:

@@ -14,17 +14,21 @@ from emulator.model.schemes import scheme_of
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.network.access import OBSERVER, SENSOR
 from emulator.network.reporting import TruthReporter
+from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
-from emulator.network.wire import Beside, Reader, held, hold, read_acknowledgement, read_progress, uplink
+from emulator.network.wire import Beside, Reader, held, hold, once_more, read_acknowledgement, read_progress, uplink
 
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
 
 class Window:
-    """How far the sensor may go: `window` slots beyond the slowest of those who report progress. Final."""
+    """How far the sensor may go: `window` slots beyond the slowest of those who report progress. Final.
 
-    def __init__(self, session: Session, followers: tuple[str, ...], window: int) -> None:
-        self._window = window
+    sent: what it sent, which is forgotten as they go on.
+    """
+
+    def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: Kept) -> None:
+        self._window, self._sent = window, sent
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
@@ -47,7 +51,9 @@ class Window:
         self._measure()
 
     def _measure(self) -> None:
-        self._limit = min(done for name, done in self._done.items() if name not in self._absent) + self._window
+        done = min(done for name, done in self._done.items() if name not in self._absent)
+        self._limit = done + self._window
+        self._sent.forget(done)
 
 
 class Holds:
@@ -56,7 +62,7 @@ class Holds:
     def __init__(self, brief: Brief, session: Session, window: Window, scheme: Scheme) -> None:
         self._session, self._window = session, window
         self._holds = set(brief.part["holds"])
-        self._telemetry = session.outlet(session.keys.telemetry(SENSOR))
+        self._telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
         watches = brief.part["chart"] is not None
         self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches)
 
@@ -70,8 +76,9 @@ class Holds:
     def hold(self, k: int) -> None:
         """Report all slots below k, and wait until the conductor says go."""
         self.reporter.flush(k)
-        self._telemetry(held(k))
-        while (command := self._session.command()).text("do") != "go":
+        self._telemetry(k, held(k))
+        # It may be told more than once, and of a hold before this one.
+        while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
             pass
         self._window.go_on(k, command.names("absent"))
         self._holds = {slot for slot in self._holds if slot > k}
@@ -86,12 +93,16 @@ class Acknowledgements:
         self._encoder, self._trials = encoder, brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
+        self._due = Due(self._key, brief.flow.longest_outage)
         chart = brief.part["chart"]
         self._watch = Watch(Chart(**chart), brief.trials) if chart is not None else None
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
         message = Reader(self._key, self._inbox.recv().payload.to_bytes())
+        while (found := message.integer("k")) != k:  # sent once more
+            self._due.missed(k, found)
+            message = Reader(self._key, self._inbox.recv().payload.to_bytes())
         acknowledged = read_acknowledgement(message, k, self._trials)
         self._encoder.acknowledged(k, acknowledged)
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
@@ -106,8 +117,8 @@ def sense(brief: Brief) -> None:
     betrayed = set(brief.part["leaks"].values())
     pace = float(brief.part["pace"])
     with Session(brief) as session:
-        window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window)
-        send = session.outlet(session.keys.uplink)
+        send = session.kept(session.keys.uplink, head=once_more, back=brief.part["history"])
+        window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window, send)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
         holds = Holds(brief, session, window, scheme)
         session.ready()
@@ -119,7 +130,7 @@ def sense(brief: Brief) -> None:
             while not (wanted := holds.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:
                 time.sleep(min(left, _LOOK_SECONDS))
             if wanted:
-                send(hold(k))
+                send(k, hold(k))
                 began = time.monotonic()
                 holds.hold(k)
                 start += time.monotonic() - began
@@ -127,7 +138,7 @@ def sense(brief: Brief) -> None:
             x = trajectory.advance()
             packet = encoder.encode(k, x, trajectory.predicted)
             beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
-            send(uplink(k, packet.z, **beside.given))
+            send(k, uplink(k, packet.z, **beside.given))
             alarms = back.wait(k, packet) if back is not None else None
             holds.reporter.add(k, x, packet.nu, packet.sent, alarms)
         session.wait_for("end")

@@ -27,7 +27,7 @@ class TruthReporter:
     """The sensor's reports: states and schedule; what was sent at all, and alarms, where there are such things. Final."""
 
     def __init__(
-        self, brief: Brief, put: Callable[[bytes], None], may_be_silent: bool = False, watches: bool = False
+        self, brief: Brief, put: Callable[[int, bytes], None], may_be_silent: bool = False, watches: bool = False
     ) -> None:
         self._brief = brief
         self._put = put
@@ -54,21 +54,22 @@ class TruthReporter:
             row = self._first % self._brief.flow.batch
             rows = slice(row, row + end - self._first)
             flags = (None if column is None else column[rows] for column in (self._sent, self._alarms))
-            self._put(Truth(self._first, self._x[rows], self._nu[rows], *flags).pack())
+            self._put(end - 1, Truth(self._first, self._x[rows], self._nu[rows], *flags).pack())
         self._first = end
 
 
 class BeliefReporter:
     """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress. Final.
 
-    cuts: where it goes away or is back; first: its first slot; counts_late: whether it can make use of late packets.
+    put, put_progress: take the last slot that a message tells of, and the message. cuts: where it goes away or is back;
+    first: its first slot; counts_late: whether it can make use of late packets.
     """
 
     def __init__(
         self,
         brief: Brief,
-        put: Callable[[bytes], None],
-        put_progress: Callable[[bytes], None],
+        put: Callable[[int, bytes], None],
+        put_progress: Callable[[int, bytes], None],
         cuts: Iterable[int] = (),
         first: int = 0,
         counts_late: bool = False,
@@ -91,12 +92,12 @@ class BeliefReporter:
         if digests is not None or is_due(self._brief, k):
             self._report(k + 1, {} if digests is None else dict([digests]))
         if is_due(self._brief, k):
-            self._put_progress(progress(k + 1))
+            self._put_progress(k, progress(k + 1))
 
     def flush(self, end: int) -> None:
         """Report all slots below `end`, and that they are done."""
         self._report(end, {})
-        self._put_progress(progress(end))
+        self._put_progress(end - 1, progress(end))
 
     def skip(self, end: int) -> None:
         """Go on from slot `end`: somebody else reports the slots before it, in which this receiver was not there."""
@@ -118,5 +119,5 @@ class BeliefReporter:
             digests,
             None if self._late is None else self._late[1, row : row + end - self._first],
         )
-        self._put(report.pack())
+        self._put(end - 1, report.pack())
         self._first = end

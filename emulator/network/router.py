@@ -4,8 +4,9 @@
                      ├── link of receiver 2 ── fate, γ ── downlink/2      fates of all ── journal
                      └── …
 
-It never loses a message: a receiver that is there gets one delivery in every slot, with all that arrives in it. At a mark
-on the uplink it journals all slots before, and waits until the conductor lets it go on; links change nowhere else.
+A receiver that is there gets one delivery in every slot, with all that arrives in it. At a mark on the uplink it journals
+all slots before, and waits until the conductor lets it go on; links change nowhere else. When packets are sent once more it
+routes them once more, to the same fates, as a router does that was started anew.
 """
 
 from __future__ import annotations
@@ -15,20 +16,24 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
 
 from emulator.brief import Brief
-from emulator.model.account import Account, Accountant
+from emulator.model.account import COUNTED_BURSTS, Account, Accountant
 from emulator.model.acknowledgements import WayBack
 from emulator.model.link import Change, Course, Fates, Link, streams_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
 from emulator.model.transit import Late, Transit
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, access_control, grants
+from emulator.network.commands import Anew, Commands
 from emulator.network.postman import Postman
+from emulator.network.resending import Due
 from emulator.network.session import Session, router_config
 from emulator.network.wire import (
     Beside,
@@ -38,6 +43,7 @@ from emulator.network.wire import (
     delivery,
     hold,
     is_hold,
+    is_once_more,
     packed_flags,
     packed_header,
     read_acknowledgement,
@@ -51,8 +57,8 @@ _FAREWELL_SECONDS = 10.0
 class Downlink:
     """One receiver's link, decided a batch of slots ahead, and its outlet. Final."""
 
-    def __init__(self, name: str, spec: Mapping[str, Any], brief: Brief, put: Callable[[bytes, float], None]) -> None:
-        self._course = Course.of(spec)
+    def __init__(self, name: str, course: Course, brief: Brief, put: Callable[[bytes, float], None]) -> None:
+        self._course = course
         keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, self._course)}
         self._link = Link(self._course, name, keys, brief.batch)
         self._accountant = Accountant(self._course.window, brief.trials)
@@ -104,15 +110,18 @@ class Downlink:
         self._masks[row] = packed_flags(self._in_time[row]).tobytes()
         self._received[row] = int(np.count_nonzero(self._in_time[row]))
 
-    def deliver(self, k: int, z: Floats, whole: bytes, beside: Beside) -> None:
-        """Send slot k's delivery: of the packets z (n, R), or as bytes the whole of them, those that arrive in it."""
+    def deliver(self, k: int, z: Floats, whole: bytes, beside: Beside, known: bool = False) -> None:
+        """Send slot k's delivery: of the packets z (n, R), or as bytes the whole of them, those that arrive in it.
+
+        known: the receiver has it, and only what arrives later is of interest.
+        """
         row = k - self._slots.start
         if beside.sent is not None:
             self._silence(row, beside.sent)
         late: tuple[Late, ...] = ()
         if self._fates.delays is not None or self._fates.again is not None or self._transit.busy:
             late = self._transit.arrival(k, self._fates, row, z, beside.header).late
-        if not self.present(k):
+        if known or not self.present(k):
             return
         received = self._received[row]
         payload = (
@@ -152,20 +161,33 @@ class WayBackLink:
         self._jammer: str | None = spec["jammer"]
         self._trials = brief.trials
         self._key = session.keys.acknowledged
-        self._sent = session.inbox(self._key)
+        self._due = Due(self._key, brief.flow.longest_outage)
+        self.sent: SimpleQueue[bytes | None] = SimpleQueue()
+        """What the legitimate estimator acknowledges; None: the conductor has said something that may end the waiting."""
+        session.funnel(self._key, self.sent.put)
         self._put = session.outlet(session.keys.acknowledgements)
 
-    def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink]) -> None:
+    def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink], commands: Commands) -> None:
         """Wait for the acknowledgements of slot k, and pass on what reaches the sensor; sent (R,): as in `Beside`.
 
-        A receiver that is not there acknowledges nothing.
+        A receiver that is not there acknowledges nothing. Raises what `Commands.check` does.
         """
         gamma = np.zeros(self._trials, np.bool_)
         if downlinks[LEGITIMATE].present(k):
-            message = Reader(self._key, self._sent.recv().payload.to_bytes())
-            gamma = read_acknowledgement(message, k, self._trials)
+            gamma = self._acknowledged(k, commands)
         gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
         self._put(acknowledgement(k, self._way.arrived(k, sent, gamma, gamma_e)))
+
+    def _acknowledged(self, k: int, commands: Commands) -> Flags:
+        while True:
+            payload = self.sent.get()
+            if payload is None:
+                commands.check()
+                continue
+            message = Reader(self._key, payload)
+            if (found := message.integer("k")) == k:
+                return read_acknowledgement(message, k, self._trials)
+            self._due.missed(k, found)
 
 
 def route(brief: Brief) -> None:
@@ -188,68 +210,129 @@ class Routing:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
         self._uplink = session.inbox(session.keys.uplink)
+        self._due = Due(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
         postman = Postman() if brief.part["pace"] else None
 
-        def outlet(name: str, course: Mapping[str, Any]) -> Callable[[bytes, float], None]:
+        def outlet(name: str, course: Course) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
-            delays = any(
-                "delay" in (one or {}) for one in (course["settings"], *(c["settings"] for c in course["changes"]))
-            )
+            delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
             return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
 
-        self._downlinks = {
-            name: Downlink(name, spec, brief, outlet(name, spec)) for name, spec in brief.part["links"].items()
-        }
+        self._courses = {name: Course.of(spec) for name, spec in brief.part["links"].items()}
+        self._outlets = {name: outlet(name, course) for name, course in self._courses.items()}
         acknowledgements = brief.part["acknowledgements"]
         self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
+        # To its own uplink, so that whoever waits there wakes: only the conductor ends a router.
+        knock = session.outlet(session.keys.uplink)
+        waiting = [] if self._way_back is None else [self._way_back.sent]
+        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting)
+        self._stale = False
+        """Whether what comes is of no interest until it is said to come once more."""
+        self._begin(0, 0)
 
     def carry_on(self) -> None:
-        """Route all slots, then wait for the conductor's end."""
-        self._session.ready()
-        for first in range(0, self._brief.slots, self._brief.flow.batch):
-            slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
-            for downlink in self._downlinks.values():
-                downlink.plan(slots)
-            self._route(slots)
-        self._session.wait_for("end")
+        """Route all slots, once more as often as it is asked for, until the conductor's end."""
+        # Nobody to wait for: who is alive has subscribed before it said so, and it said so to this very session.
+        self._session.appear()
+        while not self._commands.over():
+            try:
+                self._take(Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes()))
+            except Anew:
+                self._stale = True
 
-    def _route(self, slots: range) -> None:
-        """Deliver the packets of a batch of slots, and journal it in parts that end at the marks."""
-        journaled = slots.start
-        for k in slots:
-            message = self._next()
-            while is_hold(message):
-                message.slot(k)
-                self._journal(range(journaled, k))
-                journaled = k
+    def _begin(self, start: int, done: int) -> None:
+        """Be as a router is before slot `start` to which nothing has happened but what is known of all slots before.
+
+        done: all slots below have been delivered, acknowledged and journaled.
+        """
+        self._stale = False
+        self._k, self._done, self._journaled = start, done, start
+        self._downlinks = {
+            name: Downlink(name, course, self._brief, self._outlets[name]) for name, course in self._courses.items()
+        }
+        for first in range(0, start + 1, self._brief.flow.batch):
+            slots = self._plan(first)
+            before = range(first, min(slots.stop, start))
+            if before and before.stop > start - COUNTED_BURSTS:  # what bursts go on, and which packets are under way
+                for downlink in self._downlinks.values():
+                    downlink.account(before)
+
+    def _plan(self, first: int) -> range:
+        """Decide the batch that begins with a slot."""
+        self._slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
+        if self._slots:
+            for downlink in self._downlinks.values():
+                downlink.plan(self._slots)
+        return self._slots
+
+    def _take(self, message: Reader) -> None:
+        """Take what the sensor sends: a packet, a mark, or the word that packets come once more."""
+        if is_once_more(message):
+            self._once_more(message)
+            return
+        k = message.integer("k")
+        if self._stale or k == self._brief.slots:
+            return
+        if k != self._k:
+            self._due.missed(self._k, k)
+            return
+        if k == self._done:
+            self._journal(k)
+        if is_hold(message):
+            if k >= self._done:
+                self._journal(k)
                 self._hold(k)
-                message = self._next()
-            z = read_uplink(message, k, self._shape)
-            beside = read_beside(message, self._shape, self._brief.model.header)
-            whole = z.tobytes()
-            for downlink in self._downlinks.values():
-                downlink.deliver(k, z, whole, beside)
-            if self._way_back is not None:
-                self._way_back.carry(k, beside.sent, self._downlinks)
-        self._journal(range(journaled, slots.stop))
+            return
+        self._route(k, message)
+        if k + 1 == self._slots.stop:
+            self._journal(k + 1)
+            self._plan(k + 1)
 
-    def _next(self) -> Reader:
-        return Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes())
+    def _route(self, k: int, message: Reader) -> None:
+        """Deliver the packet of slot k, unless it is known that this is done."""
+        z = read_uplink(message, k, self._shape)
+        beside = read_beside(message, self._shape, self._brief.model.header)
+        whole, known = z.tobytes(), k < self._done
+        for downlink in self._downlinks.values():
+            downlink.deliver(k, z, whole, beside, known)
+        if self._way_back is not None and not known:
+            self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
+        self._k = k + 1
 
-    def _journal(self, slots: range) -> None:
+    def _once_more(self, message: Reader) -> None:
+        """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
+        anew = self._commands.anew(message.integer("n"))
+        if anew is None:  # it has asked once more since
+            self._stale = True
+            return
+        for name, changes in anew.map("links").items():
+            listed = tuple(_change(Reader(anew.key, b"", one)) for one in changes)
+            self._courses[name] = replace(self._courses[name], changes=listed)
+        self._begin(message.integer("k"), message.integer("again"))
+
+    def _journal(self, end: int) -> None:
+        """Journal all slots below `end`; of those that are journaled already, only remember what goes on after them."""
+        slots = range(self._journaled, end)
+        self._journaled = end
         if slots:
             accounts = {name: downlink.account(slots) for name, downlink in self._downlinks.items()}
-            self._put_journal(Journal(slots.start, len(slots), accounts).pack())
+            if slots.start >= self._done:
+                self._put_journal(Journal(slots.start, len(slots), accounts).pack())
 
     def _hold(self, k: int) -> None:
         """Pass a mark on, and do what the conductor says until it lets us go on."""
         for downlink in self._downlinks.values():
             downlink.mark(k)
-        while (command := self._session.command()).text("do") != "go":
+        while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
             if command.text("do") == "change":
-                changes = [_change(one) for one in command.maps("changes")]
-                self._downlinks[command.text("link")].amend(k, changes)
+                self._amend(command.text("link"), k, tuple(_change(one) for one in command.maps("changes")))
+
+    def _amend(self, name: str, k: int, changes: tuple[Change, ...]) -> None:
+        """Change a link from slot k on."""
+        self._downlinks[name].amend(k, changes)
+        course = self._courses[name]
+        self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
 
 
 def _change(found: Reader) -> Change:

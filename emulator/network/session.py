@@ -1,7 +1,8 @@
 """One Zenoh session of one process: how it is opened, what it declares, when it is ready, how it ends.
 
-Nothing here relies on the transport not to lose: it blocks when full, and what it loses all the same is seen as a gap
-in the slot numbers that every message carries.
+Nothing here relies on the transport not to lose: it blocks when full, and what goes down with a connection is seen as a gap
+in the slot numbers that every message carries, and sent once more. Zenoh opens a lost connection again by itself, and
+declares anew all that was declared.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ import json
 import os
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from queue import SimpleQueue
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -24,11 +27,14 @@ from emulator.errors import BriefError, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
 from emulator.network.access import OBSERVER, Keys, reader_of
 from emulator.network.connecting import Door, connected, endpoint_of
+from emulator.network.resending import Kept
 from emulator.network.wire import Reader
 
 READY_SECONDS = 30.0
 _INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
 _POLL_SECONDS = 0.004
+_LEASE_SECONDS = 4.0  # a connection over which nothing comes for so long is lost
+_HEARD_SECONDS = 2.0  # for readers to be found again once a connection is back
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
 
 Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
@@ -37,7 +43,10 @@ Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 def _transport(identity: Identity | None, listens: bool = False) -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
-    link: dict[str, Any] = {"tx": {"queue": {"congestion_control": wait}}, "rx": {"buffer_size": 1 << 20}}
+    link: dict[str, Any] = {
+        "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
+        "rx": {"buffer_size": 1 << 20},
+    }
     if identity is not None:
         from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
 
@@ -163,8 +172,14 @@ class Session:
             self._session = _listening(brief, config)
         self._publishers: list[zenoh.Publisher] = []
         self._token: zenoh.LivelinessToken | None = None
-        self._control = self.inbox(self.keys.control(self._process))
-        self.funnel(self.keys.control(self._process), self._heed)
+        self._kept: list[Kept] = []
+        self._commands: SimpleQueue[bytes] = SimpleQueue()
+        self._rounds: SimpleQueue[Reader] = SimpleQueue()
+        self._control = self.keys.control(self._process)
+        self._lifeline = _Lifeline(brief) if brief.role not in ("router", "observer") else None
+        if self._lifeline is not None:
+            self._session.info.declare_transport_events_listener(self._lifeline.changed)
+        self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
         return self
@@ -172,6 +187,8 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._lifeline is not None:
+            self._lifeline.release()
         self._session.close()  # type: ignore[no-untyped-call]
 
     def inbox(self, key: str) -> Inbox:
@@ -190,6 +207,18 @@ class Session:
         self._publishers.append(publisher)
         return publisher.put
 
+    def kept(
+        self,
+        key: str,
+        span: int | None = None,
+        head: Callable[[int, int, int], bytes] | None = None,
+        back: int = 0,
+    ) -> Kept:
+        """A publisher for one exact key, of what is sent once more after a connection was lost; as in `Kept`."""
+        kept = Kept(self.outlet(key), span, head, back)
+        self._kept.append(kept)
+        return kept
+
     def reaches(self, key: str) -> bool:
         """Whether somebody reads a key that this process has a publisher for: who does has opened its session."""
         return any(str(publisher.key_expr) == key and _matched(publisher) for publisher in self._publishers)
@@ -204,6 +233,11 @@ class Session:
             self.keys.alive(process), lambda sample: changed(sample.kind == zenoh.SampleKind.PUT), history=True
         )
 
+    @property
+    def router_id(self) -> str | None:
+        """Which router there is a connection with; one that was started again is another one."""
+        return next((str(found) for found in self._session.info.routers_zid()), None)
+
     def ready(self) -> None:
         """Wait until every publisher has a reader, then show that this process is there.
 
@@ -211,29 +245,50 @@ class Session:
         observer is there it is left to that one to say who is missing.
         """
         deadline = time.monotonic() + self.patience
-        waiting = list(self._publishers)
-        while waiting:
-            waiting = [publisher for publisher in waiting if not _matched(publisher)]
-            unread = [str(publisher.key_expr) for publisher in waiting]
+        while unread := self._unread():
             missing = dict.fromkeys(reader_of(key) for key in unread)
             if OBSERVER not in missing and self._process != OBSERVER:
                 deadline = time.monotonic() + self.patience
-            if waiting and time.monotonic() > deadline:
+            if time.monotonic() > deadline:
                 raise RunError(
                     f"{self._process}: {', '.join(missing)} did not appear within {self.patience:.0f} s, and nobody reads "
                     f"{', '.join(unread)}; start them, or look at their logs"
                 )
-            if waiting:
-                time.sleep(_POLL_SECONDS)
+            time.sleep(_POLL_SECONDS)
+        self.appear()
+
+    def appear(self) -> None:
+        """Show that this process is there."""
+        if self._kept:
+            threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self._token = self._session.liveliness().declare_token(self.keys.alive(self._process))
 
-    def _heed(self, payload: bytes) -> None:
-        """End this process, whatever it is waiting for, when the conductor says that the run has failed."""
-        with suppress(MalformedMessage):  # whoever reads the commands says what is wrong with it
-            command = Reader(self.keys.control(self._process), payload)
-            if command.text("do") == "abandon":
+    def _unread(self) -> list[str]:
+        """The keys that have no reader."""
+        return [str(publisher.key_expr) for publisher in self._publishers if not _matched(publisher)]
+
+    def _send_again(self) -> None:
+        """On a thread of its own, since whoever works may be waiting for just what is to come of it."""
+        while True:
+            command = self._rounds.get()
+            deadline = time.monotonic() + _HEARD_SECONDS
+            while self._unread() and time.monotonic() < deadline:
+                time.sleep(_POLL_SECONDS)
+            for kept in self._kept:
+                kept.again(command.integer("n"), command.integer("k"))
+
+    def _told(self, payload: bytes) -> None:
+        """Sort what the conductor says; what is no message is for whoever reads commands, who says so."""
+        with suppress(MalformedMessage):
+            command = Reader(self._control, payload)
+            if command.text("do") == "abandon":  # whatever this process is waiting for
                 print(f"evedrop: the run has failed: {command.text('why')}", file=sys.stderr, flush=True)  # noqa: T201
                 os._exit(RunError.exit_status)
+            if self._kept and command.text("do") == "again":
+                command.integer("n"), command.integer("k")
+                self._rounds.put(command)
+                return
+        self._commands.put(payload)
 
     def wait_for(self, command: str) -> None:
         """Wait for one command of the conductor: `start` or `end`."""
@@ -242,9 +297,45 @@ class Session:
 
     def command(self) -> Reader:
         """The next command of the conductor; its field `do` says what."""
-        return Reader(str(self._control.key_expr), self._control.recv().payload.to_bytes())
+        return Reader(self._control, self._commands.get())
 
     def commanded(self) -> Reader | None:
         """The next command of the conductor if there is one."""
-        sample = self._control.try_recv()
-        return None if sample is None else Reader(str(self._control.key_expr), sample.payload.to_bytes())
+        return None if self._commands.empty() else self.command()
+
+
+class _Lifeline:
+    """Ends a process that has had no connection for too long: nobody can tell it that the run is over. Final."""
+
+    def __init__(self, brief: Brief) -> None:
+        self._brief = brief
+        self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
+        self._released = False
+
+    def changed(self, event: zenoh.TransportEvent) -> None:
+        """The connection was lost or is back."""
+        self._set(event.kind == zenoh.SampleKind.DELETE)
+
+    def release(self) -> None:
+        """The process closes its connection itself."""
+        self._released = True
+        self._set(lost=False)
+
+    def _set(self, lost: bool) -> None:
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = None
+            if lost and not self._released:
+                self._timer = threading.Timer(self._brief.flow.longest_outage, self._give_up)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def _give_up(self) -> None:
+        sys.stderr.write(
+            f"evedrop: {self._brief.process} has had no connection with the router at {self._brief.router} for "
+            f"{self._brief.flow.longest_outage:g} s; look whether the router runs and can be reached\n"
+        )
+        sys.stderr.flush()
+        os._exit(RunError.exit_status)

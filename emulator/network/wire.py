@@ -205,6 +205,19 @@ def is_hold(message: Reader) -> bool:
     return message.has("hold")
 
 
+def once_more(number: int, done: int, first: int) -> bytes:
+    """What goes before packets that are sent once more, in the conductor's round of that number: from slot `first` on.
+
+    done: every slot below this one is done.
+    """
+    return pack({"k": first, "again": done, "n": number})
+
+
+def is_once_more(message: Reader) -> bool:
+    """Whether a message of the uplink says that packets are sent once more."""
+    return message.has("again")
+
+
 def delivery(
     k: int, mask: bytes, z: bytes, late: tuple[Late, ...] = (), header: bytes = b"", truth: bytes = b""
 ) -> bytes:
@@ -294,7 +307,7 @@ def read_progress(key: str, payload: bytes) -> int:
 
 
 def control(command: str, **fields: Any) -> bytes:
-    """A command of the conductor: `start`, `end`, `hold`, `change` or `go`, and what goes with it."""
+    """A command of the conductor: `start`, `end`, `hold`, `change`, `go` or `again`, and what goes with it."""
     return pack({"do": command, **fields})
 
 

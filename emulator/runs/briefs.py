@@ -10,6 +10,7 @@ from typing import Any
 
 from emulator.brief import Brief, Flow, Identity, Model
 from emulator.errors import UsageError
+from emulator.model.account import COUNTED_BURSTS
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
@@ -89,7 +90,18 @@ def flow_of(scenario: Scenario) -> Flow:
     batch = max(1, window // 4)
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
-    return Flow(window, batch)
+    return Flow(window, batch, scenario.longest_outage)
+
+
+def history_of(scenario: Scenario) -> int:
+    """How many slots before those that are not done the router must hear of once more, if it was started anew.
+
+    A packet may be under way for its link's window; and bursts of losses, which a slot without a packet ends, are told
+    apart up to a length.
+    """
+    window = max(scenario.window(name) for name in scenario.receivers)
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return max(window, COUNTED_BURSTS) if scheme.may_be_silent else window
 
 
 @dataclass(frozen=True)
@@ -172,6 +184,7 @@ def briefs_of(
                 "pace": scenario.pace,
                 "receivers": list(scenario.receivers),
                 "holds": sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
+                "history": history_of(scenario),
                 "leaks": leaks,
                 "chart": None if chart is None else asdict(chart),
             },

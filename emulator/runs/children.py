@@ -23,6 +23,7 @@ from emulator.runs.environment import own_environment
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
+ROUTER_RESTARTS = 3  # of a router that a signal ended: the run goes on with the new one
 _BEGIN_SECONDS = 10.0  # for the observer to begin to write what there is
 _GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
 _FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
@@ -69,7 +70,10 @@ class Children:
         """How long the observer has given no sign of life."""
         self.started = False
         """Whether the conductor has started the run."""
+        self.over = False
+        """Whether all is done, and everybody told to leave."""
         self._finishing = False
+        self._restarts = 0
         self._briefs: dict[str, Brief] = {}
         self._killed: set[int] = set()
         """Processes that were ended because the scenario says so."""
@@ -92,8 +96,8 @@ class Children:
             if process.stdin is not None:
                 process.stdin.close()
 
-    def start(self, brief: Brief) -> None:
-        """Start the process of a brief. Its output goes to its log, an observer's news to us.
+    def start(self, brief: Brief, again: bool = False) -> None:
+        """Start the process of a brief, or start it again. Its output goes to its log, an observer's news to us.
 
         Raises RunError if the system does not let us.
         """
@@ -112,7 +116,7 @@ class Children:
             environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
         try:
             path = brief.write(self._private)
-            with (self._logs / f"{brief.process}.log").open("ab" if brief.first else "wb") as log:
+            with (self._logs / f"{brief.process}.log").open("ab" if again else "wb") as log:
                 process = subprocess.Popen(
                     [sys.executable, "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
@@ -138,6 +142,15 @@ class Children:
         if process.pid not in self._killed:
             self._news.put(Exit(name, status))
 
+    def restart_router(self, ended: Exit) -> bool:
+        """Start the router again if a signal ended it, a few times at most; whether it was started."""
+        if ended.process != ROUTER or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+            return False
+        self._restarts += 1
+        self._killed.add(self._processes[ROUTER].pid)
+        self.start(self._briefs[ROUTER], again=True)
+        return True
+
     def act(self, request: News) -> None:
         """Do to a process what the observer asks for, and tell it so.
 
@@ -152,7 +165,7 @@ class Children:
             if process.stdin is not None:
                 process.stdin.close()
         elif do == "restart":
-            self.start(replace(self._briefs[name], first=int(request["first"])))
+            self.start(replace(self._briefs[name], first=int(request["first"])), again=True)
         else:
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal({"pause": signal.SIGSTOP, "resume": signal.SIGCONT}[str(do)])
@@ -172,14 +185,15 @@ class Children:
         if isinstance(news, Exit):
             return news
         self.silent_seconds = 0.0
-        if news["event"] in {"started", "back"}:
+        if news["event"] in {"started", "back", "reconnected"}:
             self.started = True
             self._forget_briefs()
         if news["event"] == "act":
             self.act(news)
             return None
+        self.over = self.over or news["event"] == "over"
         self._finishing = self._finishing or news["event"] == "finishing"
-        return None if news["event"] in {"alive", "finishing", "back"} else news
+        return None if news["event"] in {"alive", "over", "finishing", "back"} else news
 
     def _forget_briefs(self) -> None:
         """Everybody has read its own: the keys need not lie on a disk any longer."""

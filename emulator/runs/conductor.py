@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, NoReturn
 
 from emulator.errors import Interrupted, RunError
 from emulator.network.access import OBSERVER, ROUTER, SENSOR
@@ -15,6 +15,7 @@ from emulator.network.wire import control, progress
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
 _FAREWELL_SECONDS = 3.0  # for everybody to hear that the run has failed
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
+_END_SECONDS = 0.5  # after which who is still there is told once more that the run is over
 
 
 class Stop:
@@ -45,6 +46,9 @@ class Conductor:
         self._beat = beat
         self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
         self._present = dict.fromkeys((ROUTER, SENSOR, *receivers), False)
+        self._router: str | None = None
+        self.lost: dict[str, float] = {}
+        """Process → when it vanished from the network, of those that have, on the clock of `time.monotonic`."""
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in receivers})
@@ -64,6 +68,11 @@ class Conductor:
     def missing(self) -> list[str]:
         """The processes that are not on the network."""
         return [name for name, there in self._present.items() if not there and name not in self.absent]
+
+    def router_changed(self) -> bool:
+        """Whether the router is another one than that which the run began with, or than when this was asked last."""
+        before, self._router = self._router, self._session.router_id
+        return before != self._router
 
     def there(self, name: str) -> bool:
         """Whether a process is on the network."""
@@ -87,6 +96,7 @@ class Conductor:
                 raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
             self._note(self._next())
         self._session.ready()
+        self._router = self._session.router_id
 
     def start(self) -> None:
         """Let the sensor begin."""
@@ -95,17 +105,19 @@ class Conductor:
     def news(self) -> tuple[str, bytes] | None:
         """The next message and who sent it, or None if there was none for a moment.
 
-        Raises RunError when a process is gone, Interrupted when the end was asked for.
+        Raises Interrupted when the end was asked for.
         """
         self._stop.check()
         news = self._next()
         if news is None or not isinstance(news[1], bytes):
             self._note(news)
-            if self.missing:
-                self._stop.check(_AFTERTHOUGHT_SECONDS)
-                raise RunError(f"{', '.join(self.missing)} left the network before the run ended; look at the logs")
             return None
         return news[0], news[1]
+
+    def despair(self, names: Collection[str], patience: float) -> NoReturn:
+        """Raise RunError since these have been missing for so many seconds, unless the end is asked for just now."""
+        self._stop.check(_AFTERTHOUGHT_SECONDS)
+        raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
     def command(self, name: str, do: str, **fields: Any) -> None:
         """Tell one process what to do."""
@@ -115,10 +127,25 @@ class Conductor:
         """Tell the sensor that all slots below `done` are scored."""
         self._progress(progress(done))
 
-    def end(self) -> None:
-        """Tell everybody that the run is over."""
-        for command in self._commands.values():
-            command(control("end"))
+    def end(self, patience: float) -> None:
+        """Tell everybody that the run is over, and again who was cut off meanwhile; the router when all others have left.
+
+        patience: how many seconds a router is waited for that is missing just now.
+        """
+        deadline = time.monotonic() + patience
+        said = 0.0
+        while time.monotonic() < deadline:
+            left = [
+                name for name in self._present if name != ROUTER and name not in self.absent and self._present[name]
+            ]
+            if not left and self._present[ROUTER]:
+                break
+            if time.monotonic() - said > _END_SECONDS:
+                said = time.monotonic()
+                for name in left:
+                    self.command(name, "end")
+            self._note(self._next())
+        self.command(ROUTER, "end")
 
     def abandon(self, why: str) -> None:
         """Tell everybody that the run has failed: each ends at once, and the router when the others had time to hear it."""
@@ -138,5 +165,11 @@ class Conductor:
             return None
 
     def _note(self, news: tuple[str, bytes | bool] | None) -> None:
-        if news is not None and isinstance(news[1], bool):
-            self._present[news[0]] = news[1]
+        if news is None or not isinstance(news[1], bool):
+            return
+        name, there = news[0], news[1]
+        self._present[name] = there
+        if there:
+            self.lost.pop(name, None)
+        else:
+            self.lost.setdefault(name, time.monotonic())

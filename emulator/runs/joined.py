@@ -128,6 +128,11 @@ class Joiner:
         """The first slot that the sensor has not reported."""
         return self._truth.end
 
+    @property
+    def journaled(self) -> int:
+        """The first slot that the router has not journaled."""
+        return self._journal.end
+
     def reported(self, name: str) -> int:
         """The first slot that a receiver has not reported."""
         return self._reports[name].end

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from emulator.control import remove_control
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.children import GRACE_SECONDS, Children, Exit, News
+from emulator.runs.children import Children, Exit, News
 from emulator.runs.folder import new_folder
 from emulator.runs.ports import loopback_meeting
 from emulator.runs.signals import stop_on_signals
@@ -25,6 +26,7 @@ from emulator.runs.viewer import Viewer, choose
 from emulator.scenario import Scenario
 
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
+_EARLY_SECONDS = 1.0
 _SILENCE_SECONDS = 30.0  # the observer gives a sign of life every second
 
 
@@ -115,7 +117,10 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
 
 def _supervise(children: Children, stop: threading.Event, tell: Callable[[News], None]) -> int:
     """Follow the run to its end; the exit status that the observer gives it."""
+    early: tuple[Exit, float] | None = None
     while True:
+        if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
+            raise RunError(children.story(early[0], children.conclude(tell)))
         if stop.is_set():
             children.conclude(tell)
             raise Interrupted("interrupted; what was measured is in the results folder")
@@ -124,11 +129,13 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
         news = children.news(_LOOK_SECONDS)
         ending: News | None = None
         if isinstance(news, Exit):
-            # Who leaves with 0 before the end is missed by the observer, and after the end by nobody.
-            if news.process != OBSERVER and news.status == 0:
+            if news.process != OBSERVER and (news.status == 0 or children.restart_router(news)):
+                # Who leaves at the end may be faster than the word that it is the end.
+                early = early or ((news, time.monotonic()) if news.status == 0 else None)
                 continue
             if news.process != OBSERVER:
-                ending = children.conclude(tell, GRACE_SECONDS / 2 if children.started else 0.0)
+                # An observer that has just ended may still say so; one that goes on would wait for who will not come back.
+                ending = children.conclude(tell)
             if ending is None or not _ended_well(ending):
                 raise RunError(children.story(news, ending))
         elif news is not None:

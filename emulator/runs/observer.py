@@ -1,8 +1,8 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
 Its news go to standard output, a JSON object a line: `{"event": "started"}`, then four times a second `{"event":
-"progress", …}`, every second `{"event": "alive"}`, and then `{"event": "finishing"}` and `{"event": "ended", "status": …}`.
-Whatever ends the run, the results folder is whole.
+"progress", …}`, every second `{"event": "alive"}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
+and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunErro
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
 from emulator.network.access import LEGITIMATE, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
+from emulator.network.resending import Due
 from emulator.network.session import Question, Session
 from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
 from emulator.runs.conductor import Conductor, Stop
@@ -35,6 +36,7 @@ from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
+from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.stand_in import StandIn
@@ -137,6 +139,9 @@ class Observation:
         self._writer: ResultsWriter
         self._started = self._ended = self._told = self._beaten = time.monotonic()
         self._suspects: list[str] = []
+        self._recovery: Recovery
+        self._outages: list[Mapping[str, Any]] = []
+        self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
 
     def show(self, stand: Stand) -> Viewer:
@@ -160,6 +165,9 @@ class Observation:
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._live
                 )
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
+            patience = self._brief.flow.longest_outage
+            self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
+            self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -172,6 +180,7 @@ class Observation:
                     if news is not None:
                         self._take(conductor, *news)
                     self._steer(conductor)
+                    self._recovery.look(self._joiner.done)
             except EvedropError as error:
                 if isinstance(error, RunError):
                     self._suspects = conductor.missing
@@ -180,9 +189,12 @@ class Observation:
                 raise
             finally:
                 self._dismiss(conductor)
+                self._recovery.give_up(self._joiner.done)
+                self._outages = self._recovery.account()
                 self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
-            conductor.end()
+            tell("over")
+            conductor.end(patience)
 
     def _wait(self, stop: Stop) -> None:
         """What is done while there is no router yet."""
@@ -252,6 +264,8 @@ class Observation:
 
     def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
         message = Reader(conductor.keys[source], payload)
+        if not self._news(source, message):
+            return
         if source == ROUTER:
             for name, account in self._joiner.journal(message).items():
                 self._keeper.tallies[name].count(account)
@@ -277,6 +291,18 @@ class Observation:
             self._recording.add(shown(slots, scored))
         conductor.report(self._joiner.done)
         self._progress(scored)
+
+    def _news(self, source: str, message: Reader) -> bool:
+        """Whether a message is the one that is due, and no other one that came because some were lost."""
+        found = message.integer("k")
+        if source not in (ROUTER, SENSOR) and is_leaving(message):  # comes before the reports of the slots before it
+            return not self._steering.has_left(source, found)
+        joiner = self._joiner
+        due = {ROUTER: joiner.journaled, SENSOR: joiner.sent}.get(source)
+        due = joiner.reported(source) if due is None else due
+        if found != due:
+            self._due[source].missed(due, found)
+        return found == due
 
     def _leave(self, name: str, message: Reader) -> None:
         """Report for a receiver from now on, until it is back."""
@@ -320,6 +346,7 @@ class Observation:
             digests,
             ending,
             events=self._events,
+            outages=self._outages,
             detection=self._keeper.detection,
         )
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):

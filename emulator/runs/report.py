@@ -81,8 +81,16 @@ class ProgressLine:
                 rate=f"{news['rate']:,.0f} {news['rate_unit']}",
                 errors="  ".join(f"{name} {error:.2g}" for name, error in news.get("squared_errors", {}).items()),
             )
+        elif kind == "reconnected" and not self._quiet:
+            self.console.print(outage_line(news), soft_wrap=True)
         elif kind == "ended" and news.get("view"):
             self.console.print(f"the view stopped early: {news['view']}")
+
+
+def outage_line(outage: News) -> str:
+    """An outage of the summary as a sentence."""
+    went = "the run did not go on" if outage["until"] is None else f"the run went on after {outage['seconds']:.1f} s"
+    return f"{outage['process']} cut off at slot {outage['slot']}; {went}"
 
 
 def closing_table(summary: News, width: int) -> Table:

@@ -101,6 +101,7 @@ def summary_of(
     mode: str = "live",
     events: Sequence[Mapping[str, Any]] = (),
     detection: Detection | None = None,
+    outages: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
     expected = expectations_of(scenario)
@@ -133,6 +134,7 @@ def summary_of(
         "peers": peers,
         "links": links,
         "events": list(events),
+        "outages": list(outages),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
         "surprising": _surprising(scenario, tallies),

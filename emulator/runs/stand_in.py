@@ -28,7 +28,7 @@ class StandIn:
         fresh = prior(process, scenario.trials, away.start)
         self._absence = Absence(process, left if away.keeps_state else fresh)
         cuts, late = scenario.cuts(receiver), scenario.window(receiver) > 0
-        self._reporter = BeliefReporter(brief, put, lambda _: None, cuts, away.start, late)
+        self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts, away.start, late)
         self.next = away.start
         """The first slot that is not reported."""
         self._stop = min(away.stop, scenario.slots)

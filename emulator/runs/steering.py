@@ -52,20 +52,28 @@ class Steering:
         self._orders: deque[Order] = deque()
         self._asked = False
         self._step: Step | None = None
+        self._last = -1
+        self._changed: set[str] = set()
         self.paused = False
         """Whether the run stays held until the operator says otherwise."""
         self.events: list[dict[str, Any]] = []
         """What was done, from which slot on, and by whom."""
 
     def held(self, k: int) -> None:
-        """The sensor holds before slot k."""
-        self.at, self._asked = k, False
+        """The sensor holds before slot k. It may say so once more."""
+        if k <= self._last:
+            return
+        self.at, self._last, self._asked = k, k, False
         self._pending = list(self._due.pop(k, []))
         self._since = time.monotonic()
 
     def left(self, name: str, k: int) -> None:
         """A receiver has said its last word before slot k, with which its absence begins."""
         self._left[name] = k
+
+    def has_left(self, name: str, k: int) -> bool:
+        """Whether it has said so."""
+        return self._left.get(name) == k
 
     def done(self, number: int) -> None:
         """The launcher has done what it was asked for last."""
@@ -124,7 +132,8 @@ class Steering:
         act = self._waiting
         if act is None:
             return True
-        there = {"kill": False, "restart": True}.get(act.kind)
+        # Who is paused for long loses its connection, and must have it back.
+        there = {"kill": False, "restart": True, "resume": True}.get(act.kind)
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
             if act.kind in ("restart", "resume"):
                 self._conductor.absent -= set(act.names)
@@ -189,6 +198,7 @@ class Steering:
         self._note(k, act.said, "operator")
         self._keep(changed)
         for name in act.names:
+            self._changed.add(name)
             changes = [_plain(one) for one in changed.timeline.changes[name] if one.at >= k]
             self._conductor.command(ROUTER, "change", link=name, changes=changes)
         order.done(k, f"from slot {k} on: {act.said}")
@@ -216,8 +226,26 @@ class Steering:
     def _release(self) -> None:
         self.at = None
         until = {} if self._step is None else {"until": self._step.until}
-        self._conductor.command(ROUTER, "go")
-        self._conductor.command(SENSOR, "go", absent=sorted(self._conductor.absent), **until)
+        self._gone = {"k": self._last, "absent": sorted(self._conductor.absent), **until}
+        self._go()
+
+    def _go(self) -> None:
+        self._conductor.command(ROUTER, "go", k=self._last)
+        self._conductor.command(SENSOR, "go", **self._gone)
+
+    @property
+    def changes(self) -> dict[str, list[dict[str, Any]]]:
+        """Link → all its changes, of the links that an operator has changed."""
+        timeline = self._scenario.timeline.changes
+        return {name: [_plain(one) for one in timeline[name]] for name in sorted(self._changed)}
+
+    def remind(self) -> None:
+        """Say once more what was said last: it may have been lost with a connection. A hold may take as long as ever."""
+        self._since = time.monotonic()
+        if self.at is None and self._last >= 0:
+            self._go()
+        if self._asked:
+            self._conductor.command(SENSOR, "hold")
 
 
 def _plain(change: Change) -> dict[str, Any]:

@@ -313,6 +313,7 @@ class Scenario(Table):
     first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
     record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
     pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
+    longest_outage: Annotated[float, Field(ge=0.0, le=86400.0, strict=True, examples=[30.0])] = 30.0
     slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
     secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
     process: ProcessTable

@@ -99,7 +99,7 @@ class Bench:
         observation = Observation(folder / "results", False, None)
         made = briefs_of(scenario, f"{protocol}/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
         self.briefs: Mapping[str, Brief] = {
-            name: replace(brief, flow=Flow(window=32, batch=8)) for name, brief in made.items()
+            name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
         self.scenario = scenario
         self.keys = Keys(self.briefs["router"].run)
@@ -128,7 +128,7 @@ class Bench:
         self.tokens = Ear()
         for name in (*processes, "router"):
             self.sessions["observer"].liveliness().declare_subscriber(self.keys.alive(name), self.tokens, history=True)
-        # The router shows itself once it knows who reads its own keys; that it knows all other subscriptions is seen here.
+        # That the router knows all subscriptions is seen here: what was declared before on a connection, it knows before.
         assert self.tokens.hear() == (self.keys.alive("router"), b"")
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         for name in processes:

@@ -148,6 +148,13 @@ def decode_mark(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> di
     return {"k": message.slot(value["k"]), "hold": message.flag("hold")}
 
 
+def decode_once_more(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the router reads it."""
+    message = wire.Reader(KEY, raw)
+    assert wire.is_once_more(message)
+    return {name: message.integer(name) for name in value}
+
+
 def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
     message = wire.Reader(KEY, raw)
@@ -159,6 +166,11 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
     """As processes read it."""
     message = wire.Reader(KEY, raw)
     found: dict[str, Any] = {"do": message.text("do")}
+    for name in ("n", "k"):
+        if message.has(name):
+            found[name] = message.integer(name)
+    if message.has("links"):
+        found["links"] = dict(message.map("links"))
     if message.has("absent"):
         found["absent"] = list(message.names("absent"))
     if message.has("until"):
@@ -223,6 +235,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw)},
     ),
     "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
+    "once more": (lambda _shape, value: wire.once_more(value["n"], value["again"], value["k"]), decode_once_more),
     "mark": (lambda _shape, value: wire.hold(value["k"]), decode_mark),
     "held": (lambda _shape, value: wire.held(value["k"]), decode_held),
     "leaving": (encode_leaving, decode_leaving),

@@ -21,6 +21,7 @@ from emulator.errors import Gap, MalformedMessage
 from emulator.network import wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
+from emulator.network.resending import Kept
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
@@ -66,6 +67,7 @@ class Stage:
     inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
     funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
+    kept: dict[str, Kept] = field(default_factory=dict)
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
     """Of the conductor, as `wire.control` makes them."""
 
@@ -89,6 +91,22 @@ class Stage:
         return found
 
 
+class FakeInbox:
+    """The part of an inbox that peers use."""
+
+    def __init__(self, queue: SimpleQueue[bytes]) -> None:
+        self._queue = queue
+
+    def recv(self) -> Any:
+        """The next message."""
+        payload = self._queue.get(timeout=LIMIT)
+        return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+
+    def __iter__(self) -> Iterator[Any]:
+        while not self._queue.empty():
+            yield self.recv()
+
+
 class FakeSession:
     """The part of `Session` that peers use."""
 
@@ -106,11 +124,7 @@ class FakeSession:
         """An inbox whose `recv` never waits for longer than a test may."""
         queue = self._stage.inboxes.setdefault(key, SimpleQueue())
 
-        def recv() -> Any:
-            payload = queue.get(timeout=LIMIT)
-            return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
-
-        return SimpleNamespace(recv=recv)
+        return FakeInbox(queue)
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """As the real one, called by the test."""
@@ -119,6 +133,11 @@ class FakeSession:
     def outlet(self, key: str) -> Callable[[bytes], None]:
         """Puts into the stage."""
         return lambda payload: self._stage.put.put((key, payload))
+
+    def kept(self, key: str, *how: Any, **more: Any) -> Kept:
+        """The same, kept to be sent once more."""
+        self._stage.kept[key] = kept = Kept(self.outlet(key), *how, **more)
+        return kept
 
     def ready(self) -> None:
         """Nobody to wait for."""
@@ -209,8 +228,11 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
 
 GOOD = deliveries()
 BAD = {
-    "a slot is missing": ([GOOD[0], GOOD[2]], Gap, r"gap on evedrop/.*/downlink/\w+: slot 2 arrived where slot 1"),
-    "a slot comes twice": ([GOOD[0], GOOD[0]], Gap, "slot 0 arrived where slot 1 was due"),
+    "a slot stays missing": (
+        [GOOD[0], GOOD[2], GOOD[3]],
+        Gap,
+        r"gap on evedrop/.*/downlink/\w+: slot 3 arrived where slot 1",
+    ),
     "no msgpack": ([b"\xc1"], MalformedMessage, r"malformed message on evedrop/.*/downlink/\w+: not msgpack"),
     "z too short": ([GOOD[0][:-8]], MalformedMessage, "not msgpack"),
     "mask too long": ([wire.delivery(0, b"\1\0", b"")], MalformedMessage, "gamma of 2 bytes; expected 1 bytes"),
@@ -225,13 +247,74 @@ BAD = {
 @pytest.mark.parametrize("what", BAD)
 @pytest.mark.parametrize("name", ["legitimate", "suspicious"])
 def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
-    """A gap, a doubled slot or a malformed delivery ends a receiver with an error that names the key and what was due."""
+    """A gap that is not closed, or a malformed delivery, ends a receiver with an error that names the key and what was due."""
     messages, error, text = BAD[what]
-    brief = briefs()[name]
+    brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
     stage.fill(Keys(brief.run).downlink(name), messages)
     with pytest.raises(error, match=text) as caught:
         RECEIVERS[name](brief)
     assert caught.value.exit_status == 3
+
+
+@pytest.mark.parametrize("name", ["legitimate", "smart"])
+def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
+    """Slots that come once more, marks too, and slots that come before the one that is due change nothing of its reports."""
+    brief = replace(briefs()[name], run="r")
+    found = []
+    good = deliveries()
+    for messages in (good, [*good[:20], *good[23:30], wire.hold(25), *good[5:40], wire.hold(7), good[0], *good[30:]]):
+        stage.fill(Keys("r").downlink(name), messages)
+        stage.commands.put(wire.control("end"))
+        RECEIVERS[name](brief)
+        found.append(stage.all(Keys("r").telemetry(name)))
+    assert found[0] == found[1]
+
+
+def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
+    """A delivery that the legitimate estimator has had already may have come because its acknowledgement was lost."""
+    brief = replace(
+        briefs(
+            encoding={"scheme": "acknowledged"},
+            acknowledgements={"link": {"quality": 1.0}},
+            eavesdroppers={},
+            process={
+                "A": [[1.0, 0.0], [0.0, 1.0]],
+                "Q": [[1.0, 0.0], [0.0, 1.0]],
+                "initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+            },
+        )["legitimate"],
+        run="r",
+    )
+
+    def delivered(k: int) -> bytes:
+        gamma = np.arange(3) != k % 3
+        header = np.full((1, 2), -1).astype("<i8").tobytes()
+        return wire.delivery(k, wire.packed_flags(gamma).tobytes(), bytes(32), header=header)
+
+    slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
+    stage.fill(Keys("r").downlink("legitimate"), [delivered(k) for k in slots])
+    stage.commands.put(wire.control("end"))
+    estimate(brief)
+    expected = [wire.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
+    assert stage.all(Keys("r").acknowledged) == expected
+
+
+@pytest.mark.parametrize("name", ["legitimate", "smart"])
+def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
+    """What the observer may not have joined yet can be sent once more, and nothing that is older; the last progress too."""
+    brief = replace(briefs()[name], run="r")
+    stage.fill(Keys("r").downlink(name), deliveries())
+    stage.commands.put(wire.control("end"))
+    RECEIVERS[name](brief)
+    stage.all("")
+    stage.kept[Keys("r").telemetry(name)].again(1, 0)
+    ends = []
+    for payload in stage.all(Keys("r").telemetry(name)):
+        message = wire.Reader("", payload)
+        ends.append(message.integer("k") + message.integer("c"))
+    assert ends == [40, 44, 48, 50]
+    stage.kept[Keys("r").progress(name)].again(1, SLOTS)
+    assert stage.all(Keys("r").progress(name)) == [wire.progress(SLOTS)]
 
 
 class Sensing:
@@ -288,6 +371,28 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     assert stage.put.empty()
 
 
+def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
+    """All packets from the slot that is asked for on, and as many before it as the router needs, after a word of them."""
+    brief = briefs()["sensor"]
+    brief = replace(brief, part={**brief.part, "history": 3})
+    sensing = Sensing(stage, brief)
+    stage.commands.put(wire.control("start"))
+    sensing.packets(0, WINDOW)
+    for name in (*brief.part["receivers"], "observer"):
+        sensing.progress(name, 8)
+    sensing.packets(WINDOW, WINDOW + 8)
+    stage.kept[sensing.keys.uplink].again(4, 10)
+    key, payload = sensing.next()
+    assert (key, payload) == (sensing.keys.uplink, wire.once_more(4, 10, 7))
+    for k in range(7, WINDOW + 8):
+        wire.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
+    stage.kept[sensing.keys.uplink].again(5, 8)
+    assert wire.Reader(*sensing.next()).integer("k") == 5
+    for k in range(5, WINDOW + 8):
+        wire.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
+    assert stage.put.empty()
+
+
 class WouldWaitError(Exception):
     """The sensor would have to wait for news."""
 
@@ -310,7 +415,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
     monkeypatch.setattr(peers.sensor, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
-    window = Window(session, followers, 10)  # type: ignore[arg-type]
+    window = Window(session, followers, 10, Kept(print))  # type: ignore[arg-type]
 
     def reaches(limit: int) -> None:
         window.wait(limit - 1)
@@ -335,7 +440,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
 def test_sensor_refuses_malformed_progress(stage: Stage) -> None:
     """Progress that is not as documented is an error that names its key."""
     session = stage.session(briefs()["sensor"])
-    window = Window(session, ("a",), 1)  # type: ignore[arg-type]
+    window = Window(session, ("a",), 1, Kept(print))  # type: ignore[arg-type]
     stage.funnels[session.keys.progress("a")](msgpack.packb({"k": 1.5}))
     with pytest.raises(MalformedMessage, match=r"progress/a: k = 1.5"):
         window.wait(1)

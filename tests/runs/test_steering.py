@@ -93,14 +93,13 @@ class Run:
         return [(event["slot"], event["event"], event["by"]) for event in self.steering.events]
 
 
-GO = [("router", "go"), ("sensor", "go", {"absent": []})]
 SET = {"link": "legitimate", "set": {"quality": 0.2}}
 SETTINGS = {"loss": {"model": "bernoulli", "quality": 0.2}}
 
 
-def go(until: int) -> list[tuple[Any, ...]]:
-    """What is told when the run goes on for some slots."""
-    return [("router", "go"), ("sensor", "go", {"absent": [], "until": until})]
+def go(k: int, **until: int) -> list[tuple[Any, ...]]:
+    """What is told when the run goes on with slot k, perhaps for some slots."""
+    return [("router", "go", {"k": k}), ("sensor", "go", {"k": k, "absent": [], **until})]
 
 
 def test_a_change_is_made_between_two_slots() -> None:
@@ -109,7 +108,7 @@ def test_a_change_is_made_between_two_slots() -> None:
     asked = run.asks("link", event=SET)
     assert run.conductor.told() == [("sensor", "hold")]
     change = {"link": "legitimate", "changes": [{"at": 17, "settings": SETTINGS}]}
-    assert run.holds(17) == [("router", "change", change), *GO]
+    assert run.holds(17) == [("router", "change", change), *go(17)]
     assert asked.answers == [Answer(17, "from slot 17 on: link legitimate: quality = 0.2")]
     assert run.events == [(17, "link legitimate: quality = 0.2", "operator")]
     assert [one.model_dump(exclude_none=True)["event"] for one in run.kept] == [[{"at": 17, **SET}]]
@@ -155,7 +154,7 @@ def test_mistakes_change_nothing(event: dict[str, Any], mistakes: list[str]) -> 
     """All mistakes are answered at once, in the words for a scenario's events, and the run goes on as it was."""
     run = Run({"at": 40, "cut": "legitimate"})
     asked = run.asks("link", event=event)
-    assert run.holds(5) == GO
+    assert run.holds(5) == go(5)
     found = asked.answers[0].refused
     assert len(found) == len(mistakes)
     for line, wanted in zip(found, mistakes, strict=True):
@@ -187,7 +186,7 @@ def test_a_wish_to_hold_that_meets_one_of_the_scenario_is_done_there() -> None:
     """The hold that was asked for and the scenario's are one; the scenario's event comes first, and nothing is held twice."""
     run = Run({"at": 30, "cut": "smart"})
     asked = run.asks("link", event={"heal": "smart"})
-    assert [one[1] for one in run.holds(30)] == ["change", *[one[1] for one in GO]]
+    assert [one[1] for one in run.holds(30)] == ["change", "go", "go"]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["cut smart", "heal smart"]
 
@@ -206,7 +205,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     assert changed.answers[0].slot == 12
     resumed = run.asks("resume")
     run.steering.carry_on(12)
-    assert run.conductor.told() == GO
+    assert run.conductor.told() == go(12)
     assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
     assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
     assert ("held", {"before": 12}) in run.news
@@ -226,8 +225,8 @@ def test_a_step_lets_slots_pass_and_holds_again() -> None:
     run.holds(12)
     stepped = run.asks("step", slots=5)
     run.steering.carry_on(12)
-    assert run.conductor.told() == go(17)
-    assert run.holds(14) == go(17)
+    assert run.conductor.told() == go(12, until=17)
+    assert run.holds(14) == go(14, until=17)
     changed = run.asks("link", event=SET)
     assert [one[1] for one in run.holds(15)] == ["change", "go", "go"]
     assert changed.answers[0].slot == 15
@@ -242,7 +241,7 @@ def test_a_step_of_a_run_that_goes_on_holds_it_first() -> None:
     run = Run()
     stepped = run.asks("step", slots=1)
     assert run.conductor.told() == [("sensor", "hold")]
-    assert run.holds(20) == go(21)
+    assert run.holds(20) == go(20, until=21)
     assert run.holds(21) == []
     assert stepped.answers == [Answer(21, "slot 20 passed; held before slot 21")]
 
@@ -253,7 +252,7 @@ def test_a_step_within_a_step_is_refused() -> None:
     first = run.asks("step", slots=10)
     run.holds(20)
     second = run.asks("step", slots=3)
-    assert run.holds(22) == go(30)
+    assert run.holds(22) == go(22, until=30)
     assert second.answers[0].refused == ("another step goes on, to slot 29; wait for its end, or pause before",)
     assert run.holds(30) == []
     assert first.answers[0].slot == 30
@@ -269,7 +268,7 @@ def test_a_pause_ends_a_step() -> None:
     assert stepped.answers == [Answer(22, "slots 20 to 21 passed; the run was paused before the step was over")]
     run.asks("resume")
     run.steering.carry_on(22)
-    assert run.holds(30) == GO
+    assert run.holds(30) == go(30)
 
 
 def test_a_resume_ends_a_step() -> None:
@@ -279,7 +278,7 @@ def test_a_resume_ends_a_step() -> None:
     run.holds(20)
     assert run.asks("resume", reported=24).answers[0].slot == 24
     assert stepped.answers == [Answer(24, "slots 20 to 23 passed; the run was resumed before the step was over")]
-    assert run.holds(30) == GO
+    assert run.holds(30) == go(30)
 
 
 def test_a_step_beyond_the_end_ends_with_the_run() -> None:
@@ -319,4 +318,46 @@ def test_a_pause_before_the_last_slot_holds() -> None:
     assert run.holds(SLOTS - 1) == []
     run.asks("resume")
     run.steering.carry_on(SLOTS - 1)
-    assert run.conductor.told() == GO
+    assert run.conductor.told() == go(SLOTS - 1)
+
+
+def test_what_was_said_is_said_once_more() -> None:
+    """After a lost connection: that the sensor is to hold, or that all are to go on; nothing while the run is held."""
+    run = Run()
+    run.steering.remind()
+    assert run.conductor.told() == []
+    run.asks("step", slots=9)
+    run.conductor.told()
+    run.steering.remind()
+    assert run.conductor.told() == [("sensor", "hold")]
+    run.steering.held(20)
+    run.steering.remind()
+    assert run.conductor.told() == []
+    run.steering.carry_on(20)
+    run.conductor.told()
+    run.steering.remind()
+    assert run.conductor.told() == go(20, until=29)
+
+
+def test_a_hold_that_is_told_once_more_is_one_hold() -> None:
+    """The sensor may say twice that it holds; when the run has gone on since, that is no news."""
+    run = Run()
+    run.asks("pause")
+    run.holds(12)
+    run.steering.held(12)
+    run.asks("resume")
+    run.steering.carry_on(12)
+    assert run.conductor.told() == go(12)
+    run.steering.held(12)
+    assert run.steering.at is None
+
+
+def test_a_router_that_is_started_anew_is_told_all_changes() -> None:
+    """Of the links that an operator has changed all that changes is listed, from the first slot on; of the others nothing."""
+    run = Run({"at": 5, "link": "legitimate", "set": {"quality": 0.5}}, {"at": 60, "cut": "smart"})
+    assert run.steering.changes == {}
+    run.holds(5)
+    run.asks("link", event=SET)
+    run.holds(17)
+    first = {"at": 5, "settings": {"loss": {"model": "bernoulli", "quality": 0.5}}}
+    assert run.steering.changes == {"legitimate": [first, {"at": 17, "settings": SETTINGS}]}
