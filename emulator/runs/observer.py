@@ -20,13 +20,11 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
-from emulator.network.access import LEGITIMATE, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Question, Session
@@ -39,6 +37,7 @@ from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
+from emulator.runs.shown import open_recording, shown
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
 from emulator.runs.viewer import Stand, Viewer
@@ -372,51 +371,3 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
         writer.slot_rows(slots.first, name, one.sums, one.expected)
     writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
     writer.journal_rows(slots)
-
-
-def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -> Recording:
-    """The run's recording, on disk and, with the address of a viewer, live."""
-    from emulator.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
-    from emulator.view.scene import Scene, Shown  # noqa: PLC0415 - the same
-
-    quality = scenario.quality
-    strategies = {name: table.strategy for name, table in scenario.eavesdroppers.items()}
-    receivers = [
-        Shown(
-            name,
-            "legitimate" if name == LEGITIMATE else "eavesdropper",
-            strategies.get(name, scenario.encoding.scheme),
-            quality[name],
-        )
-        for name in scenario.receivers
-    ]
-    scene = Scene(
-        title=scenario.title,
-        run=run,
-        slots=scenario.slots,
-        trials=scenario.trials,
-        n=len(scenario.process.A),
-        pace=scenario.pace,
-        receivers=tuple(receivers),
-        noise=float(np.trace(scenario.process.process.Q)),
-    )
-    return Recording(path, scene, live)
-
-
-def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
-    """Some slots as the view takes them: the first recorded trial, and means over all."""
-    from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
-    from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
-
-    peers = {
-        name: PeerSlots(
-            x_hat=receiver.x_hat[:, :, 0],
-            P=receiver.P[:, :, :, 0],
-            action=receiver.action[:, 0],
-            squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
-            trace=receiver.trace[:, 0] / slots.trials,
-            expected_trace=scored[name].expected,
-        )
-        for name, receiver in slots.receivers.items()
-    }
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0], nu=slots.nu[:, 0], peers=peers)
