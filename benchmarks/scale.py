@@ -182,8 +182,8 @@ def exponent(points: list[tuple[float, float]]) -> float:
 
 def named(power: float) -> str:
     """Growth in a word."""
-    bounds = ((0.1, "constant"), (0.9, "slower than linear"), (1.1, "linear"), (np.inf, "faster than linear"))
-    return next(word for bound, word in bounds if abs(power) < bound)
+    words = ("falling", "constant", "slower than linear", "linear", "faster than linear")
+    return words[int(np.searchsorted((-0.1, 0.1, 0.9, 1.1), power))]
 
 
 def laws(found: list[Measured]) -> None:
@@ -206,7 +206,7 @@ def laws(found: list[Measured]) -> None:
     if len(alone) > 4:
         terms = np.array([[1.0, one.receivers, one.trials, one.trials * one.receivers] for one in alone])
         for what, values, unit in (
-            ("a slot takes", [1e6 / one.slots_per_second for one in alone], "µs"),
+            ("a slot costs", [1e6 * one.cores / one.slots_per_second for one in alone], "µs of processor"),
             ("memory is", [one.megabytes for one in alone], "MB"),
         ):
             weights = 1.0 / np.array(values)  # relative errors

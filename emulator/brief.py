@@ -26,14 +26,15 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller", "zid"),
+    "relay": ("users", "receivers", "listen", "zid", "controller"),
     "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart", "plant", "controller"),
     "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
     "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
-    "observer": ("scenario", "results", "recording", "live", "operator", "shard"),
+    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity", "shard"),
 }
-ROLES = ("router", "sensor", "legitimate", "eavesdropper", "controller", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Flow:
     """The sensor stays at most this far ahead of the slowest receiver and of the observer."""
     batch: int
     """Telemetry, journal and progress are sent at least this often."""
-    patience: float = 30.0
+    longest_outage: float = 30.0
     """Seconds for which a process may be cut off before that ends the run."""
 
 
@@ -66,6 +67,17 @@ class Model:
     def process(self) -> Process:
         """The process of the model."""
         return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who a process is where that must be shown, and who else to believe; each in PEM."""
+
+    authority: str
+    """The certificate of the run's authority, which made everybody's."""
+    certificate: str
+    key: str
+    """The private key of the certificate."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +106,10 @@ class Brief:
     """The first slot that this process sees: of one that is started again, where it goes on."""
     ends_with_stdin: bool = False
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
+    patience: int = 30
+    """Seconds that it waits for the others to be there."""
+    identity: Identity | None = None
+    """Of a run whose router takes certificates."""
 
     @property
     def batch(self) -> Batch:
@@ -150,13 +166,20 @@ def _parsed(found: Any) -> Brief:
     for name, key in found["keys"].items():
         if not isinstance(key, str) or len(bytes.fromhex(key)) != KEY_BYTES:
             raise ValueError(f"the key of {name} is not {KEY_BYTES} bytes")
-    brief = Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"])})
+    identity = found.get("identity")
+    if identity is not None:
+        identity = Identity(**identity)
+        if not all(isinstance(value, str) for value in asdict(identity).values()):
+            raise TypeError("identity has an entry that is no str")
+    brief = Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"]), "identity": identity})
     _check_numbers(brief)
     return brief
 
 
 def _check_numbers(brief: Brief) -> None:
     """Raise ValueError or TypeError for numbers that no run has."""
+    if type(brief.patience) is not int or brief.patience < 1:
+        raise ValueError("patience must be a whole number of seconds, at least 1")
     if min(brief.slots, brief.trials, brief.recorded, brief.flow.window, brief.flow.batch) < 1 or brief.first_trial < 0:
         raise ValueError("slots, trials, recorded, flow.window and flow.batch must be at least 1")
     model = brief.model

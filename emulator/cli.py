@@ -148,8 +148,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
-    for role in ("router", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
-        add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), _role(role))
+    for role in ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
+        of_role = (_role(role), _observed) if role == "observer" else (_role(role),)
+        add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser
 
 
@@ -242,6 +243,10 @@ def _entries(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that does not derive from the seed")
 
 
+def _observed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
+
+
 def _output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
     parser.add_argument("--json", action="store_true", help="the summary alone on standard output")
@@ -249,7 +254,8 @@ def _output(parser: argparse.ArgumentParser) -> None:
 
 def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
-    parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint, such as tcp/127.0.0.1:17447")
+    parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint: tcp or tls, /127.0.0.1:PORT")
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's, of a scenario with two")
 
 
 def _finished_view(parser: argparse.ArgumentParser) -> None:
@@ -327,8 +333,30 @@ def _fits(parser: argparse.ArgumentParser) -> None:
 
 def _briefs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the briefs go")
-    parser.add_argument("--results", type=Path, default=Path("results"), metavar="DIR", help="the observer's folder")
-    parser.add_argument("--listen", default="tcp/127.0.0.1:17447", metavar="ENDPOINT", help="the router's endpoint")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="the observer's folder, on its host; relative to where it is started",
+    )
+    parser.add_argument(
+        "--listen",
+        default="tcp/127.0.0.1:17447",
+        metavar="ENDPOINT",
+        help="where the router listens, such as tls/router.lan:7447",
+    )
+    parser.add_argument("--connect", metavar="ENDPOINT", help="what the others connect to; default as --listen says")
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, of a scenario with two")
+    parser.add_argument(
+        "--relay-connect", metavar="ENDPOINT", help="what those at it connect to; default as --relay says"
+    )
+    parser.add_argument(
+        "--wait", type=int, default=600, metavar="SECONDS", help="how long everybody waits for the others; default 600"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen in clear although others than this machine can get at it"
+    )
 
 
 class _Version(argparse.Action):

@@ -13,12 +13,14 @@ import signal
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.errors import BriefError, Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
+    from emulator.brief import Brief
     from emulator.runs.montecarlo import Plan
     from emulator.runs.viewer import Viewer
     from emulator.scenario import Scenario
@@ -78,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     folder = options.out or default_folder(options.scenario)
     with ProgressLine(scenario.slots, "slots", options.json) as line:
         try:
-            ended = launch(scenario, folder, options.view, options.listen, line.tell)
+            ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
         except (RunError, Interrupted):
             with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
                 _print_results(folder, options.json)
@@ -398,8 +400,13 @@ def fit_link(options: argparse.Namespace) -> int:
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
+    from emulator.runs.ports import places_at
 
-    for path in write_briefs(_loaded(options), options.listen, options.results, options.out):
+    if not 1 <= options.wait <= 30 * 86_400:
+        raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
+    scenario = _loaded(options)
+    places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
+    for path in write_briefs(scenario, places, options.results, options.out, options.wait):
         print(path)
     return 0
 
@@ -407,16 +414,33 @@ def brief(options: argparse.Namespace) -> int:
 def process(options: argparse.Namespace) -> int:
     """Be one process of a run."""
     from emulator.brief import read_brief
-    from emulator.model.registry import NotRegistered
     from emulator.modules import look_in
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
+    if getattr(options, "out", None) is not None:
+        brief = replace(brief, part={**brief.part, "results": str(options.out)})
     if brief.part.get("modules") is not None:
         look_in(str(brief.part["modules"]))
-    match options.role:
+    try:
+        return _play(brief)
+    except BriefError as error:
+        raise BriefError(f"{options.brief}: {error}") from error
+
+
+def _play(brief: Brief) -> int:
+    """Be the process of a brief; the exit status."""
+    from emulator.model.registry import NotRegistered
+
+    if brief.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        check_identity(brief.identity, brief.process)
+    match brief.role:
         case "router":
             from emulator.network.router import route as play
+        case "relay":
+            from emulator.network.relay import relay as play
         case "sensor":
             from peers.sensor import sense as play
         case "legitimate":
@@ -430,9 +454,9 @@ def process(options: argparse.Namespace) -> int:
 
             return observe(brief)
         case _:
-            raise BriefError(f"no role {options.role}; give one of those that `evedrop --help` lists")
+            raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:
         play(brief)
     except NotRegistered as error:
-        raise BriefError(f"{options.brief} names {error.name}{error.why or ', which is no class here'}") from error
+        raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
     return 0

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from emulator.brief import Identity
 from emulator.errors import UsageError
 
 _NAME = "control.json"
@@ -25,6 +26,8 @@ class Control:
     """Zenoh endpoint."""
     user: str
     password: str
+    identity: Identity | None = None
+    """The operator's, of a run whose router takes certificates."""
 
     def write(self, folder: Path) -> None:
         """Write it into a results folder, readable by nobody else."""
@@ -58,15 +61,18 @@ def read_control(folder: Path) -> Control:
     path = folder / _NAME
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        control = Control(**found)
+        identity = found.get("identity")
+        control = Control(**{**found, "identity": None if identity is None else Identity(**identity)})
     except FileNotFoundError as error:
         over = (folder / "summary.json").is_file()
         why = "it is over" if over else f"it has no {_NAME} (yet)" if folder.is_dir() else "there is no such folder"
         raise no_run(folder, why) from error
     except OSError as error:
         raise no_run(folder, f"{path.name} cannot be read ({error.strerror})") from error
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise no_run(folder, f"{path.name} is not one ({error})") from error
-    if not all(isinstance(value, str) for value in asdict(control).values()):
+    entries = asdict(control)
+    texts = [*(entries.pop("identity") or {}).values(), *entries.values()]
+    if not all(isinstance(value, str) for value in texts):
         raise no_run(folder, f"{path.name} is not one (an entry is no string)")
     return control

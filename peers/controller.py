@@ -9,10 +9,11 @@ from emulator.model.controllers import CONTROLLERS
 from emulator.model.controllers.controller import Assignment
 from emulator.model.plant import Plant
 from emulator.network.access import CONTROLLER
+from emulator.network.loop_wire import decided, read_known
 from emulator.network.reporting import DecisionReporter
 from emulator.network.resending import Due
 from emulator.network.session import Session
-from emulator.network.wire import Reader, decided, read_known
+from emulator.network.wire import Reader
 from peers.loop import disturbances_in, kept_decisive
 
 
@@ -30,7 +31,7 @@ def steer(brief: Brief) -> None:
         # Slots are joined without its reports, so all that is kept is sent again.
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
-        due = Due(key, brief.flow.patience)
+        due = Due(key, brief.flow.longest_outage)
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):

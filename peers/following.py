@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from emulator.model.receiver import Belief, Receiver
 from emulator.model.transit import Arrival
 from emulator.network.reporting import BeliefReporter
 from emulator.network.resending import Due
-from emulator.network.session import Session
+from emulator.network.session import Inbox, Session
 from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_acknowledgement, read_delivery
 from peers.loop import Consultation
 
@@ -43,7 +44,7 @@ def follow(
         put_progress = session.kept(session.keys.progress(name), 0)
         answers = Answers(brief, session, acknowledges, None if consult is None else consult(session))
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
-        due = Due(downlink, brief.flow.patience)
+        due = Due(downlink, brief.flow.longest_outage)
         session.ready()
         k = brief.first
         while k < brief.slots:
@@ -77,6 +78,7 @@ def follow(
             answers.after(k, belief)
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
+        answers.over(deliveries, downlink)
         session.wait_for("end")
 
 
@@ -91,7 +93,7 @@ class Answers:
     def had(self, k: int, delivery: Reader) -> None:
         """A delivery of slot k has come once more: the first acknowledgement may have been lost."""
         if self._acknowledge is not None:
-            self._acknowledge(acknowledgement(k, read_acknowledgement(delivery, k, self._trials)))
+            self._acknowledge(_acknowledged(delivery, k, self._trials))
 
     def before(self, k: int, arrival: Arrival) -> None:
         """Slot k's delivery is here."""
@@ -104,6 +106,22 @@ class Answers:
         """Slot k's delivery has been dealt with."""
         if self._consultation is not None:
             self._consultation.after(k, belief)
+
+    def over(self, deliveries: Inbox, key: str) -> None:
+        """All slots are done: acknowledge whatever still comes, on a thread of its own that ends with the session."""
+        if self._acknowledge is not None:
+            threading.Thread(target=self._go_on, args=(deliveries, key), name="acknowledges", daemon=True).start()
+
+    def _go_on(self, deliveries: Inbox, key: str) -> None:
+        for delivery in deliveries:
+            message = Reader(key, delivery.payload.to_bytes())
+            if not is_hold(message):
+                self.had(message.integer("k"), message)
+
+
+def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
+    """The acknowledgement of a delivery, whose γ is where a delivery has its own."""
+    return acknowledgement(k, read_acknowledgement(delivery, k, trials))
 
 
 def _save(brief: Brief, belief: Belief) -> None:

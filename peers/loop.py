@@ -14,9 +14,10 @@ from emulator.model.local_filter import LocalFilter
 from emulator.model.plant import Drive, Plant
 from emulator.model.process import Floats, Trajectory
 from emulator.model.receiver import Belief, Flags, Receiver
+from emulator.network.loop_wire import known, read_decided
 from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
-from emulator.network.wire import Reader, known, read_decided
+from emulator.network.wire import Reader
 
 
 def disturbances_in(text: str, slots: int) -> Floats:
@@ -63,7 +64,7 @@ class Actuator:
         self._put = None
         if loop is not None:
             self._period = loop["period"]
-            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.patience)
+            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.longest_outage)
             self._put = (
                 kept_decisive(session, session.keys.state, brief, self._period) if loop["acts_on"] == "truth" else None
             )
@@ -110,7 +111,7 @@ class Consultation:
         self._told: tuple[Informed, Decided] | None = None
         if isinstance(receiver, Informed):
             shape = (len(loop["plant"]["input_lower"]), brief.trials)
-            self._told = receiver, Decided(session, self._period, shape, brief.flow.patience)
+            self._told = receiver, Decided(session, self._period, shape, brief.flow.longest_outage)
 
     def before(self, k: int) -> None:
         """Learn the inputs that led into slot k."""

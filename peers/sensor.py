@@ -98,7 +98,7 @@ class Acknowledgements:
         self._encoder, self._trials = encoder, brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
-        self._due = Due(self._key, brief.flow.patience)
+        self._due = Due(self._key, brief.flow.longest_outage)
         chart = brief.part["chart"]
         self._watch = Watch(Chart(**chart), brief.trials) if chart is not None else None
 

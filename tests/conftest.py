@@ -222,8 +222,11 @@ class Evedrop:
 
     def process(self, *arguments: str, **options: Any) -> Done:
         """The same in a process of its own; options are those of Popen."""
-        process = self._start(["-m", "emulator"], arguments, options)
-        return Live(process, self.temporary, self.folder).end()
+        return self.begun(*arguments, **options).end()
+
+    def begun(self, *arguments: str, **options: Any) -> Live:
+        """The same, without waiting for its end."""
+        return Live(self._start(["-m", "emulator"], arguments, options), self.temporary, self.folder)
 
     def started(self, *arguments: str, out: str = "run", largest_file: int = 0, **options: Any) -> Live:
         """Start a command in a process of its own, to be followed and disturbed."""

@@ -89,9 +89,8 @@ def ask(control: Control, request: Request, patience: float) -> Answer | None:
     """
     zenoh.init_log_from_env_or("off")
     key = Keys(control.run).control(OBSERVER)
-    config = client_config(control)
-    config["connect"]["timeout_ms"] = 0  # a run that goes on has a router: one attempt will do
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+    # A run that goes on has a router: one attempt will do.
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
         for reply in session.get(key, payload=request.pack(), timeout=patience):
             if reply.ok is not None:
                 return read_answer(key, reply.ok.payload.to_bytes())

@@ -15,7 +15,8 @@ from emulator.brief import Brief
 from emulator.model.digest import BeliefLog, Digests, InputLog
 from emulator.model.process import Floats
 from emulator.model.receiver import Belief, Flags, trace_of
-from emulator.network.wire import Decisions, Report, Truth, progress
+from emulator.network.loop_wire import Decisions
+from emulator.network.wire import Report, Truth, progress
 
 
 def is_due(brief: Brief, k: int) -> bool:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from queue import SimpleQueue
 from types import TracebackType
@@ -21,38 +22,45 @@ from typing import Any, Protocol, Self
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from emulator.brief import Brief
+from emulator.brief import Brief, Identity
 from emulator.errors import BriefError, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
-from emulator.network.access import Keys
+from emulator.network.access import OBSERVER, Keys, reader_of
+from emulator.network.connecting import Door, connected, endpoint_of
 from emulator.network.resending import Kept
 from emulator.network.wire import Reader
 
-CONNECT_SECONDS = 20.0
 READY_SECONDS = 30.0
 _INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
 _POLL_SECONDS = 0.004
 _LEASE_SECONDS = 4.0  # a connection over which nothing comes for so long is lost
 _HEARD_SECONDS = 2.0  # for readers to be found again once a connection is back
+_LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
 
 Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 
 
-def _transport() -> dict[str, Any]:
+def _transport(identity: Identity | None, listens: bool = False) -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
-    # Shared memory would put what the router sends to one receiver into the memory of all.
-    return {
-        "link": {
-            "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
-            "rx": {"buffer_size": 1 << 20},
-        },
-        "shared_memory": {"enabled": False},
+    link: dict[str, Any] = {
+        "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
+        "rx": {"buffer_size": 1 << 20},
     }
+    if identity is not None:
+        from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
+
+        link |= {"protocols": ["tls"], "tls": tls_section(identity, listens)}
+    # Shared memory would put what the router sends to one receiver into the memory of all.
+    return {"link": link, "shared_memory": {"enabled": False}}
 
 
 class Credentials(Protocol):
     """Where the router is, and who asks to be let in: a brief, or the operator's control file."""
+
+    @property
+    def run(self) -> str:
+        """Name of the run."""
 
     @property
     def router(self) -> str:
@@ -66,6 +74,10 @@ class Credentials(Protocol):
     def password(self) -> str:
         """The user's."""
 
+    @property
+    def identity(self) -> Identity | None:
+        """Its certificate, if the router takes any."""
+
 
 def client_config(entry: Credentials) -> dict[str, Any]:
     """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
@@ -74,24 +86,53 @@ def client_config(entry: Credentials) -> dict[str, Any]:
         "mode": "client",
         "connect": {
             "endpoints": [entry.router],
-            "timeout_ms": int(CONNECT_SECONDS * 1000),
+            "timeout_ms": 0,
             "exit_on_failure": True,
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(), "auth": auth},
+        "transport": {**_transport(entry.identity), "auth": auth},
     }
 
 
-def router_config(endpoint: str, users_file: str, access: dict[str, Any]) -> dict[str, Any]:
-    """Configuration of the router: it listens, asks for user and password, and denies what is not granted."""
+def door_of(entry: Credentials) -> Door:
+    """The way in for a brief, or for the operator."""
+    return Door(entry.router, entry.run, client_config(entry), entry.identity)
+
+
+def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
+    """Configuration of a router: it listens, asks for user and password, and denies what is not granted."""
     return {
         "mode": "router",
-        "listen": {"endpoints": [endpoint], "exit_on_failure": True},
+        **({"id": brief.part["zid"]} if brief.role == "router" and brief.part["zid"] is not None else {}),
+        "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(), "auth": {"usrpwd": {"dictionary_file": users_file}}},
+        "transport": {**_transport(brief.identity, listens=True), "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
     }
+
+
+def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -> zenoh.Session:
+    """A router's session. Raises BriefError if it cannot listen where its brief says."""
+    endpoint = endpoint_of(listen, identity)
+    try:
+        endpoint.try_to_listen()
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except socket.gaierror as error:
+        raise BriefError(
+            f"the host of {listen} is not known here ({error.strerror}); write it into /etc/hosts, or write the "
+            f"briefs again with --listen {endpoint.protocol}/0.0.0.0:{endpoint.port} and --connect"
+        ) from error
+    except OSError as error:
+        other = f"--listen {endpoint.protocol}/HOST:PORT"
+        raise BriefError(
+            f"the router cannot listen at {listen} ({error.strerror}); end the program that does, or write the briefs "
+            f"again with another {other}, of the host that the router is started on"
+        ) from error
+    except zenoh.ZError as error:
+        raise BriefError(
+            f"the router cannot listen at {listen} ({error}); write the briefs again with another --listen"
+        ) from error
 
 
 class Question:
@@ -108,31 +149,42 @@ class Question:
         self._query.drop()  # type: ignore[no-untyped-call]
 
 
+def _matched(publisher: zenoh.Publisher) -> bool:
+    return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+
+
 class Session:
     """A process's session. Final; use it as a context manager, or its threads outlive the program."""
 
-    def __init__(self, brief: Brief, config: dict[str, Any] | None = None) -> None:
-        zenoh.init_log_from_env_or("error")
+    def __init__(
+        self,
+        brief: Brief,
+        config: dict[str, Any] | None = None,
+        listen: str | None = None,
+        meanwhile: Callable[[], None] = lambda: None,
+    ) -> None:
+        """config, listen: of a router, and where it listens; meanwhile: called while there is no router to connect to yet."""
+        zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
         self.keys = Keys(brief.run)
         self._process = brief.process
-        try:
-            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config or client_config(brief))))
-        except zenoh.ZError as error:
-            raise BriefError(
-                f"no session with the router at {brief.router}: {error}. Check that it runs, that the brief is of this "
-                "run, and that nothing else listens there"
-            ) from error
+        self.patience = float(brief.patience)
+        """Seconds that are waited for the others."""
+        if config is None or listen is None:
+            self._session = connected(door_of(brief), self.patience, meanwhile)
+        else:
+            self._session = _listening(listen, brief.identity, config)
         self._publishers: list[zenoh.Publisher] = []
         self._token: zenoh.LivelinessToken | None = None
         self._kept: list[Kept] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
-        self._lifeline = _Lifeline(brief) if brief.role not in ("router", "observer") else None
+        self._lifeline = _Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         if self._lifeline is not None:
             self._session.info.declare_transport_events_listener(self._lifeline.changed)
+        self._by_hand = not brief.ends_with_stdin
         self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
@@ -173,6 +225,10 @@ class Session:
         self._kept.append(kept)
         return kept
 
+    def reaches(self, key: str) -> bool:
+        """Whether somebody reads a key that this process has a publisher for: who does has opened its session."""
+        return any(str(publisher.key_expr) == key and _matched(publisher) for publisher in self._publishers)
+
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Be asked at one exact key; `receive` is called on a thread of Zenoh's and must only hand the question on."""
         self._session.declare_queryable(key, lambda query: receive(Question(key, query)))
@@ -188,16 +244,44 @@ class Session:
         """Which router there is a connection with; one that was started again is another one."""
         return next((str(found) for found in self._session.info.routers_zid()), None)
 
+    def attendance(self, processes: Iterable[str]) -> dict[str, bool]:
+        """Process → whether it is there, kept up to date by a thread of Zenoh's."""
+        present = dict.fromkeys(processes, False)
+        for name in present:
+            self.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+        return present
+
+    def linked(self) -> bool:
+        """Whether there is a link with another router."""
+        return bool(self._session.info.routers_zid())
+
+    def wait_for_link(self) -> None:
+        """Wait until there is one. Raises RunError after the brief's patience."""
+        deadline = time.monotonic() + self.patience
+        while not self.linked():
+            if time.monotonic() > deadline:
+                raise RunError(
+                    f"{self._process}: no link with the router within {self.patience:.0f} s; look at its log"
+                )
+            time.sleep(_POLL_SECONDS)
+
     def ready(self) -> None:
         """Wait until every publisher has a reader, then show that this process is there.
 
-        Raises RunError after 30 s, naming the keys that nobody reads.
+        Raises RunError after the brief's patience, naming who is missing and the keys that they do not read; but while the
+        observer is there it is left to that one to say who is missing.
         """
-        unread = self._unread(READY_SECONDS)
-        if unread:
-            raise RunError(
-                f"{self._process}: after {READY_SECONDS:.0f} s nobody reads {', '.join(unread)}; look at the other logs"
-            )
+        deadline = time.monotonic() + self.patience
+        while unread := self._unread():
+            missing = dict.fromkeys(reader_of(key) for key in unread)
+            if OBSERVER not in missing and self._process != OBSERVER:
+                deadline = time.monotonic() + self.patience
+            if time.monotonic() > deadline:
+                raise RunError(
+                    f"{self._process}: {', '.join(missing)} did not appear within {self.patience:.0f} s, and nobody reads "
+                    f"{', '.join(unread)}; start them, or look at their logs"
+                )
+            time.sleep(_POLL_SECONDS)
         self.appear()
 
     def appear(self) -> None:
@@ -206,21 +290,17 @@ class Session:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self._token = self._session.liveliness().declare_token(self.keys.alive(self._process))
 
-    def _unread(self, seconds: float) -> list[str]:
-        """The keys that still have no reader after so many seconds, at most."""
-        deadline = time.monotonic() + seconds
-        waiting = list(self._publishers)
-        while True:
-            waiting = [publisher for publisher in waiting if not publisher.matching_status.matching]  # type: ignore[attr-defined]  # the stub says bool
-            if not waiting or time.monotonic() > deadline:
-                return [str(publisher.key_expr) for publisher in waiting]
-            time.sleep(_POLL_SECONDS)
+    def _unread(self) -> list[str]:
+        """The keys that have no reader."""
+        return [str(publisher.key_expr) for publisher in self._publishers if not _matched(publisher)]
 
     def _send_again(self) -> None:
         """On a thread of its own, since whoever works may be waiting for just what is to come of it."""
         while True:
             command = self._rounds.get()
-            self._unread(_HEARD_SECONDS)
+            deadline = time.monotonic() + _HEARD_SECONDS
+            while self._unread() and time.monotonic() < deadline:
+                time.sleep(_POLL_SECONDS)
             for kept in self._kept:
                 kept.again(command.integer("n"), command.integer("k"))
 
@@ -228,6 +308,11 @@ class Session:
         """Sort what the conductor says; what is no message is for whoever reads commands, who says so."""
         with suppress(MalformedMessage):
             command = Reader(self._control, payload)
+            if self._by_hand and command.text("do") == "abandon":
+                # Whatever this process waits for will not come, and nobody has launched it who would end it.
+                sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
+                sys.stderr.flush()
+                os._exit(RunError.exit_status)
             if self._kept and command.text("do") == "again":
                 command.integer("n"), command.integer("k")
                 self._rounds.put(command)
@@ -272,14 +357,14 @@ class _Lifeline:
                 self._timer.cancel()
             self._timer = None
             if lost and not self._released:
-                self._timer = threading.Timer(self._brief.flow.patience, self._give_up)
+                self._timer = threading.Timer(self._brief.flow.longest_outage, self._give_up)
                 self._timer.daemon = True
                 self._timer.start()
 
     def _give_up(self) -> None:
         sys.stderr.write(
             f"evedrop: {self._brief.process} has had no connection with the router at {self._brief.router} for "
-            f"{self._brief.flow.patience:g} s; look whether the router runs and can be reached\n"
+            f"{self._brief.flow.longest_outage:g} s; look whether the router runs and can be reached\n"
         )
         sys.stderr.flush()
         os._exit(RunError.exit_status)

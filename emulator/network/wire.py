@@ -195,32 +195,7 @@ def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
     return flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
 
 
-def known(name: str, k: int, x: Floats) -> bytes:
-    """What the controller acts on in slot k, (n, R): `x_hat`, an estimate, or `x`, the true state, as `name` says."""
-    return pack({"k": k, name: x.tobytes()})
-
-
-def read_known(message: Reader, name: str, k: int, shape: tuple[int, int]) -> Floats:
-    """The same, which must be of slot k."""
-    message.slot(k)
-    return message.finite(name, shape)
-
-
-def decided(k: int, u: Floats, failed: Flags) -> bytes:
-    """The inputs (m, R) from slot k on, and where they are those before, because the decision failed, (R,)."""
-    fields = {"k": k, "u": u.tobytes()}
-    if failed.any():
-        fields["failed"] = packed_flags(failed).tobytes()
-    return pack(fields)
-
-
-def read_decided(message: Reader, k: int, shape: tuple[int, int]) -> tuple[Floats, Flags]:
-    """The inputs (m, R) that must be from slot k on, and where their decision failed."""
-    message.slot(k)
-    return message.finite("u", shape), _failed(message, (shape[1],))
-
-
-def _failed(message: Reader, shape: tuple[int, ...]) -> Flags:
+def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
     """Where decisions failed, (…, R): nowhere, unless it is said."""
     if not message.has("failed"):
         return np.zeros(shape, np.bool_)
@@ -400,36 +375,13 @@ def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int 
         flags["sent"],
         flags["alarms"],
         message.finite("u", (c, inputs, trials)) if inputs else None,
-        _failed(message, (c, trials)) if inputs else None,
+        read_failed(message, (c, trials)) if inputs else None,
         message.finite("true", (c, n, trials)) if measures else None,
     )
 
 
-@dataclass(frozen=True)
-class Decisions:
-    """The controller's telemetry over c slots."""
-
-    first: int
-    count: int
-    seconds: Floats
-    """What each decision took."""
-    digests: Mapping[int, Digests]
-    """As in `Report`."""
-
-    def pack(self) -> bytes:
-        """As a message."""
-        digests = {block: digests.tobytes() for block, digests in self.digests.items()}
-        return pack({"k": self.first, "c": self.count, "seconds": self.seconds.tobytes(), "digests": digests})
-
-
-def read_decisions(message: Reader, first: int, trials: int, period: int) -> Decisions:
-    """The controller's telemetry that must begin at slot `first`, with a decision every period slots."""
-    k, c = message.slot(first), message.integer("c", 1)
-    made = len(range(-(-k // period) * period, k + c, period))
-    return Decisions(k, c, message.finite("seconds", (made,)), _read_digests(message, trials))
-
-
-def _read_digests(message: Reader, trials: int) -> dict[int, Digests]:
+def read_digests(message: Reader, trials: int) -> dict[int, Digests]:
+    """Block, by its first slot → digests, (R, 32)."""
     digests: dict[int, Digests] = {}
     for block, value in message.map("digests").items():
         if type(block) is not int or not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
@@ -494,7 +446,7 @@ def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: i
         message.finite("P", (c, n, n, recorded)),
         message.finite("trace", (c, 2)),
         message.array("late", "<u2", (c, trials)) if message.has("late") else None,
-        _read_digests(message, trials),
+        read_digests(message, trials),
         message.array("late_used", "<u2", (c, trials)) if message.has("late_used") else None,
     )
 

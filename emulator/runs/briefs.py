@@ -15,16 +15,18 @@ from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
 from emulator.modules import named_in
-from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 from emulator.runs.acknowledging import chart_of, way_back_of
-from emulator.runs.folder import new_folder
 from emulator.runs.loop_briefs import LoopBriefs
+from emulator.runs.ports import Places, places_at
+from emulator.runs.routers import Routers, identities_of
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
 
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 1024
 _REPORT_SECONDS = 0.04
+_LAUNCHED_PATIENCE = 30  # seconds
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def flow_of(scenario: Scenario) -> Flow:
     batch = max(1, window // 4)
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
-    return Flow(window, batch, scenario.patience)
+    return Flow(window, batch, scenario.longest_outage)
 
 
 def history_of(scenario: Scenario) -> int:
@@ -122,18 +124,31 @@ class Observation:
 
 
 def briefs_of(
-    scenario: Scenario, endpoint: str, observation: Observation, ends_with_stdin: bool = True
+    scenario: Scenario,
+    places: Places | str,
+    observation: Observation,
+    ends_with_stdin: bool = True,
+    patience: int = _LAUNCHED_PATIENCE,
 ) -> dict[str, Brief]:
-    """Process name → brief, with passwords and a run name made afresh."""
+    """Process name → brief, with run name, passwords and, where the router takes them, certificates made afresh.
+
+    places: a text is an endpoint of one router, that is both listened on and connected to. Raises UsageError if they are
+    not as many as the scenario's routers.
+    """
     run = f"r{secrets.token_hex(4)}"
+    if isinstance(places, str):
+        places = places_at(places)
+    places.check(scenario.relayed)
     keys = StreamKeys.of(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
     users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)}
+    routers = Routers.of(users, places)
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d
     model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
+    identities = identities_of(run, places, tuple(users))
     loop = LoopBriefs(scenario)
 
     def imports(process: str, part: Mapping[str, Any]) -> bool:
@@ -146,9 +161,9 @@ def briefs_of(
             run=run,
             process=process,
             role=role,
-            router=endpoint,
+            router=str(places.router.listen if role == "router" else routers.endpoint(process)),
             user=process,
-            password=users.get(process, ""),
+            password=routers.password(process),
             slots=scenario.slots,
             trials=scenario.trials,
             first_trial=scenario.first_trial,
@@ -158,6 +173,8 @@ def briefs_of(
             keys={name: key.hex() for name, key in owned.items()},
             part={**part, "modules": scenario.modules} if imports(process, part) else part,
             ends_with_stdin=ends_with_stdin,
+            patience=patience,
+            identity=identities.get(process),
         )
 
     courses = {name: scenario.course(name) for name in scenario.receivers}
@@ -173,10 +190,11 @@ def briefs_of(
             {
                 "links": links,
                 "pace": scenario.pace,
-                "users": users,
+                "users": routers.at_router,
                 "leaks": leaks,
                 "acknowledgements": None if back is None else back._asdict(),
                 "controller": loop.wiring,
+                "zid": routers.zid,
             },
         ),
         brief(
@@ -207,16 +225,20 @@ def briefs_of(
             {},
             {
                 "scenario": scenario.model_dump(mode="json"),
-                "results": str(observation.results.absolute()),
+                "results": str(observation.results),
                 "recording": observation.recording,
                 "live": observation.live,
                 "operator": users[OPERATOR],
                 "shard": observation.shard,
+                "operator_identity": asdict(identities[OPERATOR]) if identities else None,
             },
         ),
     ]
     if loop.of_controller is not None:
         made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
+    if places.relay is not None:
+        part = routers.relay_part(scenario.receivers, places.relay)
+        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring}))
     for name, table in scenario.eavesdroppers.items():
         part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
         made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
@@ -229,22 +251,24 @@ def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
     return {"window": scenario.window(receiver), "outages": outages}
 
 
-def write_briefs(scenario: Scenario, endpoint: str, results: Path, folder: Path) -> list[Path]:
-    """Write the briefs into a folder, for processes that are started by hand; the observer's results go to `results`.
+def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path, patience: int) -> list[Path]:
+    """Write the briefs into a folder, for processes that are started by hand, on whichever hosts.
 
-    Raises UsageError if either folder has something in it or cannot be written, and for a scenario in shards.
+    results: the observer's folder, on its host; relative to where it is started. patience: seconds that everybody waits for
+    the others. Raises UsageError if the folder has something in it or cannot be written, and for a scenario in
+    shards.
     """
     if scenario.shards > 1:
         raise UsageError(
             f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
             "itself, with its own --first-trial and --trials"
         )
-    new_folder(results)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty; give another --out, or empty it")
-        made = briefs_of(scenario, endpoint, Observation(results, True, None), ends_with_stdin=False)
+        observation = Observation(results, True, None)
+        made = briefs_of(scenario, places, observation, ends_with_stdin=False, patience=patience)
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

@@ -59,7 +59,9 @@ def gather(
     wall = 0.0 if started is None else time.monotonic() - started
     score = Score.merged([Score.left(shard.folder, shard.scenario) for shard in shards])
     ending = Ending(wall, how, replay_of(folder, scenario))
-    summary = summary_of(scenario, score.tallies, digests, ending, events=_events(shards), detection=score.detection)
+    summary = summary_of(
+        scenario, score.tallies, digests, ending, events=_happened(shards, "events"), detection=score.detection
+    )
     write_summary(folder, summary)
     _tidy(folder, shards)
     return summary
@@ -91,12 +93,12 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     return {int(start): digests[starts == start] for start in np.unique(starts)}
 
 
-def _events(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
-    """All that happened in any shard, once, in order of slots."""
+def _happened(shards: Sequence[Shard], what: str) -> list[Mapping[str, Any]]:
+    """All that happened in any shard, by an entry of its summary: each once, in order of slots."""
     found: list[Mapping[str, Any]] = []
     for results in _results(shards):
-        found += [event for event in results.summary["events"] if event not in found]
-    return sorted(found, key=lambda event: int(event["slot"]))
+        found += [one for one in results.summary[what] if one not in found]
+    return sorted(found, key=lambda one: int(one["slot"]))
 
 
 def _results(shards: Sequence[Shard]) -> Iterator[Results]:

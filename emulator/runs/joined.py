@@ -16,12 +16,12 @@ from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
 from emulator.network.access import CONTROLLER
+from emulator.network.loop_wire import read_decisions
 from emulator.network.wire import (
     Journal,
     Reader,
     Report,
     Truth,
-    read_decisions,
     read_journal,
     read_report,
     read_truth,

@@ -34,12 +34,14 @@ class Acted:
     """Receiver → x̂, (c, n, R)."""
     action: Codes
     """The legitimate estimator's, (c, R)."""
+    true: Floats
+    """The true states, (c, n, R): x, but of a sensor that filters."""
 
     def part(self, trials: slice) -> Acted:
         """Of some trials."""
         inputs = InputSlots(self.inputs.u[..., trials], self.inputs.failed[:, trials])
         estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
-        return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials])
+        return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials], self.true[..., trials])
 
 
 @dataclass
@@ -102,7 +104,7 @@ class LoopTally:
         """Take the next slots."""
         inputs = acted.inputs
         if self.household is not None:
-            self.household.add(acted.x, inputs.u, acted.estimates)
+            self.household.add(acted.true, inputs.u, acted.estimates)
         self.slots += inputs.failed.size
         self.failed += int(np.count_nonzero(inputs.failed))
         self.clipped += int(np.count_nonzero(self._plant.clips(inputs.u)))

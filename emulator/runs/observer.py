@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from emulator.brief import Brief
+from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
@@ -32,6 +32,7 @@ from emulator.network.resending import Due
 from emulator.network.session import Question, Session
 from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
 from emulator.runs.conductor import Conductor, Stop
+from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
 from emulator.runs.loop_tally import SolveTimes
@@ -54,19 +55,26 @@ _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 
 def observe(brief: Brief) -> int:
-    """Run the observer of a brief; the exit status of the run."""
+    """Run the observer of a brief; the exit status of the run.
+
+    Raises UsageError, BriefError, RunError or Interrupted, of one started by hand, as long as nothing has begun.
+    """
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     by_hand = not brief.ends_with_stdin
-    if brief.ends_with_stdin:
+    if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
-    observation = Observation(brief, scenario, confirmations)
+    observation = Observation(brief, scenario, confirmations, by_hand)
+    if by_hand:
+        # Before there is anything in it: what a brief that does not fit leaves behind would be in the next one's way.
+        new_folder(observation.folder)
+        with Session(brief, meanwhile=stop.check):
+            pass
     status, how = 0, "complete"
     try:
-        observation.folder.mkdir(parents=True, exist_ok=True)  # on another host than that of the briefs it is not there
         write_resolved(observation.folder, scenario)
         with observation.writer():
             try:
@@ -107,9 +115,13 @@ def tell(event: str, **news: Any) -> None:
 class Observation:
     """One run as the observer sees it. Final."""
 
-    def __init__(self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes]) -> None:
+    def __init__(
+        self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
+    ) -> None:
+        """by_hand: whether nobody has launched the others who would end them."""
         self.folder = Path(brief.part["results"])
         self._brief = brief
+        self._by_hand = by_hand
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
@@ -140,15 +152,15 @@ class Observation:
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
-        with Session(self._brief) as session:
-            conductor = Conductor(session, self._scenario.digested, stop, self._beat)
+        with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
+            conductor = Conductor(session, self._scenario.digested, stop, self._beat, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
                 )
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
-            patience = self._brief.flow.patience
+            patience = self._brief.flow.longest_outage
             self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             try:
@@ -164,8 +176,10 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
-            except RunError:
-                self._suspects = conductor.missing
+            except (RunError, Interrupted) as error:
+                self._suspects = conductor.missing if isinstance(error, RunError) else []
+                if self._by_hand:  # a launcher ends them itself
+                    conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
             finally:
                 self._dismiss(conductor)
@@ -176,9 +190,16 @@ class Observation:
             tell("over")
             conductor.end(patience)
 
+    def _wait(self, stop: Stop) -> None:
+        """What is done while there is no router yet."""
+        stop.check()
+        self._beat()
+
     @property
     def _control(self) -> Control:
-        return Control(self._brief.run, self._brief.router, OPERATOR, self._brief.part["operator"])
+        part = self._brief.part
+        identity = None if part["operator_identity"] is None else Identity(**part["operator_identity"])
+        return Control(self._brief.run, self._brief.router, OPERATOR, part["operator"], identity)
 
     def _keep(self, scenario: Scenario) -> None:
         """The run is of another scenario from now on, of which all slots so far are too."""

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from emulator.brief import Flow
-from emulator.network.access import OBSERVER, ROUTER
+from emulator.network.access import OBSERVER, RELAY, ROUTER
 from emulator.runs.conductor import Conductor
 from emulator.runs.steering import Steering
 
@@ -84,7 +84,7 @@ class Recovery:
         usual = 3.0 * max(self._batch_seconds, self._longest)
         if self._done < self._target:
             return max(_SOON_SECONDS, usual)
-        return max(min(_IDLE_SECONDS, max(1.0, self._flow.patience / 3.0)), usual)
+        return max(min(_IDLE_SECONDS, max(1.0, self._flow.longest_outage / 3.0)), usual)
 
     def _go_on(self, done: int, now: float) -> None:
         if not self._missing and not self._wait:
@@ -104,19 +104,25 @@ class Recovery:
         for name in self._conductor.missing:
             self._missing.setdefault(name, (done, self._conductor.lost.get(name, now)))
         gone = [
-            name for name in self._conductor.missing if now - self._conductor.lost.get(name, now) > self._flow.patience
+            name
+            for name in self._conductor.missing
+            if now - self._conductor.lost.get(name, now) > self._flow.longest_outage
         ]
         if gone:
             # Without the router nobody else can be seen either.
-            gone = [ROUTER] if ROUTER in gone else gone
+            gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
             self.give_up(done)
-            self._conductor.despair(gone, self._flow.patience)
+            self._conductor.despair(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
         found = self._missing
-        if ROUTER in found:
-            # All vanish with the router, and with our own connection to it.
-            found = {ROUTER if self._conductor.router_changed() else OBSERVER: found[ROUTER]}
+        # All vanish with the router that we are connected to, and with our own connection to it. Behind a relay, the sensor
+        # vanishes with the router, and both with the link between them.
+        own = RELAY if self._conductor.relayed else ROUTER
+        if own in found:
+            found = {own if self._conductor.router_changed() else OBSERVER: found[own]}
+        elif ROUTER in found:
+            found = {ROUTER: found[ROUTER]}
         for name, beginning in found.items():
             self._back.setdefault(name, beginning)
         self._missing = {}
@@ -143,8 +149,7 @@ class Recovery:
         now = time.monotonic()
         self._close(done, now)
         found = self._missing
-        if ROUTER in found:
-            found = {ROUTER: found[ROUTER]}
+        found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
         self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
 

@@ -81,8 +81,16 @@ class ProgressLine:
                 rate=f"{news['rate']:,.0f} {news['rate_unit']}",
                 errors="  ".join(f"{name} {error:.2g}" for name, error in news.get("squared_errors", {}).items()),
             )
+        elif kind == "reconnected" and not self._quiet:
+            self.console.print(outage_line(news), soft_wrap=True)
         elif kind == "ended" and news.get("view"):
             self.console.print(f"the view stopped early: {news['view']}")
+
+
+def outage_line(outage: News) -> str:
+    """An outage of the summary as a sentence."""
+    went = "the run did not go on" if outage["until"] is None else f"the run went on after {outage['seconds']:.1f} s"
+    return f"{outage['process']} cut off at slot {outage['slot']}; {went}"
 
 
 def closing_table(summary: News, width: int) -> Table:
@@ -137,9 +145,8 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"{name}: its error has infinite variance, so the mean over trials is no measure; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
-    if summary["household"] is not None:
-        for line in household_lines(summary["household"]):
-            console.print(line)
+    for line in household_lines(summary["household"]):
+        console.print(line)
     for expectation in summary["expectations"]:
         console.print(told(expectation))
         if "replay" in expectation:
@@ -166,8 +173,10 @@ def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def household_lines(house: Mapping[str, Any]) -> list[str]:
-    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it."""
+def household_lines(house: Mapping[str, Any] | None) -> list[str]:
+    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it; or nothing."""
+    if house is None:
+        return []
     seen = house["knowing_truth"]
     lines = [
         f"the house buys {_figure(house['bought_energy'], '.3f')} kWh and sells {_figure(house['sold_energy'], '.3f')} kWh; a "

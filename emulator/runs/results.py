@@ -27,6 +27,7 @@ from emulator.model.receiver import Action, Codes, Flags
 from emulator.network.access import CONTROLLER
 from emulator.network.wire import packed_flags
 from emulator.runs.histogram import LEVELS
+from emulator.runs.input_table import input_columns, inputs_schema, inputs_schema_in
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums
 from emulator.scenario import Scenario
@@ -102,19 +103,6 @@ DIGESTS = pa.schema(
         ("digest", pa.binary(DIGEST_BYTES)),
     ]
 )
-
-
-def _inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
-    return pa.schema(
-        [
-            ("slot", pa.int64()),
-            ("trial", pa.int64()),
-            ("u", pa.list_(pa.float64(), inputs)),
-            *([("d", pa.list_(pa.float64(), disturbances))] if disturbances else []),
-            ("failed", pa.bool_()),
-            ("clipped", pa.bool_()),
-        ]
-    )
 
 
 class _Table:
@@ -193,7 +181,7 @@ class ResultsWriter:
         self._loop = loop
         if loop is not None:
             plant, disturbances = loop
-            self._inputs = _Table(folder / "inputs.parquet", _inputs_schema(plant.inputs, disturbances.shape[1]), {})
+            self._inputs = _Table(folder / "inputs.parquet", inputs_schema(plant.inputs, disturbances.shape[1]), {})
             self._tables.append(self._inputs)
 
     @classmethod
@@ -293,19 +281,7 @@ class ResultsWriter:
         """A row per slot and recorded trial, the first of which is first_trial: what moved the plant."""
         if slots.inputs is None or self._loop is None:
             return
-        plant, disturbances = self._loop
-        recorded = next(iter(slots.receivers.values())).P.shape[3]
-        u, some = slots.inputs.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
-        self._inputs.add(
-            [
-                np.repeat(np.arange(some.start, some.stop), recorded),
-                np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
-                np.stack([plant.limited(one) for one in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
-                *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
-                slots.inputs.failed[:, :recorded].reshape(-1),
-                plant.clips(u).reshape(-1),
-            ]
-        )
+        self._inputs.add(input_columns(slots, *self._loop, first_trial))
 
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
@@ -408,14 +384,7 @@ class Results:
         """A row per slot and recorded trial of a closed loop; None without a controller."""
         if self.summary.get("controller") is None:
             return None
-        path = self.folder / "inputs.parquet"
-        try:
-            schema = pq.read_schema(path)
-            widths = [int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d")]
-        except (OSError, pa.ArrowException, AttributeError):
-            widths = [0, 0]
-        widths[0] = max(1, widths[0])  # whatever it is, reading it with this schema says what is wrong
-        return self._table("inputs", _inputs_schema(*widths))
+        return self._table("inputs", inputs_schema_in(self.folder / "inputs.parquet"))
 
     @property
     def digests(self) -> pa.Table:

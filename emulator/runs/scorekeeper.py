@@ -69,7 +69,8 @@ class Scorekeeper:
             self.filter.add(true_errors(slots.true, slots.x, x_hats))
         if slots.inputs is not None and self.loop is not None:
             estimates = {name: one.x_hat for name, one in slots.receivers.items()}
-            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action))
+            true = slots.x if slots.true is None else slots.true
+            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(

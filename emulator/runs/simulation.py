@@ -195,7 +195,7 @@ class Simulation:
             beside = None if not loop.filters else true_errors(true, x, {name: one.x_hat for name, one in rows.items()})
             inputs, user = loop.inputs, rows[LEGITIMATE]
             estimates = {name: one.x_hat for name, one in rows.items()}
-            acted = None if inputs is None else Acted(inputs, x, estimates, user.action)
+            acted = None if inputs is None else Acted(inputs, x, estimates, user.action, true)
             if not self._recorded:
                 return Chunk(chunk.start, measured, None, alarms, acted, beside)
             some = slice(0, self._recorded)

@@ -15,8 +15,9 @@ from emulator.model.controllers import CONTROLLERS
 from emulator.model.elementary import semidefinite_factor
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import numbers
-from emulator.scenario.tables import LegitimateTable, ProcessTable
+from emulator.scenario.tables import LegitimateTable
 from emulator.scenario.words import as_toml, listed
 
 

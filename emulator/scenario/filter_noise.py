@@ -15,8 +15,8 @@ from emulator.model.elementary import semidefinite_factor
 from emulator.model.local_filter import Step, settled
 from emulator.model.process import Floats, Process
 from emulator.scenario.plant import PlantTable, plant_of
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import numbers
-from emulator.scenario.tables import ProcessTable
 
 FILTER = "filter"
 _INVERTS_NOISE = ("bayesian", "genie", "likelihood", "tracker")

@@ -31,6 +31,7 @@ from emulator.scenario.filter_noise import filter_mistakes
 from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from emulator.scenario.link_table import CorrelationTable, LinkTable
 from emulator.scenario.plant import ControllerTable, PlantTable
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
     SECRET_BYTES,
@@ -38,7 +39,6 @@ from emulator.scenario.tables import (
     EavesdropperTable,
     EncodingTable,
     LegitimateTable,
-    ProcessTable,
     Scenario,
 )
 from emulator.scenario.words import as_toml, listed, no_entry

@@ -10,8 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field
 
 from emulator.model.acknowledgements import ATTACKS
@@ -19,7 +17,6 @@ from emulator.model.controllers import Assignment
 from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.link import Course
 from emulator.model.plant import Plant
-from emulator.model.process import Process, mistakes_of
 from emulator.model.registry import asked, is_own
 from emulator.model.schemes import SCHEMES
 from emulator.modules import elsewhere, look_in
@@ -29,14 +26,12 @@ from emulator.scenario.expect import ExpectTable
 from emulator.scenario.household import HouseholdTable
 from emulator.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
 from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import (
     Found,
-    Matrix,
-    Number,
     Probability,
     ProcessName,
     Table,
-    numbers,
     one_of,
     registered,
 )
@@ -44,62 +39,6 @@ from emulator.scenario.timeline import Timeline
 from emulator.scenario.words import as_toml, listed, no_entry
 
 SECRET_BYTES = 32
-_MATRICES = ("A", "Q", "initial_covariance")
-
-
-class ProcessTable(Table):
-    """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance)."""
-
-    A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
-    Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
-    initial_covariance: Annotated[Matrix, Field(examples=[[[1.0, 0.0], [0.0, 1.0]]])]
-    singular_noise: Annotated[bool, Field(strict=True, examples=[True])] = False
-    reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
-    states: Annotated[
-        list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
-    ] = None
-    units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether the three are a process; what is missing or no matrix at all is left out of the question."""
-        found: list[Found] = []
-        matrices: dict[str, NDArray[np.float64]] = {}
-        for name in _MATRICES:
-            field = cls.model_fields[name]
-            rows = table.get(name)
-            if not numbers(rows) or rows is None:
-                continue
-            lengths = {len(row) for row in rows}
-            if lengths == {len(rows)} and rows:
-                matrices[name] = np.array(rows, np.float64)
-            else:
-                count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
-                shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
-                found.append(
-                    (name, f"has {shape}; expected a square matrix, such as {as_toml((field.examples or [0])[0])}")
-                )
-        if matrices:
-            known = matrices.get("A", next(iter(matrices.values())))
-            stand_in = np.eye(len(known))
-            A, Q, initial = (matrices.get(name, stand_in) for name in _MATRICES)
-            singular = table.get("singular_noise") is True
-            found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
-            for name in ("reference", "states", "units"):
-                values = table.get(name)
-                if isinstance(values, list) and len(values) != len(known):
-                    found.append((name, f"has {len(values)} entries; expected {len(known)}, one for each state"))
-        return found
-
-    @property
-    def around(self) -> list[float]:
-        """The public reference, from which states are transmitted as deviations; 0 unless it is given."""
-        return [0.0] * len(self.A) if self.reference is None else self.reference
-
-    @property
-    def process(self) -> Process:
-        """The process it describes."""
-        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
 
 
 class EncodingTable(Table):
@@ -261,6 +200,12 @@ class AcknowledgementsTable(Table):
         return []
 
 
+class NetworkTable(Table):
+    """`[network]`: how the processes of a live run are connected; the trials are the same."""
+
+    routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
+
+
 class Scenario(Table):
     """One scenario, checked."""
 
@@ -272,7 +217,7 @@ class Scenario(Table):
     record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
     shards: Annotated[int, Field(ge=1, le=64, strict=True, examples=[2])] = 1
     pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
-    patience: Annotated[float, Field(ge=0.0, le=86400.0, strict=True, examples=[30.0])] = 30.0
+    longest_outage: Annotated[float, Field(ge=0.0, le=86400.0, strict=True, examples=[30.0])] = 30.0
     slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
     secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
     modules: Annotated[str | None, Field(strict=True, examples=["."])] = None
@@ -289,6 +234,7 @@ class Scenario(Table):
         HouseholdTable | None, Field(examples=[{"grid": "P_grid", "load": "P_load", "battery": "SOC"}])
     ] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
+    network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
     )
@@ -307,6 +253,11 @@ class Scenario(Table):
             return [("modules", f'is "{folder}", which is no folder; expected the one that the modules are in')]
         look_in(str(Path(folder).absolute()))
         return [("modules", what) for what in elsewhere(folder, table)]
+
+    @property
+    def relayed(self) -> bool:
+        """Whether there are two routers, of which the second is a relay."""
+        return self.network is not None and self.network.routers > 1
 
     @property
     def receivers(self) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from emulator.brief import Brief, Flow
 from emulator.network.access import Keys
 from emulator.network.session import client_config
 from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port
+from emulator.runs.ports import free_port, loopback_places
 from emulator.scenario import Scenario
 
 LIMIT_SECONDS = 60.0
@@ -86,35 +86,31 @@ class Ear:
 
 
 def connect(brief: Brief, **changes: Any) -> zenoh.Session:
-    """A session with a brief's credentials; changes replace top-level entries of its configuration."""
-    return zenoh.open(zenoh.Config.from_json5(json.dumps({**client_config(brief), **changes})))
+    """A session with a brief's credentials, with a router that may not be up yet; changes replace top-level entries."""
+    config = client_config(brief)
+    config["connect"]["timeout_ms"] = int(1000 * LIMIT_SECONDS)
+    return zenoh.open(zenoh.Config.from_json5(json.dumps({**config, **changes})))
 
 
 class Bench:
     """A router process, and sessions with everybody else's credentials in the test's hands."""
 
-    def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack) -> None:
+    def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
         observation = Observation(folder / "results", False, None)
-        made = briefs_of(scenario, f"tcp/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
+        listen = f"{protocol}/127.0.0.1:{free_port()}"
+        places = loopback_places(listen, None, scenario.relayed)
+        made = briefs_of(scenario, places, observation, ends_with_stdin=False)
         self.briefs: Mapping[str, Brief] = {
-            name: replace(brief, flow=Flow(32, 8, scenario.patience)) for name, brief in made.items()
+            name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
         self.scenario = scenario
         self.keys = Keys(self.briefs["router"].run)
         self.log = folder / "router.log"
         self.private = folder / "private"
         self.private.mkdir()
-        with self.log.open("wb") as log:
-            self.router = stack.enter_context(
-                subprocess.Popen(
-                    [sys.executable, "-m", "emulator", "router", str(self.briefs["router"].write(folder))],
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    env={**os.environ, "TMPDIR": str(self.private)},
-                )
-            )
-        stack.callback(self.router.kill)
+        self.router = self._started("router", folder, stack)
+        if scenario.relayed:
+            self.relay = self._started("relay", folder, stack)
         names = ("sensor", *scenario.receivers, "observer")
         self.sessions = {name: stack.enter_context(connect(self.briefs[name])) for name in names}
         self.downlinks = {name: self.listen(name, self.keys.downlink(name)) for name in scenario.receivers}
@@ -131,6 +127,21 @@ class Bench:
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         for name in processes:
             self.settle(name)
+
+    def _started(self, name: str, folder: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
+        """The process of a router's brief; ended with the bench."""
+        with (folder / f"{name}.log").open("wb") as log:
+            process = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", "emulator", name, str(self.briefs[name].write(folder))],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    env={**os.environ, "TMPDIR": str(self.private)},
+                )
+            )
+        stack.callback(process.kill)
+        return process
 
     def listen(self, process: str, key: str) -> Ear:
         """Subscribe with a process's credentials."""
@@ -159,7 +170,7 @@ class Bench:
 
 
 @contextmanager
-def bench_of(scenario: Scenario, folder: Path) -> Iterator[Bench]:
+def bench_of(scenario: Scenario, folder: Path, protocol: str = "tcp") -> Iterator[Bench]:
     """A bench that is gone when the block ends."""
     with ExitStack() as stack:
-        yield Bench(scenario, folder, stack)
+        yield Bench(scenario, folder, stack, protocol)

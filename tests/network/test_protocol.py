@@ -18,7 +18,7 @@ from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.elementary import normal_quantile
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
-from emulator.network import operator, wire
+from emulator.network import loop_wire, operator, wire
 from emulator.network.access import Keys, Wiring, grants
 from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
@@ -103,7 +103,7 @@ def decode_known(name: str) -> Decode:
     """As the controller reads it."""
 
     def decode(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-        x = wire.read_known(wire.Reader(KEY, raw), name, value["k"], (shape["n"], shape["trials"]))
+        x = loop_wire.read_known(wire.Reader(KEY, raw), name, value["k"], (shape["n"], shape["trials"]))
         return {"k": value["k"], name: x.tolist()}
 
     return decode
@@ -111,7 +111,7 @@ def decode_known(name: str) -> Decode:
 
 def decode_decided(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the sensor reads it."""
-    u, failed = wire.read_decided(wire.Reader(KEY, raw), value["k"], (shape["inputs"], shape["trials"]))
+    u, failed = loop_wire.read_decided(wire.Reader(KEY, raw), value["k"], (shape["inputs"], shape["trials"]))
     return {"k": value["k"], "u": u.tolist(), "failed": failed.astype(int).tolist()}
 
 
@@ -125,12 +125,12 @@ def digests_of(value: dict[str, Any]) -> dict[int, np.ndarray]:
 
 def encode_decisions(_shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the controller makes it."""
-    return wire.Decisions(value["k"], value["c"], np.array(value["seconds"], float), digests_of(value)).pack()
+    return loop_wire.Decisions(value["k"], value["c"], np.array(value["seconds"], float), digests_of(value)).pack()
 
 
 def decode_decisions(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    found = wire.read_decisions(wire.Reader(KEY, raw), value["k"], shape["trials"], shape["period"])
+    found = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], shape["trials"], shape["period"])
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in found.digests.items()}
     return {"k": found.first, "c": found.count, "seconds": found.seconds.tolist(), "digests": digests}
 
@@ -208,6 +208,8 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
             found[name] = message.integer(name)
     if message.has("links"):
         found["links"] = dict(message.map("links"))
+    if message.has("why"):
+        found["why"] = message.text("why")
     if message.has("absent"):
         found["absent"] = list(message.names("absent"))
     if message.has("until"):
@@ -280,12 +282,12 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
     "report": (encode_report, decode_report),
     "journal": (encode_journal, decode_journal),
     "estimate": (
-        lambda _shape, value: wire.known("x_hat", value["k"], np.array(value["x_hat"])),
+        lambda _shape, value: loop_wire.known("x_hat", value["k"], np.array(value["x_hat"])),
         decode_known("x_hat"),
     ),
-    "state": (lambda _shape, value: wire.known("x", value["k"], np.array(value["x"])), decode_known("x")),
+    "state": (lambda _shape, value: loop_wire.known("x", value["k"], np.array(value["x"])), decode_known("x")),
     "input": (
-        lambda _shape, value: wire.decided(value["k"], np.array(value["u"]), flags(value["failed"])),
+        lambda _shape, value: loop_wire.decided(value["k"], np.array(value["u"]), flags(value["failed"])),
         decode_decided,
     ),
     "decisions": (encode_decisions, decode_decisions),

@@ -100,7 +100,7 @@ BAD = {
 def test_bad_packet_ends_the_router(name: str, bench: Callable[..., Bench]) -> None:
     """A gap that is not closed, or a malformed packet, ends the router with status 3 and a line that says which."""
     messages, line = BAD[name]
-    stage = bench(patience=0.0)
+    stage = bench(longest_outage=0.0)
     for message in messages:
         stage.put("sensor", stage.keys.uplink, message)
     assert stage.router.wait(LIMIT_SECONDS) == 3

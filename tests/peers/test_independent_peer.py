@@ -101,7 +101,6 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
     """In the place of our estimator, among our router, sensor, eavesdroppers and observer, it ends with our digest."""
     scenario = load("eavesdroppers", {"slots": 300, "trials": 2})
     out = tmp_path / "out"
-    (out / "logs").mkdir(parents=True)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     briefs = briefs_of(scenario, endpoint, Observation(out, False, None), ends_with_stdin=False)
     with ExitStack() as stack:

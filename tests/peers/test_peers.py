@@ -91,6 +91,22 @@ class Stage:
         return found
 
 
+class FakeInbox:
+    """The part of an inbox that peers use."""
+
+    def __init__(self, queue: SimpleQueue[bytes]) -> None:
+        self._queue = queue
+
+    def recv(self) -> Any:
+        """The next message."""
+        payload = self._queue.get(timeout=LIMIT)
+        return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+
+    def __iter__(self) -> Iterator[Any]:
+        while not self._queue.empty():
+            yield self.recv()
+
+
 class FakeSession:
     """The part of `Session` that peers use."""
 
@@ -108,11 +124,7 @@ class FakeSession:
         """An inbox whose `recv` never waits for longer than a test may."""
         queue = self._stage.inboxes.setdefault(key, SimpleQueue())
 
-        def recv() -> Any:
-            payload = queue.get(timeout=LIMIT)
-            return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
-
-        return SimpleNamespace(recv=recv)
+        return FakeInbox(queue)
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """As the real one, called by the test."""
@@ -237,7 +249,7 @@ BAD = {
 def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
     """A gap that is not closed, or a malformed delivery, ends a receiver with an error that names the key and what was due."""
     messages, error, text = BAD[what]
-    brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, patience=0.0))
+    brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
     stage.fill(Keys(brief.run).downlink(name), messages)
     with pytest.raises(error, match=text) as caught:
         RECEIVERS[name](brief)

@@ -94,7 +94,7 @@ def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, what: str
     """Whoever notices, the sender is named, with what was wrong and the last lines of its log."""
     name, does, said = ROGUES[what]
     rogue = with_rogue(evedrop, name, does)
-    live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "patience=1", env=rogue)
+    live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "longest_outage=1", env=rogue)
     done = live.end()
     assert done.status == 3
     assert done.err.startswith(f"evedrop: {name} broke the protocol: ")
@@ -238,7 +238,7 @@ class Stillness:
 @pytest.mark.long
 def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop) -> None:
     """When its connection is lost and does not come back for as long as the scenario waits, it is named."""
-    live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "patience=2")
+    live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "longest_outage=2")
     live.running()
     live.kill("naive", signal.SIGSTOP)
     done = live.end()

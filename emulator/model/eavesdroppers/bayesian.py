@@ -9,7 +9,10 @@ Source: docs/mathematics.md, bayesian eavesdropper.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from emulator.model.elementary import cholesky, exp
@@ -19,6 +22,8 @@ from emulator.model.mixture import NEGLIGIBLE, Mixture, merge, pruned, summed, w
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Belief, Flags, Heard
 from emulator.streams import Batch
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 CAPACITY = 12
 """Components a trial may have; beyond it the two least probable ones become one of the same mean and covariance."""
@@ -38,6 +43,7 @@ class Bayesian(PacketReader):
         self._mu_d = knowledge.state_probability
         self._capacity = capacity
         self._leaks = Leaks(knowledge.process)
+        self._trial_of = np.tile(np.arange(batch.trials), capacity)
         self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
 
     def prior(self, first: int = 0) -> Belief:
@@ -71,22 +77,30 @@ class Bayesian(PacketReader):
         return Belief(x_hat, P, action, mixture)
 
     def _weighed(self, of: Mixture, gamma: Flags, z: Floats, leak: Leak) -> tuple[Mixture, Floats]:
-        """The components a slot later, and the probability that the packet is the state, (R,)."""
-        A, white = self.process.A, leak.white(z)
-        mean = self.process.predict(of.mean.reshape(len(z), -1)).reshape(of.mean.shape)
-        predicted, informed = grown(A, of.spread, self._noise, leak.remaining_factor)
-        apart = [row - m for row, m in zip(z, mean, strict=True)]
-        squared = squared_length(predicted, apart)
-        ratio = summed(_weighed_ratios(gamma, of.weight, squared, predicted.diagonal, white, leak))
-        state, other = self._type_probabilities(ratio, gamma)
-        return (
-            Mixture(
-                of.weight * other,
-                mean + np.where(gamma, leak.innovation(white), 0.0)[:, None, :],
-                *(np.where(gamma, *pair) for pair in zip(informed, predicted, strict=True)),
-            ),
-            state,
-        )
+        """The components a slot later, and the probability that the packet is the state, (R,).
+
+        Places that are empty are left out of all that costs: half of them are, most of the time.
+        """
+        there = np.flatnonzero(of.weight)
+        trial = self._trial_of[there]
+        some = Mixture(*(_taken(part.reshape(*part.shape[:-2], of.weight.size), there) for part in of))
+        white, heard = leak.white(z), _taken(gamma, trial)
+        mean = self.process.predict(some.mean)
+        predicted, informed = grown(self.process.A, some.spread, self._noise, leak.remaining_factor)
+        apart = _taken(z, trial) - mean
+        squared = squared_length(predicted, list(apart))
+        ratios = np.zeros(of.weight.shape)
+        alone = _taken(_squared(white), trial)
+        ratios.reshape(-1)[there] = _weighed_ratios(heard, some.weight, squared, predicted.diagonal, alone, leak)
+        state, other = self._type_probabilities(summed(ratios), gamma)
+        mean += _taken(np.where(gamma, leak.innovation(white), 0.0), trial)
+        for after, known in zip(predicted, informed, strict=True):
+            np.copyto(after, known, where=heard)
+        spread = [np.zeros(part.shape) for part in of[1:]]
+        for whole, part in zip(spread, (mean, *predicted), strict=True):
+            for row, values in zip(whole.reshape(len(whole), of.weight.size), part, strict=True):
+                row[there] = values
+        return Mixture(of.weight * other, *spread), state
 
     def _type_probabilities(self, ratio: Floats, gamma: Flags) -> tuple[Floats, Floats]:
         """Probabilities that the packet is the state, and that it is not, (R,); 0 and 1 where nothing was received.
@@ -100,25 +114,35 @@ class Bayesian(PacketReader):
         return np.where(gamma, odds / (1.0 + odds), 0.0), np.where(gamma, 1.0 / (1.0 + odds), 1.0)
 
 
-def _weighed_ratios(
-    gamma: Flags, weight: Floats, squared: Floats, diagonal: Floats, white: Floats, leak: Leak
-) -> Floats:
-    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) where z was received, (C, R).
+def _taken(part: NDArray[_Kind], places: NDArray[np.intp]) -> NDArray[_Kind]:
+    """Some places of the last axis, all of them known to be there."""
+    return part.take(places, axis=-1, mode="clip")
 
-    weight: π, (C, R); squared: (z − m)ᵀ P⁻¹ (z − m), (C, R); diagonal: D of P's factors, (n, C, R); white: L_k⁻¹ z, (n, R).
-    """
-    alone = white[0] * white[0]
+
+def _squared(white: Floats) -> Floats:
+    """Squared lengths of (n, R), (R,)."""
+    total: Floats = white[0] * white[0]
     for row in white[1:]:
-        alone += row * row
+        total += row * row
+    return total
+
+
+def _weighed_ratios(
+    heard: Flags, weight: Floats, squared: Floats, diagonal: Floats, alone: Floats, leak: Leak
+) -> Floats:
+    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) of components whose trial received z, (N,); 0 of others.
+
+    weight: π, (N,); squared: (z − m)ᵀ P⁻¹ (z − m), (N,); diagonal: D of P's factors, (n, N); alone: zᵀ Σ_k⁻¹ z, (N,).
+    """
     exponent = 0.5 * (alone - squared)
     # Most are told apart by far, and need no exponential.
-    some = np.flatnonzero((weight > 0.0) & (exponent > _IMPOSSIBLE) & gamma)
+    some = np.flatnonzero((exponent > _IMPOSSIBLE) & heard)
     determinant = np.ones(len(some))
     for D, state in zip(diagonal, leak.state_diagonal, strict=True):
-        determinant *= D.reshape(-1)[some] / state
-    likely = exp(np.minimum(exponent.reshape(-1)[some], _CERTAIN))
+        determinant *= D[some] / state
+    likely = exp(np.minimum(exponent[some], _CERTAIN))
     ratios = np.zeros(weight.shape)
-    ratios.reshape(-1)[some] = weight.reshape(-1)[some] * likely / np.sqrt(determinant)
+    ratios[some] = weight[some] * likely / np.sqrt(determinant)
     return ratios
 
 

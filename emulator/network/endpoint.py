@@ -1,0 +1,73 @@
+"""An endpoint of Zenoh's, `tcp/HOST:PORT` or `tls/HOST:PORT`: where a router listens, and where the others find it."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from dataclasses import dataclass
+
+_FORM = re.compile(r"(tcp|tls)/(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_.-]+)):([0-9]{1,5})")
+_MOST_LABEL = 63
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """Its parts."""
+
+    protocol: str
+    """`tcp`, in clear, or `tls`."""
+    host: str
+    """A name or an address; one of IPv6 without brackets."""
+    port: int
+
+    @classmethod
+    def of(cls, text: str) -> Endpoint:
+        """The endpoint that a text names. Raises ValueError if it names none."""
+        found = _FORM.fullmatch(text)
+        if found is None:
+            raise ValueError(f"{text} is no endpoint")
+        protocol, sixth, host, port = found.groups()
+        endpoint = cls(protocol, sixth or host, int(port))
+        if not 0 < endpoint.port < 2**16:
+            raise ValueError(f"{text} names no port")
+        if sixth is not None and endpoint.address is None:
+            raise ValueError(f"{text} names no address")
+        if any(not 0 < len(label) <= _MOST_LABEL for label in endpoint.host.split(".")) and sixth is None:
+            raise ValueError(f"{text} names no host")
+        return endpoint
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.protocol}/{host}:{self.port}"
+
+    @property
+    def address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+        """The host's, if it is given by one."""
+        try:
+            return ipaddress.ip_address(self.host)
+        except ValueError:
+            return None
+
+    @property
+    def secure(self) -> bool:
+        """Whether what goes over it is encrypted, and both ends show who they are."""
+        return self.protocol == "tls"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether nobody but this machine can get at it."""
+        return self.host == "localhost" or (self.address is not None and self.address.is_loopback)
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it is every address of a machine: to listen on, and not to connect to."""
+        return self.address is not None and self.address.is_unspecified
+
+    def try_to_listen(self) -> None:
+        """Raise OSError unless this host can listen there."""
+        found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
+        family, kind, protocol, _, address = found[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)

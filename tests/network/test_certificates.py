@@ -1,0 +1,323 @@
+"""A router that takes certificates: who can connect to it, as whom, and what a process says of certificates that do not fit.
+
+Each attack is shown to fail where the same attempt with the right certificate succeeds.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import socket
+import ssl
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import zenoh
+from bench import Bench, Ear, bench_of, connect, scenario_of, until
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from emulator.brief import Brief, Identity, read_brief
+from emulator.control import Control, read_control
+from emulator.errors import BriefError, RunError, UsageError
+from emulator.network import wire
+from emulator.network.certificates import check_identity
+from emulator.network.connecting import Door, connected
+from emulator.network.session import client_config, door_of
+from emulator.runs.authority import Authority
+from emulator.runs.briefs import Observation, briefs_of
+from emulator.runs.ports import free_port, places_at
+
+EVE, MALLORY = "eve", "mallory"
+NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)
+ONCE = {"timeout_ms": 0, "exit_on_failure": True}
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """One router for all tests of this file."""
+    with bench_of(scenario_of(slots=100_000), tmp_path_factory.mktemp("tls"), "tls") as one:
+        one.due = 0
+        yield one
+
+
+def flow(stage: Bench) -> None:
+    """Let one slot pass, in which everybody gets a delivery."""
+    k, stage.due = stage.due, stage.due + 1
+    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    for ear in stage.downlinks.values():
+        assert wire.Reader(*ear.hear()).integer("k") == k
+
+
+def self_signed() -> Identity:
+    """A certificate of nobody's but its own making, which claims to be Eve's."""
+    other = Authority("nobody").identity(EVE)
+    return replace(other, authority=other.certificate)
+
+
+def expired() -> Identity:
+    """A certificate of a year ago, of an authority that nobody knows."""
+    return Authority("old", datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=365)).identity(EVE)
+
+
+STRANGERS = {
+    "of another run": lambda _: Authority("r00000000").identity(EVE),
+    "self-signed": lambda _: self_signed(),
+    "expired": lambda _: expired(),
+    "another run's, this run's authority": lambda brief: replace(
+        Authority(brief.run).identity(EVE), authority=brief.identity.authority
+    ),
+}
+
+
+@pytest.mark.parametrize("who", STRANGERS)
+def test_a_certificate_that_is_not_of_this_run_opens_nothing(who: str, stage: Bench) -> None:
+    """With Eve's user and password but another certificate there is no session, even for who believes every router."""
+    brief = stage.briefs[EVE]
+    stranger = STRANGERS[who](brief)
+    config = client_config(replace(brief, identity=stranger))
+    config["transport"]["link"]["tls"]["verify_name_on_connect"] = False
+    config["transport"]["link"]["tls"]["root_ca_certificate_base64"] = client_config(brief)["transport"]["link"]["tls"][
+        "root_ca_certificate_base64"
+    ]
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(zenoh.Config.from_json5(json.dumps(config))).close()
+    connect(brief, connect={"endpoints": [brief.router], **ONCE}).close()
+    flow(stage)
+
+
+@pytest.mark.parametrize("protocol", ["tls", "tcp"])
+def test_without_a_certificate_there_is_no_session(protocol: str, stage: Bench) -> None:
+    """Nobody is let in who shows none, nor who speaks no TLS."""
+    brief = stage.briefs[EVE]
+    config = client_config(brief)
+    endpoint = f"{protocol}/{brief.router.partition('/')[2]}"
+    config["connect"]["endpoints"] = [endpoint]
+    config["transport"]["link"]["protocols"] = [protocol]
+    tls = config["transport"]["link"].pop("tls")
+    if protocol == "tls":
+        authority = {"root_ca_certificate_base64": tls["root_ca_certificate_base64"], "enable_mtls": False}
+        config["transport"]["link"]["tls"] = authority
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(zenoh.Config.from_json5(json.dumps(config))).close()
+    flow(stage)
+
+
+@pytest.mark.parametrize(("user", "shown"), [(MALLORY, EVE), (EVE, MALLORY), ("observer", EVE)])
+def test_a_certificate_opens_nothing_under_another_user(user: str, shown: str, stage: Bench) -> None:
+    """Who has another's user and password, but the own certificate, hears nothing of theirs and puts nothing for them."""
+    thief = replace(stage.briefs[user], identity=stage.briefs[shown].identity)
+    telemetry = stage.keys.telemetry(user if user != "observer" else EVE)
+    with connect(thief) as attacker, connect(stage.briefs[user]) as rightful:
+        stolen, own = Ear(), Ear()
+        for key in (stage.keys.downlink(EVE), stage.keys.downlink(MALLORY), stage.keys.telemetry("sensor")):
+            attacker.declare_subscriber(key, stolen)
+            rightful.declare_subscriber(key, own)
+        attacker.put(telemetry, b"forged")
+        attacker.put(stage.keys.control("sensor"), b"forged")
+        until(lambda: flow(stage) or stage.settle("sensor") or not own.messages.empty(), "what is rightfully heard")
+        for _ in range(3):
+            flow(stage)
+            stage.settle("sensor")
+        assert stolen.all() == []
+    for name in (EVE, MALLORY):
+        stage.settle(name)
+    assert stage.controls["sensor"].all() == []
+
+
+def test_with_the_own_certificate_an_eavesdropper_hears_its_own_alone(stage: Bench) -> None:
+    """Access control is the same as without certificates: the own downlink, and neither uplink nor another's."""
+    with connect(stage.briefs[EVE]) as attacker:
+        ears = {key: Ear() for key in (stage.keys.downlink(EVE), stage.keys.downlink(MALLORY), stage.keys.uplink)}
+        for key, ear in ears.items():
+            attacker.declare_subscriber(key, ear)
+        until(lambda: flow(stage) or not ears[stage.keys.downlink(EVE)].messages.empty(), "its own delivery")
+        flow(stage)
+        assert {key for ear in ears.values() for key, _ in ear.all()} == {stage.keys.downlink(EVE)}
+
+
+def test_an_eavesdropper_cannot_pose_as_the_router(stage: Bench) -> None:
+    """A router with a process's certificate is believed by nobody, and a process says that it is none."""
+    sensor, eve = stage.briefs["sensor"], stage.briefs[EVE]
+    port = free_port()
+    config = client_config(eve)
+    tls = config["transport"]["link"]["tls"]
+    for what in ("certificate", "private_key"):
+        tls[f"listen_{what}_base64"] = tls[f"connect_{what}_base64"]
+    del config["connect"], config["transport"]["auth"]
+    config |= {"mode": "router", "listen": {"endpoints": [f"tls/127.0.0.1:{port}"], "exit_on_failure": True}}
+    lured = replace(sensor, router=f"tls/127.0.0.1:{port}")
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))):
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(lured)))).close()
+        with pytest.raises(
+            BriefError, match=r"has the certificate of another process of evedrop r.*, and is no router"
+        ):
+            connected(door_of(lured), 20.0)
+
+
+def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
+    """The router of this run at a host that its certificate does not name: one line with the option that mends it."""
+    brief = stage.briefs[EVE]
+    port = brief.router.rpartition(":")[2]
+    with pytest.raises(BriefError, match=rf"does not name localhost; .* --connect tls/localhost:{port}, all of them"):
+        connected(door_of(replace(brief, router=f"tls/localhost:{port}")), 20.0)
+
+
+def test_another_runs_router_is_told_apart(stage: Bench) -> None:
+    """A brief of another run says whose router it found, within seconds."""
+    other = briefs_of(stage.scenario, stage.briefs[EVE].router, Observation(Path("nowhere"), False, None))[EVE]
+    with pytest.raises(BriefError) as caught:
+        connected(door_of(other), 60.0)
+    assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)
+
+
+def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> None:
+    """What the observer writes into its folder opens a session; without the certificate in it none is opened."""
+    part = stage.briefs["observer"].part
+    control = Control(
+        stage.keys.run, stage.briefs[EVE].router, "operator", part["operator"], Identity(**part["operator_identity"])
+    )
+    control.write(tmp_path)
+    assert (tmp_path / "control.json").stat().st_mode & 0o777 == 0o600
+    found = read_control(tmp_path)
+    assert found == control
+    zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(found)))).close()
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(replace(found, identity=None))))).close()
+    path = tmp_path / "control.json"
+    path.write_text(json.dumps({**asdict(control), "identity": {"key": 3}}))
+    with pytest.raises(UsageError, match=r"control\.json is not one"):
+        read_control(tmp_path)
+
+
+def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
+    """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
+    made = briefs_of(
+        scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
+    )
+    texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
+    keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
+    assert len(set(keys.values())) == len(made)
+    for name, key in keys.items():
+        assert [other for other, text in texts.items() if json.dumps(key) in text] == [name]
+    assert {name: text.count("PRIVATE KEY") // 2 for name, text in texts.items()} == {
+        name: 2 if name == "observer" else 1 for name in made
+    }
+    assert len({brief.identity.authority for brief in made.values() if brief.identity}) == 1
+    for name in made:
+        assert read_brief(tmp_path / f"{name}.json") == replace(made[name], part=json.loads(texts[name])["part"])
+
+
+def certificate_of(brief: Brief) -> x509.Certificate:
+    """The certificate in a brief."""
+    assert brief.identity is not None
+    return x509.load_pem_x509_certificate(brief.identity.certificate.encode())
+
+
+def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
+    """The router's names its hosts and is for a server; the others' name no host and are for a client."""
+    made = briefs_of(
+        scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
+    )
+    names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["router.lan"]
+    assert [str(one) for one in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
+    for name, brief in made.items():
+        found = certificate_of(brief)
+        assert found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == name
+        uses = {use._name for use in found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value}
+        assert uses == ({"serverAuth"} if name == "router" else {"clientAuth"})
+        if name != "router":
+            with pytest.raises(x509.ExtensionNotFound):
+                found.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+
+
+AUTHORITY = Authority("r01", NOW)
+EVES, OTHERS = AUTHORITY.identity(EVE), Authority("r01", NOW).identity(EVE)
+DAY = datetime.timedelta(days=1)
+
+
+@pytest.mark.parametrize(
+    ("identity", "now", "said"),
+    [
+        (EVES, NOW - 2 * DAY, r"not valid before 2026-05-03 12:00 UTC.*clock says 2026-05-02 12:00 UTC; set the clock"),
+        (EVES, NOW + 31 * DAY, r"expired 2026-06-03 12:00 UTC.*says 2026-06-04 12:00 UTC; write the briefs again"),
+        (replace(EVES, key=OTHERS.key), NOW, r"identity\.key is not that of identity\.certificate; write the briefs"),
+        (replace(EVES, authority=OTHERS.authority), NOW, r"was not made by identity\.authority \(evedrop r01\)"),
+        (AUTHORITY.identity(MALLORY), NOW, r"is that of mallory, not of eve"),
+        (replace(EVES, certificate="none"), NOW, r"identity is none \(.*\); write the briefs again"),
+        (replace(EVES, key=EVES.certificate), NOW, r"identity is none \(.*\); write the briefs again"),
+    ],
+)  # fmt: skip
+def test_an_identity_that_does_not_fit_is_seen_at_once(identity: Identity, now: datetime.datetime, said: str) -> None:
+    """Too early, too late, another's key, another's authority, another's name, nonsense: each is one line with the remedy."""
+    with pytest.raises(BriefError, match=said) as caught:
+        check_identity(identity, EVE, now)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_identity_that_fits_is_taken() -> None:
+    """From a day before the authority was made, for clocks that are late, until 30 days after."""
+    for now in (NOW - DAY, NOW, NOW + 30 * DAY):
+        check_identity(EVES, EVE, now)
+
+
+def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
+    """A router that shows a certificate of another time: the process names the clock."""
+    old = Authority(stage.keys.run, datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=365))
+    router, eve = old.identity("router", ["127.0.0.1"], connects=False), old.identity(EVE)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    config = client_config(replace(stage.briefs[EVE], router=endpoint, identity=eve))
+    tls = {**config["transport"]["link"]["tls"]}
+    listening = client_config(replace(stage.briefs[EVE], identity=router))["transport"]["link"]["tls"]
+    for what in ("certificate", "private_key"):
+        tls[f"listen_{what}_base64"] = listening[f"connect_{what}_base64"]
+    server = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "scouting": config["scouting"],
+        "transport": {"link": {"protocols": ["tls"], "tls": tls}},
+    }
+    with (
+        zenoh.open(zenoh.Config.from_json5(json.dumps(server))),
+        pytest.raises(
+            BriefError, match=r"not valid now by this host's clock \(certificate has expired\); set the clock"
+        ),
+    ):
+        connected(Door(endpoint, stage.keys.run, config, eve), 20.0)
+
+
+def test_a_router_that_is_not_there_is_waited_for() -> None:
+    """Nobody listens: the process says so when its patience ends, as a failure of the run."""
+    calls: list[None] = []
+    door = Door(f"tcp/127.0.0.1:{free_port()}", "r01", {})
+    with pytest.raises(
+        RunError, match=r"no router answered at tcp/.* within 1 s \(Connection refused\); start it there"
+    ):
+        connected(door, 1.0, lambda: calls.append(None))
+    assert len(calls) > 1
+
+
+def test_briefs_that_fit_no_endpoint_are_refused() -> None:
+    """Certificates for a router in clear, none for one that takes them, and what is no endpoint."""
+    for door, said in (
+        (Door("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
+        (Door("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),
+        (Door("7447", "r01", {}), "7447 is no endpoint"),
+    ):
+        with pytest.raises(BriefError, match=said):
+            connected(door, 1.0)
+
+
+def test_the_routers_certificate_passes_the_strictest_check(stage: Bench) -> None:
+    """Python's TLS, told to be strict about every field of RFC 5280, takes it: other libraries will, too."""
+    brief = stage.briefs[EVE]
+    assert brief.identity is not None
+    strict = ssl.create_default_context(cadata=brief.identity.authority)
+    strict.verify_flags |= ssl.VERIFY_X509_STRICT
+    address = ("127.0.0.1", int(brief.router.rpartition(":")[2]))
+    with socket.create_connection(address) as link, strict.wrap_socket(link, server_hostname="127.0.0.1") as shown:
+        assert shown.getpeercert()["subject"] == ((("commonName", "router"),),)

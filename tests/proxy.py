@@ -1,0 +1,100 @@
+"""A cable that can be pulled: a TCP proxy that closes its connections, or goes silent without closing them."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+_PIECE = 1 << 16
+
+
+class Cable:
+    """Passes on what comes to its own port. Final.
+
+    whole: set while it passes everything on; closed connections stay closed, and none is accepted meanwhile.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._flows = threading.Event()
+        self._flows.set()
+        self._accepts = True
+        self._ends: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens, as Zenoh writes it."""
+        return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+
+    @property
+    def connections(self) -> int:
+        """How many there are."""
+        return len(self._ends) // 2
+
+    def cut(self) -> None:
+        """Close all connections, and take no new one."""
+        self._accepts = False
+        self._close()
+
+    def silence(self) -> None:
+        """Pass nothing on any more; nobody is told."""
+        self._flows.clear()
+
+    def heal(self) -> None:
+        """Pass everything on again."""
+        self._accepts = True
+        self._flows.set()
+
+    def close(self) -> None:
+        """For good."""
+        self._accepts = False
+        self._flows.set()
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._close()
+
+    def _close(self) -> None:
+        ends, self._ends = self._ends, []
+        for end in ends:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                self._flows.wait()
+                try:
+                    if not self._accepts:
+                        raise ConnectionRefusedError
+                    far = socket.create_connection(("127.0.0.1", self._port))
+                except OSError:
+                    near.close()
+                    continue
+                self._ends += [near, far]
+                for here, there in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=(here, there), daemon=True).start()
+
+    def _carry(self, here: socket.socket, there: socket.socket) -> None:
+        with suppress(OSError):
+            while piece := here.recv(_PIECE):
+                self._flows.wait()
+                there.sendall(piece)
+        for end in (here, there):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+        here.close()
+
+
+@contextmanager
+def cable(port: int) -> Iterator[Cable]:
+    """A cable to a port of this machine."""
+    one = Cable(port)
+    try:
+        yield one
+    finally:
+        one.close()

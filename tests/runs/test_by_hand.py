@@ -1,0 +1,310 @@
+"""Processes that are started by hand, each where and when its user likes: the same run, and one line for what does not fit.
+
+Addresses of loopback stand for hosts.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emulator.errors import UsageError
+from emulator.runs.ports import Meeting, free_port, meeting_at
+from emulator.runs.results import load_results
+from tests.conftest import Done, Evedrop, Live, wait_until
+
+ROLES = ("router", "relay", "sensor", "legitimate", "observer")
+SOON = 5.0
+"""Seconds within which a mistake is to be said; how long the machine took for all else is not counted."""
+
+
+def written(evedrop: Evedrop, *options: str, out: str = "briefs", slots: int = 200) -> dict[str, str]:
+    """Process name → its brief, as `evedrop brief` wrote it."""
+    done = evedrop("brief", "eavesdroppers", "--slots", str(slots), "--out", out, *options)
+    assert done.status == 0, done.err
+    return {Path(path).stem: path for path in done.out.split()}
+
+
+def begun(evedrop: Evedrop, name: str, path: str, *options: str, **how: Any) -> Live:
+    """A process of a brief, started by hand."""
+    return evedrop.begun(name if name in ROLES else "eavesdropper", path, *options, **how)
+
+
+def digests(path: Path) -> dict[str, str]:
+    """Receiver → its digest."""
+    return {name: one["digest"] for name, one in load_results(path).summary["peers"].items()}
+
+
+TLS = ("--listen", "tls/0.0.0.0:{port}", "--connect", "tls/127.0.0.2:{port}")
+NAMED = ("--listen", "tls/localhost:{port}")
+CLEAR = ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/127.0.0.3:{port}", "--insecure")
+TWO = ("--set", "network.routers=2", "--listen", "tls/127.0.0.2:{port}", "--relay", "tls/127.0.0.3:{port}")
+TWO_CLEAR = ("--set", "network.routers=2", "--listen", "tcp/127.0.0.2:{port}", "--relay", "tcp/127.0.0.3:{port}")
+
+
+@pytest.mark.parametrize(
+    ("options", "backwards"),
+    [(TLS, False), (TLS, True), (NAMED, False), (CLEAR, True), (TWO, True), (TWO_CLEAR, False)],
+    ids=["tls", "tls, router last", "tls by name", "in clear", "two routers", "two routers in clear"],
+)
+def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards: bool, evedrop: Evedrop) -> None:
+    """In whatever order, from two folders that stand for hosts, in clear or not: the digests of the trials in memory."""
+    port = str(free_port())
+    briefs = written(evedrop, *(option.format(port=port) for option in options), "--results", "results")
+    hosts = [evedrop.folder / "one", evedrop.folder / "two"]
+    started = []
+    for number, (name, path) in enumerate(
+        sorted(briefs.items(), key=lambda at: ROLES.index(at[0]) if at[0] in ROLES else 9)
+    ):
+        host = hosts[name not in {"router", "sensor"}]
+        host.mkdir(exist_ok=True)
+        taken = (evedrop.folder / path).rename(host / f"{name}.json")  # as if carried there: no host has another's
+        started.append((number, name, taken, host))
+    running = []
+    for _, name, taken, host in reversed(started) if backwards else started:
+        running.append((name, begun(evedrop, name, str(taken), cwd=host)))
+        if name == "router" and backwards:
+            assert running[0][1].process.poll() is None, "everybody waits for the router"
+    ended = {name: live.end() for name, live in running}
+    assert {name: done.status for name, done in ended.items()} == dict.fromkeys(briefs, 0), ended
+    assert {name: done.err for name, done in ended.items()} == dict.fromkeys(briefs, "")
+    assert evedrop("montecarlo", "eavesdroppers", "--slots", "200", "--trials", "1", "--out", "memory").status in {0, 1}
+    assert digests(hosts[1] / "results") == digests(evedrop.folder / "memory")
+
+
+def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
+    """`evedrop run --listen tls/127.0.0.1:PORT`: the same digests, and a control file with which it can be steered."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    live = evedrop.live("eavesdroppers", "--slots", "100000", "--pace", "0.002", "--listen", endpoint)
+    live.running()
+    control = json.loads((live.folder / "control.json").read_text())
+    assert control["router"] == endpoint
+    assert "PRIVATE KEY" in control["identity"]["key"]
+    assert evedrop("status", "run").status == 0
+    (evedrop.folder / "copy").mkdir()
+    (evedrop.folder / "copy" / "control.json").write_text(json.dumps({**control, "user": "observer"}))
+    told(evedrop("status", "copy"), 2, "copy/control.json: identity.certificate is that of operator, not of observer")
+    assert evedrop("pause", "run").out.startswith("held before slot")
+    live.process.terminate()
+    assert live.end().status == 130
+    live.nothing_left()
+    assert (
+        evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--listen", endpoint, "--out", "a").status
+        == 0
+    )
+    assert evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--out", "b").status == 0
+    assert digests(evedrop.folder / "a") == digests(evedrop.folder / "b")
+
+
+@pytest.mark.parametrize("scenario", ["acknowledged", "restart"])
+def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> None:
+    """Acknowledgements that cross, processes that are started again: the digests of one router, and of memory."""
+    small = ("--trials", "1", "--record-trials", "1", "--pace", "0", "--set", "expect=[]")
+    two = evedrop("run", scenario, *small, "--view", "off", "--set", "network.routers=2", "--out", "two")
+    assert two.status == 0, two.err
+    assert evedrop("run", scenario, *small, "--view", "off", "--out", "one").status == 0
+    assert evedrop("montecarlo", scenario, *small, "--out", "memory").status == 0
+    assert digests(evedrop.folder / "two") == digests(evedrop.folder / "one") == digests(evedrop.folder / "memory")
+
+
+def test_a_run_of_two_routers_is_steered_and_ended_as_any(evedrop: Evedrop) -> None:
+    """The operator gets at the observer through the relay; a signal ends everybody, the relay too."""
+    live = evedrop.live("eavesdroppers", "--slots", "100000", "--pace", "0.002", "--set", "network.routers=2")
+    live.running()
+    assert evedrop("link", "run", "smart", "quality=0.2").out.startswith("from slot")
+    status = json.loads(evedrop("status", "run", "--json").out)
+    assert status["processes"]["relay"] is True
+    live.process.terminate()
+    assert live.end().status == 130
+    live.nothing_left()
+
+
+def told(done: Done, status: int, *words: str) -> None:
+    """One line, with this status, that has these words in it, the file among them."""
+    assert (done.status, done.out) == (status, "")
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: ")
+    for word in words:
+        assert word in line
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_a_brief_of_another_run_is_told_apart(protocol: str, evedrop: Evedrop) -> None:
+    """Of a process, and of the observer, which leaves no results: long before anybody's patience ends."""
+    endpoint = f"{protocol}/127.0.0.1:{free_port()}"
+    ours = written(evedrop, "--listen", endpoint)
+    others = written(evedrop, "--listen", endpoint, out="others")
+    with Router(evedrop, ours["router"], endpoint) as router:
+        runs = {name: json.loads((evedrop.folder / path).read_text())["run"] for name, path in others.items()}
+        for name in ("sensor", "smart", "observer"):
+            words = [f"others/{name}.json: ", endpoint, runs[name], "start the router of this run"]
+            told(begun(evedrop, name, others[name]).end(), 2, *words)
+        assert router.process.poll() is None
+    assert list((evedrop.folder / "results").iterdir()) == []
+
+
+class Router:
+    """A router that listens. Final; ended when the block ends."""
+
+    def __init__(self, evedrop: Evedrop, brief: str, endpoint: str) -> None:
+        host, _, port = endpoint.partition("/")[2].rpartition(":")
+        self._live = begun(evedrop, "router", brief)
+        self._address = (host, int(port))
+
+    def _listens(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(self._address) == 0
+
+    def __enter__(self) -> Live:
+        wait_until(self._listens, "a router that listens")
+        return self._live
+
+    def __exit__(self, *_: object) -> None:
+        self._live.process.kill()
+        self._live.process.communicate()
+
+
+def test_a_port_that_somebody_has_is_said(evedrop: Evedrop) -> None:
+    """A second router at the same place: its brief, the place, what to do."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    briefs = written(evedrop, "--listen", endpoint)
+    with Router(evedrop, briefs["router"], endpoint):
+        done = begun(evedrop, "router", briefs["router"]).end()
+    told(done, 2, "briefs/router.json: ", endpoint, "Address already in use", "end the program that does")
+
+
+def test_an_address_of_another_host_is_said(evedrop: Evedrop) -> None:
+    """A router started on a host that does not have the address its brief names."""
+    briefs = written(evedrop, "--listen", f"tls/192.0.2.1:{free_port()}")
+    told(
+        begun(evedrop, "router", briefs["router"]).end(),
+        2,
+        "router.json: ",
+        "of the host that the router is started on",
+    )
+
+
+def test_a_host_that_is_not_known_is_said(evedrop: Evedrop) -> None:
+    """A name that does not resolve, for those who connect and for who listens."""
+    briefs = written(evedrop, "--listen", "tls/nowhere.invalid:7447")
+    for name in ("sensor", "observer", "router"):
+        told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", "nowhere.invalid", "/etc/hosts")
+
+
+def test_a_certificate_of_another_process_is_said(evedrop: Evedrop) -> None:
+    """Briefs whose identities were exchanged: both say so before they try anything."""
+    briefs = written(evedrop, "--listen", "tls/127.0.0.1:7447")
+    found = {name: json.loads((evedrop.folder / briefs[name]).read_text()) for name in ("smart", "naive")}
+    for name, other in (("smart", "naive"), ("naive", "smart")):
+        (evedrop.folder / briefs[name]).write_text(json.dumps({**found[name], "identity": found[other]["identity"]}))
+        told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", f"is that of {other}, not of {name}")
+
+
+def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
+    """After the time that `--wait` gives, the observer names who is missing; exit 3, and a folder that says so."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    briefs = written(evedrop, "--listen", endpoint, "--wait", "15")
+    lives = {name: begun(evedrop, name, path) for name, path in briefs.items() if name != "smart"}
+    done = lives["observer"].end()
+    assert done.status == 3
+    assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
+    assert load_results(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
+    said = {name: live.end() for name, live in lives.items() if name != "observer"}
+    assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)
+    for name, one in said.items():
+        assert one.err.startswith(f"evedrop: {name}: the observer gave the run up: smart did not appear")
+
+
+def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
+    """Ctrl-C on its host: what was measured is on disk, and everybody else ends, saying why."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    briefs = written(evedrop, "--listen", endpoint, "--set", "pace=0.002", slots=100_000)
+    lives = {name: begun(evedrop, name, path) for name, path in briefs.items()}
+    wait_until((evedrop.folder / "results" / "control.json").exists, "a run under way")
+    lives["observer"].process.send_signal(signal.SIGINT)
+    ended = {name: live.end() for name, live in lives.items()}
+    assert ended["observer"].status == 130
+    assert load_results(evedrop.folder / "results").summary["ended"] == "interrupted"
+    others = {name: done for name, done in ended.items() if name != "observer"}
+    assert {name: (done.status, done.err) for name, done in others.items()} == {
+        name: (3, f"evedrop: {name}: the observer gave the run up: interrupted\n") for name in others
+    }
+
+
+def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
+    """A router that nobody starts: each names where it should be, exit 3; the observer leaves no results."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    briefs = written(evedrop, "--listen", endpoint, "--wait", "1")
+    for name in ("sensor", "observer"):
+        told(
+            begun(evedrop, name, briefs[name]).end(),
+            3,
+            f"no router answered at {endpoint} within 1 s",
+            "start it there",
+        )
+    assert list((evedrop.folder / "results").iterdir()) == []
+
+
+def test_the_results_are_where_the_observer_is_told(evedrop: Evedrop) -> None:
+    """Relative to where it is started; --out has the last word; a folder with something in it is refused."""
+    briefs = written(evedrop, "--listen", "tcp/127.0.0.1:7447", "--wait", "1", "--results", "there/results")
+    (evedrop.folder / "host").mkdir()
+    assert begun(evedrop, "observer", "../briefs/observer.json", cwd=evedrop.folder / "host").end().status == 3
+    assert (evedrop.folder / "host" / "there" / "results").is_dir()
+    (evedrop.folder / "full").mkdir()
+    (evedrop.folder / "full" / "old").touch()
+    told(begun(evedrop, "observer", briefs["observer"], "--out", "full").end(), 2, "full is not empty")
+
+
+@pytest.mark.parametrize(
+    ("listen", "connect", "said"),
+    [
+        (
+            "tcp/0.0.0.0:7447",
+            "tcp/router.lan:7447",
+            r"in clear, and others.*give tls/0\.0\.0\.0:7447, or add --insecure",
+        ),
+        ("tcp/router.lan:7447", None, "is in clear"),
+        ("tcp/[::]:7447", "tcp/10.0.0.7:7447", "is in clear"),
+        ("tls/0.0.0.0:7447", None, r"none to connect to; add --connect tls/HOST:7447"),
+        ("tls/router.lan:7447", "tls/0.0.0.0:7447", "--connect tls/0.0.0.0:7447 is every address"),
+        ("tls/0.0.0.0:7447", "tcp/router.lan:7447", "is not what --listen tls/0.0.0.0:7447 speaks"),
+        ("tls/[::]:7447", "tls/[fe80::1]:7447", "give the host's name"),
+        ("7447", None, "--listen 7447 is no endpoint; give one such as tls/router.lan:7447"),
+        ("tls/router.lan", None, "is no endpoint"),
+        ("tls/router.lan:0", None, "names no port"),
+        ("tls/router..lan:7447", None, "names no host"),
+        ("tls/[12]:7447", None, "names no address"),
+        ("quic/router.lan:7447", None, "is no endpoint"),
+        ("tls/0.0.0.0:7447", "router.lan", "--connect router.lan is no endpoint"),
+    ],
+)
+def test_what_is_no_place_to_meet_is_refused(listen: str, connect: str | None, said: str) -> None:
+    """Each with the option and what to give instead."""
+    with pytest.raises(UsageError, match=said) as caught:
+        meeting_at(listen, connect)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("listen", "connect", "names"),
+    [
+        ("tls/0.0.0.0:7447", "tls/router.lan:7447", ("router.lan",)),
+        ("tls/10.0.0.7:7447", None, ("10.0.0.7",)),
+        ("tls/10.0.0.7:7447", "tls/router.lan:80", ("router.lan", "10.0.0.7")),
+        ("tcp/127.0.0.9:7447", None, ("127.0.0.9",)),
+        ("tcp/[::1]:7447", "tcp/tunnel.lan:7447", ("tunnel.lan", "::1")),
+    ],
+)
+def test_a_router_is_known_by_its_names(listen: str, connect: str | None, names: tuple[str, ...]) -> None:
+    """What is connected to, then what is listened on; in clear on loopback alone, unless the user says otherwise."""
+    found = meeting_at(listen, connect)
+    assert found.names == names
+    assert (str(found.listen), str(found.connect)) == (listen, connect or listen)
+    assert found.secure == listen.startswith("tls/")
+    assert isinstance(meeting_at("tcp/0.0.0.0:7447", "tcp/a:7447", insecure=True), Meeting)

@@ -1,0 +1,268 @@
+"""Lost connections and killed routers: the run recovers to the bits of an undisturbed one, and says who was cut off."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emulator.runs.ports import free_port
+from emulator.scenario import Scenario, load
+from tests.by_hand import as_if_undisturbed, by_hand
+from tests.conftest import Evedrop, wait_until
+from tests.proxy import Cable, cable
+
+SCENARIO = """
+title = "Disturbed"
+slots = {slots}
+seed = 20
+trials = {trials}
+pace = {pace}
+longest_outage = {longest_outage}
+[process]
+A = [[1.0, 0.1], [0.0, 0.98]]
+Q = [[0.01, 0.0], [0.0, 0.01]]
+initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
+[encoding]
+{encoding}
+[legitimate]
+window = 3
+{more_of_legitimate}
+link = {{ quality = 0.8, delay = {{ model = "normal", mean = 1.0, deviation = 1.0 }}, duplicate = 0.1, corrupt = 0.02 }}
+[eavesdroppers.smart]
+strategy = "{strategy}"
+link = {{ loss = {{ model = "gilbert-elliott", p = 0.05, r = 0.3 }} }}
+{more}
+"""
+INNOVATION = 'scheme = "innovation"\nstate_probability = 0.5'
+ACKNOWLEDGED = """
+[acknowledgements]
+link = { quality = 0.8 }
+attack = "critical"
+jammer = "smart"
+"""
+LOOP = """
+[plant]
+inputs = ["heater"]
+input_matrix = [[0.1], [0.0]]
+input_lower = [-2.0]
+input_upper = [2.0]
+noise = [[1e-4, 0.0], [0.0, 1e-4]]
+[controller]
+strategy = "lqr"
+state_weights = [1.0, 1.0]
+input_weights = [0.1]
+{}
+"""
+CHANGING = """
+[[event]]
+at = 300
+link = "smart"
+set = { loss = { model = "bernoulli", quality = 0.6 } }
+[[event]]
+from = 500
+to = 900
+kill = "smart"
+state = "last"
+"""
+
+
+def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
+    """A scenario with losses in bursts, delays and second copies, and its file."""
+    entries = {
+        "slots": 1200, "trials": 3, "pace": 0.0, "longest_outage": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
+        "more_of_legitimate": "", **given,
+    }  # fmt: skip
+    path = folder / "disturbed.toml"
+    path.write_text(SCENARIO.format(**entries))
+    return path, load(path)
+
+
+RUNS: dict[str, dict[str, Any]] = {
+    "as fast as it goes": {"slots": 5000, "trials": 20},
+    "silent and acknowledged": {
+        "slots": 1500, "trials": 20, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED,
+    },
+    "coded and acknowledged": {
+        "slots": 1500, "trials": 20, "encoding": 'scheme = "acknowledged"', "strategy": "reference", "more": ACKNOWLEDGED,
+    },
+    "in a loop that is told its inputs": {"slots": 3000, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true"},
+    "in a loop over the truth": {"slots": 3000, "more": LOOP.format('period = 7\nacts_on = "truth"')},
+    "paced, with events": {"slots": 2000, "pace": 0.002, "more": CHANGING},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", RUNS)
+def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp_path: Path) -> None:
+    """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
+    path, scenario = scenario_in(tmp_path, **RUNS[what])
+    live = evedrop.live(str(path), "--json")
+    found: list[int] = []
+    for _ in range(2):
+        live.running(more_than=max(live.done(), 100))
+        found.append(live.child("router"))
+        live.kill("router")
+        wait_until(lambda: live.children().get("router") not in {None, *found}, "another router")
+    done = live.end(120)
+    assert done.status == 0, done.err
+    live.nothing_left()
+    as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
+    outages = done.summary["outages"]
+    assert [one["process"] for one in outages] == ["router"] * 2
+    assert all(one["seconds"] > 0.0 and 0 < one["slot"] <= one["until"] for one in outages)
+
+
+@pytest.mark.parametrize("name", ["router", "relay"])
+def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
+    """With a closed loop over both of them: digests and links are those in memory, and the one that was killed is named."""
+    more = LOOP.format("period = 2") + "[network]\nrouters = 2"
+    path, scenario = scenario_in(tmp_path, slots=3000, more=more, more_of_legitimate="knows_input = true")
+    live = evedrop.live(str(path), "--json")
+    live.running(more_than=300)
+    before = live.child(name)
+    live.kill(name)
+    wait_until(lambda: live.children().get(name) not in {None, before}, f"another {name}")
+    done = live.end(120)
+    assert done.status == 0, done.err
+    live.nothing_left()
+    as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
+    assert [one["process"] for one in done.summary["outages"]] == [name]
+
+
+def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path: Path) -> None:
+    """A router that is started while the run is paused knows the changes that were made; the folder gives the same again."""
+    path, _ = scenario_in(tmp_path, slots=3000, pace=0.002, more=CHANGING)
+    live = evedrop.live(str(path), "--json")
+    live.running(more_than=100)
+    folder = str(live.folder)
+    assert evedrop("link", folder, "legitimate", "quality=0.4").status == 0
+    assert evedrop("pause", folder).status == 0
+    assert evedrop("link", folder, "smart", "cut").status == 0
+    before = live.child("router")
+    live.kill("router")
+    wait_until(lambda: live.children().get("router") not in {None, before}, "another router")
+    wait_until(lambda: evedrop("resume", folder).status == 0, "a router that lets an operator in")
+    live.running(more_than=max(live.done(), 1000))
+    assert evedrop("link", folder, "smart", "heal").status == 0
+    done = live.end(60)
+    assert done.status == 0, done.err
+    assert [one["process"] for one in done.summary["outages"]] == ["router"]
+    as_if_undisturbed(done.summary, load(live.folder / "scenario.toml"), tmp_path / "memory")
+
+
+def test_a_router_that_dies_too_often_is_named(evedrop: Evedrop, tmp_path: Path) -> None:
+    """The fourth time it is not started again: the run ends with status 3, with what was measured, and nothing is left."""
+    path, _ = scenario_in(tmp_path, slots=1_000_000)
+    live = evedrop.live(str(path))
+    found: set[int | None] = {None}
+    for _ in range(4):
+        live.running(more_than=live.done())
+        wait_until(lambda: live.children().get("router") not in found, "another router")
+        found.add(live.child("router"))
+        live.kill("router")
+    done = live.end()
+    assert done.status == 3
+    assert "router was ended by signal 9" in done.err
+    live.nothing_left()
+    assert live.results.slots.num_rows > 0
+
+
+def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
+    """Of processes that were started by hand each gives up by itself, says why, and ends with status 3."""
+    _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)
+    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        run.running()
+        run.kill("router")
+        statuses = run.statuses()
+        assert statuses.pop("router") == -9
+        assert set(statuses.values()) == {3}
+        assert "router cut off from the network for 2 s" in run.log("observer").read_text()
+        assert "smart has had no connection with the router at tcp/127.0.0.1" in run.log("smart").read_text()
+        assert run.summary["slots"] > 0
+        outage = run.summary["outages"][-1]
+        assert (outage["process"], outage["until"]) == ("router", None)
+
+
+def test_a_router_that_is_started_again_by_hand(tmp_path: Path) -> None:
+    """The same command once more, some seconds later, and the run goes on; all end with status 0."""
+    _, scenario = scenario_in(tmp_path, slots=2000, pace=0.001)
+    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        run.running()
+        run.kill("router")
+        time.sleep(3.0)  # how long it is away is what is tested
+        run.start("router")
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        (outage,) = run.summary["outages"]
+        assert outage["process"] == "router"
+        assert outage["seconds"] > 3.0
+
+
+@pytest.mark.parametrize("how", ["closed", "silent"])
+@pytest.mark.parametrize("name", ["sensor", "legitimate", "observer"])
+def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: Path) -> None:
+    """Closed for two seconds, or without a word for longer than its lease: who was cut off is listed, and all is as ever."""
+    given = {"encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED}
+    _, scenario = scenario_in(tmp_path, slots=800, pace=0.002, **given)
+    port = free_port()
+    with ExitStack() as stack:
+        wire: Cable = stack.enter_context(cable(port))
+        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
+        run.write(**{name: wire.endpoint})
+        run.start()
+        run.running(more_than=100)
+        assert wire.connections
+        if how == "closed":
+            wire.cut()
+            time.sleep(2.0)  # how long it is cut off is what is tested
+        else:
+            wire.silence()
+            time.sleep(7.0)  # the same
+        wire.heal()
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert [one["process"] for one in run.summary["outages"]] == [name]
+
+
+@pytest.mark.parametrize("name", ["controller", "legitimate"])
+def test_a_loop_is_taken_up_where_it_was_cut(name: str, tmp_path: Path) -> None:
+    """Estimates and inputs that were lost on the way are said once more: nobody waits for ever, and no input changes."""
+    _, scenario = scenario_in(
+        tmp_path, slots=800, pace=0.002, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true"
+    )
+    port = free_port()
+    with ExitStack() as stack:
+        wire: Cable = stack.enter_context(cable(port))
+        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
+        run.write(**{name: wire.endpoint})
+        run.start()
+        run.running(more_than=100)
+        wire.cut()
+        time.sleep(1.0)  # how long it is cut off is what is tested
+        wire.heal()
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert [one["process"] for one in run.summary["outages"]] == [name]
+
+
+def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
+    """Longer than the scenario lets it: the observer names it, and it ends by itself."""
+    _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)
+    port = free_port()
+    with ExitStack() as stack:
+        wire: Cable = stack.enter_context(cable(port))
+        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
+        run.write(smart=wire.endpoint)
+        run.start()
+        run.running()
+        wire.cut()
+        for process in ("smart", "observer"):
+            wait_until(lambda process=process: run.processes[process].poll() == 3, f"the end of {process}")
+        assert "smart cut off from the network for 2 s" in run.log("observer").read_text()
