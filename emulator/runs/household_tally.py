@@ -63,7 +63,7 @@ class HouseholdTally:
         for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
             other[row] = self._perfect.follow(state, inputs)[self._grid]
             grid[row] = self._plant.limited(inputs)[self._grid]
-        self.meter = self.meter.with_more(Meter.over(grid, other))
+        self.meter = self.meter.then(grid, other)
         for row in range(-self.done % self._period, len(x), self._period):
             for name, guess in self._guesses.items():
                 load = guess.take(self.done + row, estimates[name][row])
