@@ -4,16 +4,20 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-long lint setup clean
+.PHONY: demo test test-long test-hosts lint setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long and not hosts"
 
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long
+
+# Every process in a network namespace of its own: needs root, ip and tcpdump.
+test-hosts: $(READY)
+	$(BIN)/python -m pytest -m hosts tests/hosts
 
 lint: $(READY)
 	$(BIN)/ruff check .

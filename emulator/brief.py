@@ -26,14 +26,15 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller", "zid"),
+    "relay": ("users", "receivers", "listen", "zid", "controller"),
     "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart", "plant", "controller"),
     "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
     "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
     "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity", "shard"),
 }
-ROLES = ("router", "sensor", "legitimate", "eavesdropper", "controller", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
-    for role in ("router", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
+    for role in ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
         of_role = (_role(role), _observed) if role == "observer" else (_role(role),)
         add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser
@@ -255,6 +255,7 @@ def _output(parser: argparse.ArgumentParser) -> None:
 def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
     parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint: tcp or tls, /127.0.0.1:PORT")
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's, of a scenario with two")
 
 
 def _finished_view(parser: argparse.ArgumentParser) -> None:
@@ -346,6 +347,10 @@ def _briefs(parser: argparse.ArgumentParser) -> None:
         help="where the router listens, such as tls/router.lan:7447",
     )
     parser.add_argument("--connect", metavar="ENDPOINT", help="what the others connect to; default as --listen says")
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, of a scenario with two")
+    parser.add_argument(
+        "--relay-connect", metavar="ENDPOINT", help="what those at it connect to; default as --relay says"
+    )
     parser.add_argument(
         "--wait", type=int, default=600, metavar="SECONDS", help="how long everybody waits for the others; default 600"
     )

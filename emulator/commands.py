@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     folder = options.out or default_folder(options.scenario)
     with ProgressLine(scenario.slots, "slots", options.json) as line:
         try:
-            ended = launch(scenario, folder, options.view, options.listen, line.tell)
+            ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
         except (RunError, Interrupted):
             with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
                 _print_results(folder, options.json)
@@ -400,12 +400,13 @@ def fit_link(options: argparse.Namespace) -> int:
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
-    from emulator.runs.ports import meeting_at
+    from emulator.runs.ports import places_at
 
     if not 1 <= options.wait <= 30 * 86_400:
         raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
-    meeting = meeting_at(options.listen, options.connect, options.insecure)
-    for path in write_briefs(_loaded(options), meeting, options.results, options.out, options.wait):
+    scenario = _loaded(options)
+    places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
+    for path in write_briefs(scenario, places, options.results, options.out, options.wait):
         print(path)
     return 0
 
@@ -438,6 +439,8 @@ def _play(brief: Brief) -> int:
     match brief.role:
         case "router":
             from emulator.network.router import route as play
+        case "relay":
+            from emulator.network.relay import relay as play
         case "sensor":
             from peers.sensor import sense as play
         case "legitimate":

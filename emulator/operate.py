@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.errors import UsageError
+from emulator.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
     from emulator.control import Control
@@ -78,6 +78,13 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
     from emulator.network.operator import ask
 
     began = time.monotonic()
+    if control.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        try:
+            check_identity(control.identity, control.user)
+        except BriefError as error:
+            raise UsageError(f"{run / 'control.json'}: {error}") from error
     try:
         found = ask(control, request, patience)
     except zenoh.ZError as error:

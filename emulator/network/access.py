@@ -7,7 +7,7 @@ Source: docs/protocol.md, keys.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,8 @@ OPERATOR = "operator"
 CONTROLLER = "controller"
 ACKNOWLEDGEMENTS = "acknowledgements"
 """No process: the name of their way back, whose random stream is `link/acknowledgements`."""
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
+RELAY = "relay"
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
 
 
 @dataclass(frozen=True)
@@ -88,11 +89,20 @@ class Keys:
 
 
 def reader_of(key: str) -> str:
-    """The process that reads a key: all of them have one reader."""
+    """The process that reads a key; of inputs, which the legitimate estimator may read too, the one that always does."""
     kind, _, name = key.split("/", 2)[2].partition("/")
     if kind == "ack":
         return ROUTER if name == "sent" else SENSOR
-    return {"uplink": ROUTER, "journal": OBSERVER, "telemetry": OBSERVER, "progress": SENSOR}.get(kind, name)
+    readers = {
+        "uplink": ROUTER,
+        "journal": OBSERVER,
+        "telemetry": OBSERVER,
+        "progress": SENSOR,
+        "estimate": CONTROLLER,
+        "state": CONTROLLER,
+        "input": SENSOR,
+    }
+    return readers.get(kind, name)
 
 
 @dataclass(frozen=True)
@@ -108,6 +118,10 @@ class Grant:
     answers: tuple[str, ...] = ()
     """Keys at which it may be asked."""
     asks: tuple[str, ...] = ()
+    further_tokens: tuple[str, ...] = ()
+    """Of those on whose behalf it speaks."""
+    zid: str | None = None
+    """Its Zenoh id, of who has no user: the router, which does not ask to be let in."""
 
 
 @dataclass(frozen=True)
@@ -119,19 +133,28 @@ class Wiring:
     knows_input: bool
     """Whether the legitimate estimator is told the inputs."""
 
+    @classmethod
+    def of(cls, part: Mapping[str, Any] | None) -> Wiring | None:
+        """As a brief tells it; None without a controller."""
+        return None if part is None else cls(**part)
+
     @property
     def on_truth(self) -> bool:
         """Whether the controller is told the true state."""
         return self.acts_on == "truth"
 
 
-def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None) -> list[Grant]:
-    """The table of docs/protocol.md for a run, with a controller if there is a loop; the router itself needs no grant."""
+def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, relayed: bool = False) -> list[Grant]:
+    """The table of docs/protocol.md for a run, with a controller if there is a loop; router and relay need no grant.
+
+    relayed: whether there is a relay, which the observer watches and tells the end.
+    """
     keys = Keys(run)
     followers = (*receivers, OBSERVER)
     processes = (SENSOR, *receivers) if loop is None else (SENSOR, *receivers, CONTROLLER)
     state = (keys.state,) if loop is not None and loop.on_truth else ()
     estimate = (keys.estimate,) if loop is not None and not loop.on_truth else ()
+    routers = (ROUTER, RELAY) if relayed else (ROUTER,)
     table = [
         Grant(
             SENSOR,
@@ -146,10 +169,10 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None) -> 
         ),
         Grant(
             OBSERVER,
-            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, ROUTER))),
+            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, *routers))),
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
             token=keys.alive(OBSERVER),
-            watches=tuple(keys.alive(name) for name in (*processes, ROUTER)),
+            watches=tuple(keys.alive(name) for name in (*processes, *routers)),
             answers=(keys.control(OBSERVER),),
         ),
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
@@ -190,16 +213,14 @@ def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [
-            {
-                "id": grant.process,
-                "usernames": [grant.process],
-                **({"cert_common_names": [grant.process]} if certified else {}),
-            }
-            for grant in table
-        ],
+        "subjects": [_subject(grant, certified) for grant in table],
         "policies": [{"subjects": [grant.process], "rules": [rule["id"] for rule in _rules(grant)]} for grant in table],
     }
+
+
+def _subject(grant: Grant, certified: bool) -> dict[str, Any]:
+    shown = {"usernames": [grant.process]} if grant.zid is None else {"zids": [grant.zid]}
+    return {"id": grant.process, **shown, **({"cert_common_names": [grant.process]} if certified else {})}
 
 
 def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
@@ -209,7 +230,7 @@ def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
         ("reader", "egress", "declare_subscriber", grant.writes),
         ("subscribe", "ingress", "declare_subscriber", grant.reads),
         ("read", "egress", "put", grant.reads),
-        ("token", "ingress", "liveliness_token", () if grant.token is None else (grant.token,)),
+        ("token", "ingress", "liveliness_token", (*grant.further_tokens, *filter(None, [grant.token]))),
         ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),
         ("watched", "egress", "liveliness_token", grant.watches),
         ("offer", "ingress", "declare_queryable", grant.answers),

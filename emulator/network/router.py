@@ -11,13 +11,8 @@ routes them once more, to the same fates, as a router does that was started anew
 
 from __future__ import annotations
 
-import os
-import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
@@ -32,6 +27,8 @@ from emulator.model.receiver import Flags
 from emulator.model.transit import Late, Transit
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
 from emulator.network.commands import Anew, Commands
+from emulator.network.doorkeeping import until_all_left, users_file
+from emulator.network.linked import at_router
 from emulator.network.postman import Postman
 from emulator.network.resending import Due
 from emulator.network.session import Session, router_config
@@ -50,8 +47,6 @@ from emulator.network.wire import (
     read_beside,
     read_uplink,
 )
-
-_FAREWELL_SECONDS = 10.0
 
 
 class Downlink:
@@ -213,16 +208,12 @@ class WayBackLink:
 
 def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
-    wiring = brief.part["controller"]
-    table = grants(brief.run, tuple(brief.part["links"]), None if wiring is None else Wiring(**wiring))
-    with _opened(brief, access_control(table, brief.identity is not None)) as session:
-        present = {grant.process: False for grant in table if grant.token is not None}
-        for name in present:
-            session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+    table = grants(brief.run, tuple(brief.part["links"]), Wiring.of(brief.part["controller"]))
+    let_in = table if brief.part["zid"] is None else at_router(brief.run, table)
+    with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
+        present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
-        deadline = time.monotonic() + _FAREWELL_SECONDS
-        while any(present.values()) and time.monotonic() < deadline:
-            time.sleep(0.005)
+        until_all_left(present, session.linked)
 
 
 class Routing:
@@ -382,18 +373,5 @@ def _change(found: Reader) -> Change:
 
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:
-    with _users_file(brief.part["users"]) as users:
-        return Session(brief, router_config(brief, str(users), access))
-
-
-@contextmanager
-def _users_file(users: Mapping[str, str]) -> Iterator[Path]:
-    """The dictionary of users and passwords that Zenoh reads once, when the session opens; then it must not stay."""
-    handle, name = tempfile.mkstemp(prefix="evedrop-users-")
-    path = Path(name)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.writelines(f"{user}:{password}\n" for user, password in users.items())
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
+    with users_file(brief.part["users"]) as users:
+        return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

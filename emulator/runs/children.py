@@ -18,7 +18,7 @@ from typing import Any
 
 from emulator.brief import Brief
 from emulator.errors import RunError
-from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
 
 News = Mapping[str, Any]
@@ -126,8 +126,8 @@ class Children:
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUNBUFFERED": "1",
         }
-        if brief.role == "router":
-            environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
+        if brief.role in {"router", "relay"}:
+            environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
             with (self._logs / f"{brief.process}.log").open("ab" if again else "wb") as log:
@@ -157,12 +157,12 @@ class Children:
             self._news.put(Exit(name, status))
 
     def restart_router(self, ended: Exit) -> bool:
-        """Start the router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process != ROUTER or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        """Start a router again if a signal ended it, a few times at most; whether it was started."""
+        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
-        self._killed.add(self._processes[ROUTER].pid)
-        self.start(self._briefs[ROUTER], again=True)
+        self._killed.add(self._processes[ended.process].pid)
+        self.start(self._briefs[ended.process], again=True)
         return True
 
     def act(self, request: News) -> None:

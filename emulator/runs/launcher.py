@@ -19,7 +19,7 @@ from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import Children, Exit, News
 from emulator.runs.folder import new_folder
-from emulator.runs.ports import loopback_meeting
+from emulator.runs.ports import Places, loopback_places
 from emulator.runs.private import private_folder
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
@@ -38,8 +38,17 @@ class Ended:
     viewer: Viewer | None
 
 
-def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell: Callable[[News], None]) -> Ended:
+def launch(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Callable[[News], None],
+    relay: str | None = None,
+) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
+
+    listen, relay: the endpoints of router and, if there is one, relay; free ports by default.
 
     Raises UsageError before anything is started, RunError when the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases what was measured is in the folder and no process is left.
@@ -47,29 +56,38 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
     view = choose(view)
     with stop_on_signals() as stop:
         if scenario.shards == 1:
-            return launch_one(scenario, folder, view, listen, tell, stop)
+            return launch_one(scenario, folder, view, loopback_places(listen, relay, scenario.relayed), tell, stop)
         from emulator.runs.shards import launch_shards  # noqa: PLC0415 - it launches each of them by the function below
 
-        return launch_shards(scenario, folder, view, listen, tell, stop)
+        given = {"--listen": listen, "--relay": relay}
+        for option, endpoint in given.items():
+            if endpoint is not None:
+                raise UsageError(
+                    f"{option} {endpoint} is one router's endpoint, and each of the {scenario.shards} shards has its own; "
+                    "leave it out, or give --set shards=1"
+                )
+        return launch_shards(scenario, folder, view, tell, stop)
 
 
 def launch_one(
     scenario: Scenario,
     folder: Path,
     view: str,
-    listen: str | None,
+    places: Places,
     tell: Callable[[News], None],
     stop: threading.Event,
     shard: bool = False,
 ) -> Ended:
-    """Run a scenario as `launch` does, on one router, until `stop` is set; shard: whether others carry further trials."""
-    meeting = loopback_meeting(listen)
+    """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
+
+    shard: whether others carry further trials.
+    """
     with private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, meeting, Observation(folder.absolute(), view != "off", None, shard))
+            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None, shard))
             observer = briefs.pop(OBSERVER)
             with Children(folder / "logs", private, scenario.controller is not None) as children:
                 for brief in briefs.values():

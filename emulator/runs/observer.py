@@ -62,11 +62,11 @@ def observe(brief: Brief) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     by_hand = not brief.ends_with_stdin
-    if brief.ends_with_stdin:
+    if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
-    observation = Observation(brief, scenario, confirmations)
+    observation = Observation(brief, scenario, confirmations, by_hand)
     if by_hand:
         # Before there is anything in it: what a brief that does not fit leaves behind would be in the next one's way.
         new_folder(observation.folder)
@@ -114,9 +114,13 @@ def tell(event: str, **news: Any) -> None:
 class Observation:
     """One run as the observer sees it. Final."""
 
-    def __init__(self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes]) -> None:
+    def __init__(
+        self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
+    ) -> None:
+        """by_hand: whether nobody has launched the others who would end them."""
         self.folder = Path(brief.part["results"])
         self._brief = brief
+        self._by_hand = by_hand
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
@@ -147,7 +151,7 @@ class Observation:
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
         with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
-            conductor = Conductor(session, self._scenario.digested, stop, self._beat)
+            conductor = Conductor(session, self._scenario.digested, stop, self._beat, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
@@ -170,8 +174,10 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
-            except RunError:
-                self._suspects = conductor.missing
+            except (RunError, Interrupted) as error:
+                self._suspects = conductor.missing if isinstance(error, RunError) else []
+                if self._by_hand:  # a launcher ends them itself
+                    conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
             finally:
                 self._dismiss(conductor)

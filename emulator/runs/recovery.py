@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from emulator.brief import Flow
-from emulator.network.access import OBSERVER, ROUTER
+from emulator.network.access import OBSERVER, RELAY, ROUTER
 from emulator.runs.conductor import Conductor
 from emulator.runs.steering import Steering
 
@@ -110,15 +110,19 @@ class Recovery:
         ]
         if gone:
             # Without the router nobody else can be seen either.
-            gone = [ROUTER] if ROUTER in gone else gone
+            gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
             self.give_up(done)
             self._conductor.despair(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
         found = self._missing
-        if ROUTER in found:
-            # All vanish with the router, and with our own connection to it.
-            found = {ROUTER if self._conductor.router_changed() else OBSERVER: found[ROUTER]}
+        # All vanish with the router that we are connected to, and with our own connection to it. Behind a relay, the sensor
+        # vanishes with the router, and both with the link between them.
+        own = RELAY if self._conductor.relayed else ROUTER
+        if own in found:
+            found = {own if self._conductor.router_changed() else OBSERVER: found[own]}
+        elif ROUTER in found:
+            found = {ROUTER: found[ROUTER]}
         for name, beginning in found.items():
             self._back.setdefault(name, beginning)
         self._missing = {}
@@ -145,8 +149,7 @@ class Recovery:
         now = time.monotonic()
         self._close(done, now)
         found = self._missing
-        if ROUTER in found:
-            found = {ROUTER: found[ROUTER]}
+        found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
         self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
 

@@ -21,7 +21,7 @@ from emulator.errors import Interrupted, RunError, UsageError
 from emulator.runs.children import News
 from emulator.runs.folder import new_folder
 from emulator.runs.launcher import Ended, launch_one
-from emulator.runs.ports import free_port
+from emulator.runs.ports import Places, loopback_places
 from emulator.runs.viewer import Viewer
 from emulator.scenario import Scenario
 
@@ -132,8 +132,10 @@ class _Course:
     """In the order of time."""
     viewer: Viewer | None = None
 
-    def launched(self, shard: Shard, at: str, tell: Callable[[News], None], view: str, stop: threading.Event) -> None:
-        """Launch one, its router at an endpoint, to its end; whatever ends it early ends all."""
+    def launched(
+        self, shard: Shard, at: Places, tell: Callable[[News], None], view: str, stop: threading.Event
+    ) -> None:
+        """Launch one, its routers at places, to its end; whatever ends it early ends all."""
         try:
             ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, shard=True)
         except BaseException as error:
@@ -153,7 +155,6 @@ def launch_shards(
     scenario: Scenario,
     folder: Path,
     view: str,
-    listen: str | None,
     tell: Callable[[News], None],
     stop: threading.Event,
 ) -> Ended:
@@ -161,16 +162,11 @@ def launch_shards(
 
     The view is of the first shard, which has the recorded trials.
     """
-    if listen is not None:
-        raise UsageError(
-            f"--listen {listen} is one router's endpoint, and each of the {scenario.shards} shards has a router; leave it "
-            "out, or give --set shards=1"
-        )
-    endpoints = _endpoints(scenario.shards)
+    places = _places(scenario)
     new_folder(folder)
     shards = shards_of(scenario, folder)
     progress, course = OneProgress(shards, tell), _Course()
-    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
+    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, places, strict=True)]
     threads = [threading.Thread(target=course.launched, args=(*one, "off", stop)) for one in others]
     for thread in threads:
         thread.start()
@@ -186,12 +182,17 @@ def launch_shards(
         raise
 
 
-def _endpoints(count: int) -> list[str]:
-    """So many endpoints on loopback; of ports that are found one by one, two might be the same while nobody listens yet."""
-    ports = set[int]()
-    while len(ports) < count:
-        ports.add(free_port())
-    return [f"tcp/127.0.0.1:{port}" for port in ports]
+def _places(scenario: Scenario) -> list[Places]:
+    """Places for all shards; of ports that are found one by one, two might be the same while nobody listens yet."""
+    found: list[Places] = []
+    taken = set[int]()
+    while len(found) < scenario.shards:
+        places = loopback_places(None, None, scenario.relayed)
+        ports = {meeting.listen.port for meeting in (places.router, places.relay) if meeting is not None}
+        if not ports & taken:
+            found.append(places)
+            taken |= ports
+    return found
 
 
 def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course: _Course, started: float | None) -> int:

@@ -200,6 +200,12 @@ class AcknowledgementsTable(Table):
         return []
 
 
+class NetworkTable(Table):
+    """`[network]`: how the processes of a live run are connected; the trials are the same."""
+
+    routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
+
+
 class Scenario(Table):
     """One scenario, checked."""
 
@@ -228,6 +234,7 @@ class Scenario(Table):
         HouseholdTable | None, Field(examples=[{"grid": "P_grid", "load": "P_load", "battery": "SOC"}])
     ] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
+    network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
     )
@@ -246,6 +253,11 @@ class Scenario(Table):
             return [("modules", f'is "{folder}", which is no folder; expected the one that the modules are in')]
         look_in(str(Path(folder).absolute()))
         return [("modules", what) for what in elsewhere(folder, table)]
+
+    @property
+    def relayed(self) -> bool:
+        """Whether there are two routers, of which the second is a relay."""
+        return self.network is not None and self.network.routers > 1
 
     @property
     def receivers(self) -> tuple[str, ...]:

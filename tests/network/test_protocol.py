@@ -208,6 +208,8 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
             found[name] = message.integer(name)
     if message.has("links"):
         found["links"] = dict(message.map("links"))
+    if message.has("why"):
+        found["why"] = message.text("why")
     if message.has("absent"):
         found["absent"] = list(message.names("absent"))
     if message.has("until"):
