@@ -32,8 +32,9 @@ HOUSE: dict[str, Any] = {
     "controller__period": 10,
     "household__window_seconds": 10.0,
     "eavesdroppers__bayesian__strategy": "smart",
+    "event": [{"from": 90, "to": 170, "kill": "smart", "state": "last"}, {"from": 100, "to": 140, "cut": "legitimate"}],
 }
-"""Of a house whose sensor filters."""
+"""Of a house whose sensor filters, whose controller is cut off for a while, and one of whose eavesdroppers is restarted."""
 
 Ran = Callable[[int], Results]
 
@@ -112,6 +113,29 @@ def test_a_loop_with_a_solver_is_made_one(tmp_path: Path) -> None:
     memory = montecarlo(scenario, out=tmp_path / "memory", trials=2).summary
     assert sharded["controller"]["digest"] == memory["controller"]["digest"] is not None
     assert sharded["household"] == memory["household"]
+
+
+@pytest.mark.parametrize(("name", "trials"), [("controller", {2, 3, 5}), ("observer", {2})])
+def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str, trials: set[int]) -> None:
+    """Inputs, and the figures of controller and house, as far as each shard came; nothing of one without its observer."""
+    words = ("--trials", "5", "--set", "shards=2", "--set", "expect=[]", "--set", f"record_trials={RECORDED}")
+    live = evedrop.live("microgrid", *words)
+    live.running(more_than=500)
+    os.kill(child(live, 2, name), signal.SIGKILL)
+    done = live.end()
+    assert done.status == 3
+    assert f"shard 2 (trials 2 to 4): {name} was ended by signal 9" in done.err
+    live.nothing_left()
+    assert not (live.folder / "shards").exists()
+    assert set(live.results.slots["trials"].to_pylist()) <= trials
+    assert live.results.inputs is not None
+    recorded = set(live.results.inputs["trial"].to_pylist())
+    assert recorded == set(range(min(RECORDED, max(trials))))
+    assert live.results.inputs.num_rows == live.results.trials.num_rows / len(load("microgrid").receivers)
+    summary = live.results.summary
+    assert summary["controller"]["digest"] is None
+    assert summary["controller"]["decisions"] > 0
+    assert summary["household"]["bought_energy"] > 0.0
 
 
 def test_a_killed_router_of_a_shard_is_started_again(evedrop: Evedrop, tmp_path: Path) -> None:
