@@ -138,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
     add("compare", commands.compare, "every scheme against every adversary", _scenario, _entries, _output, _compares)
     add("design", commands.design, "admissible μ_d, secrecy, optimum, per eavesdropper", _scenario, _set, _designs)
     add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
-    add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view)
+    add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view, _served)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
     add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
     add("check", commands.check, "validate scenarios, or classes of your own", _scenarios, _set, _classes)
@@ -148,8 +148,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
+    add("health", commands.health, "whether the process of a brief is on the network", _argument("brief", "BRIEF"))
     for role in ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
-        of_role = (_role(role), _observed) if role == "observer" else (_role(role),)
+        of_role = (_role(role), _observed, _served) if role == "observer" else (_role(role),)
         add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser
 
@@ -262,6 +263,12 @@ def _finished_view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it into a file instead; needs no screen")
     parser.add_argument("--slot", type=int, metavar="K", help="the moment to draw; default the last")
+
+
+def _served(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--serve", metavar="HOST:PORT", help="show it to browsers, at this address and port (and the next one)"
+    )
 
 
 def _memory(parser: argparse.ArgumentParser) -> None:

@@ -270,8 +270,9 @@ def figures(options: argparse.Namespace) -> int:
 
 def view(options: argparse.Namespace) -> int:
     """Open a finished run, or draw it."""
-    from emulator.runs.viewer import open_run
+    from emulator.runs.viewer import Stand, open_run
 
+    stand = None if options.serve is None else Stand.of(options.serve)
     recording = options.run / "recording.rrd"
     if recording.is_file() and not (options.run / "summary.json").is_file():
         raise UsageError(
@@ -282,7 +283,7 @@ def view(options: argparse.Namespace) -> int:
 
         recording = replay(options.run)
     if options.picture is None:
-        viewer = open_run(options.run, options.view)
+        viewer = open_run(options.run, options.view, stand)
         print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
         _hold(viewer)
         return 0
@@ -423,13 +424,13 @@ def process(options: argparse.Namespace) -> int:
     if brief.part.get("modules") is not None:
         look_in(str(brief.part["modules"]))
     try:
-        return _play(brief)
+        return _play(brief, getattr(options, "serve", None))
     except BriefError as error:
         raise BriefError(f"{options.brief}: {error}") from error
 
 
-def _play(brief: Brief) -> int:
-    """Be the process of a brief; the exit status."""
+def _play(brief: Brief, serve: str | None) -> int:
+    """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
     from emulator.model.registry import NotRegistered
 
     if brief.identity is not None:
@@ -452,7 +453,7 @@ def _play(brief: Brief) -> int:
         case "observer":
             from emulator.runs.observer import observe
 
-            return observe(brief)
+            return observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:
@@ -460,3 +461,14 @@ def _play(brief: Brief) -> int:
     except NotRegistered as error:
         raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
     return 0
+
+
+def health(options: argparse.Namespace) -> int:
+    """Say whether a process is there."""
+    from emulator.brief import read_brief
+    from emulator.network.health import is_there
+
+    brief = read_brief(options.brief)
+    there = is_there(brief)
+    print(f"{brief.process} is {'' if there else 'not '}on the network of {brief.run}")
+    return 0 if there else 1

@@ -186,11 +186,11 @@ def test_a_secret_file_replaces_the_seed_where_it_must(tmp_path: Path) -> None:
 def test_passwords_and_run_are_made_afresh() -> None:
     """Two runs of one scenario share no password, each process has its own, and the router alone knows all."""
     first, second = made(scenario_of()), made(scenario_of())
-    passwords = [brief.password for briefs in (first, second) for name, brief in briefs.items() if name != "router"]
-    assert len(set(passwords)) == len(passwords) == 12
+    passwords = [brief.password for briefs in (first, second) for brief in briefs.values()]
+    assert len(set(passwords)) == len(passwords) == 14
     assert min(map(len, passwords)) >= 32
     assert first["router"].run != second["router"].run
-    users = {n: b.password for n, b in first.items() if n != "router"}
+    users = {n: b.password for n, b in first.items()}
     assert first["router"].part["users"] == {**users, "operator": first["observer"].part["operator"]}
     assert first["observer"].part["operator"] not in passwords
 

@@ -118,6 +118,8 @@ class Grant:
     answers: tuple[str, ...] = ()
     """Keys at which it may be asked."""
     asks: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    """Liveliness tokens that it may ask for: its own, and so learns no more than that it is there."""
     further_tokens: tuple[str, ...] = ()
     """Of those on whose behalf it speaks."""
     zid: str | None = None
@@ -145,7 +147,7 @@ class Wiring:
 
 
 def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, relayed: bool = False) -> list[Grant]:
-    """The table of docs/protocol.md for a run, with a controller if there is a loop; router and relay need no grant.
+    """The table of docs/protocol.md for a run, with a controller if there is a loop; routers need none but to ask for themselves.
 
     relayed: whether there is a relay, which the observer watches and tells the end.
     """
@@ -166,16 +168,19 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
                 *(() if loop is None else (keys.input,)),
             ),
             token=keys.alive(SENSOR),
+            checks=(keys.alive(SENSOR),),
         ),
         Grant(
             OBSERVER,
             writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, *routers))),
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
             token=keys.alive(OBSERVER),
+            checks=(keys.alive(OBSERVER),),
             watches=tuple(keys.alive(name) for name in (*processes, *routers)),
             answers=(keys.control(OBSERVER),),
         ),
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
+        *(Grant(name, writes=(), reads=(), token=None, checks=(keys.alive(name),)) for name in routers),
     ]
     if loop is not None:
         table.append(
@@ -184,6 +189,7 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
                 writes=(keys.input, keys.telemetry(CONTROLLER)),
                 reads=(*estimate, *state, keys.control(CONTROLLER)),
                 token=keys.alive(CONTROLLER),
+                checks=(keys.alive(CONTROLLER),),
             )
         )
     for name in receivers:
@@ -198,6 +204,7 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
                 ),
                 reads=(keys.downlink(name), keys.control(name), *((keys.input,) if user and told else ())),
                 token=keys.alive(name),
+                checks=(keys.alive(name),),
             )
         )
     return table
@@ -231,6 +238,8 @@ def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
         ("subscribe", "ingress", "declare_subscriber", grant.reads),
         ("read", "egress", "put", grant.reads),
         ("token", "ingress", "liveliness_token", (*grant.further_tokens, *filter(None, [grant.token]))),
+        ("check", "ingress", "liveliness_query", grant.checks),
+        ("checked", "egress", "liveliness_token", grant.checks),
         ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),
         ("watched", "egress", "liveliness_token", grant.watches),
         ("offer", "ingress", "declare_queryable", grant.answers),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _FORM = re.compile(r"(tcp|tls)/(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_.-]+)):([0-9]{1,5})")
 _MOST_LABEL = 63
@@ -63,6 +63,13 @@ class Endpoint:
     def everywhere(self) -> bool:
         """Whether it is every address of a machine: to listen on, and not to connect to."""
         return self.address is not None and self.address.is_unspecified
+
+    @property
+    def nearby(self) -> Endpoint:
+        """Where whoever listens there is found from the same machine."""
+        if not self.everywhere:
+            return self
+        return replace(self, host="::1" if ":" in self.host else "127.0.0.1")
 
     def try_to_listen(self) -> None:
         """Raise OSError unless this host can listen there."""

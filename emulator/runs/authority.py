@@ -42,14 +42,13 @@ class Authority:
             .sign(self._key, hashes.SHA256())
         )
 
-    def identity(self, process: str, hosts: Sequence[str] = (), connects: bool = True) -> Identity:
+    def identity(self, process: str, hosts: Sequence[str] = ()) -> Identity:
         """A process's certificate and key.
 
         hosts: names and addresses at which it is a router; nobody else's certificate is taken for a router's.
-        connects: whether it connects to one.
         """
         key = ec.generate_private_key(ec.SECP256R1())
-        uses = [ExtendedKeyUsageOID.CLIENT_AUTH] * connects + [ExtendedKeyUsageOID.SERVER_AUTH] * bool(hosts)
+        uses = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * bool(hosts)
         made = (
             self._begun(_named(process), key.public_key())
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)

@@ -141,7 +141,9 @@ def briefs_of(
     places.check(scenario.relayed)
     keys = StreamKeys.of(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
-    users = {name: secrets.token_urlsafe(24) for name in (SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)}
+    users = {
+        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
+    }
     routers = Routers.of(users, places)
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)

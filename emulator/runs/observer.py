@@ -13,20 +13,18 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
-from emulator.network.access import CONTROLLER, LEGITIMATE, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Question, Session
@@ -40,8 +38,10 @@ from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
+from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
+from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -53,11 +53,13 @@ _BEAT_SECONDS = 1.0
 _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 
-def observe(brief: Brief) -> int:
+def observe(brief: Brief, serve: str | None = None) -> int:
     """Run the observer of a brief; the exit status of the run.
 
-    Raises UsageError, BriefError, RunError or Interrupted, of one started by hand, as long as nothing has begun.
+    serve: HOST:PORT where browsers may see it, if anywhere. Raises UsageError, BriefError, RunError or Interrupted, of one
+    started by hand, as long as nothing has begun.
     """
+    stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
@@ -72,6 +74,7 @@ def observe(brief: Brief) -> int:
         new_folder(observation.folder)
         with Session(brief, meanwhile=stop.check):
             pass
+    viewer = None if stand is None else observation.show(stand)
     status, how = 0, "complete"
     try:
         write_resolved(observation.folder, scenario)
@@ -88,6 +91,8 @@ def observe(brief: Brief) -> int:
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
     status, how = observation.finish(status, how)
+    if viewer is not None:
+        viewer.stop()
     if by_hand and status not in {0, 1}:
         print(f"evedrop: {how}", file=sys.stderr)  # noqa: T201 - nobody else says it
     return status
@@ -134,6 +139,7 @@ class Observation:
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
+        self._live: str | None = brief.part["live"]
         self._showing: Showing | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = self._beaten = time.monotonic()
@@ -142,6 +148,13 @@ class Observation:
         self._outages: list[Mapping[str, Any]] = []
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
+
+    def show(self, stand: Stand) -> Viewer:
+        """A viewer for browsers, which the run will be streamed to."""
+        viewer = Viewer.serve(stand, self.folder / "logs")
+        tell("view", address=viewer.address)
+        self._live = viewer.url
+        return viewer
 
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
@@ -155,7 +168,7 @@ class Observation:
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
-                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._brief.part["live"]
+                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._live
                 )
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             patience = self._brief.flow.longest_outage
@@ -174,7 +187,7 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
-            except (RunError, Interrupted) as error:
+            except EvedropError as error:
                 self._suspects = conductor.missing if isinstance(error, RunError) else []
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
@@ -369,67 +382,3 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
     writer.input_rows(slots, first_trial)
     writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
     writer.journal_rows(slots)
-
-
-def showing_of(scenario: Scenario) -> Showing | None:
-    """Who follows the shown trial of a closed loop."""
-    from emulator.runs.showing import Showing  # noqa: PLC0415 - only with a view
-
-    return Showing.of(scenario)
-
-
-def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -> Recording:
-    """The run's recording, on disk and, with the address of a viewer, live."""
-    from emulator.runs.showing import driven_scene  # noqa: PLC0415 - only with a view
-    from emulator.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
-    from emulator.view.scene import Scene, Shown  # noqa: PLC0415 - the same
-
-    quality = scenario.quality
-    strategies = {name: table.strategy for name, table in scenario.eavesdroppers.items()}
-    receivers = [
-        Shown(
-            name,
-            "legitimate" if name == LEGITIMATE else "eavesdropper",
-            strategies.get(name, scenario.encoding.scheme),
-            quality[name],
-        )
-        for name in scenario.receivers
-    ]
-    scene = Scene(
-        title=scenario.title,
-        run=run,
-        slots=scenario.slots,
-        trials=scenario.trials,
-        n=len(scenario.process.A),
-        pace=scenario.pace,
-        receivers=tuple(receivers),
-        noise=float(np.trace(scenario.process.process.Q)),
-        **driven_scene(scenario),
-    )
-    return Recording(path, scene, live)
-
-
-def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
-    """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
-
-    around: the reference from which states are deviations, (n,); showing: of a closed loop, who follows the same trial.
-    """
-    from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
-    from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
-
-    peers = {
-        name: PeerSlots(
-            x_hat=receiver.x_hat[:, :, 0] + around,
-            P=receiver.P[:, :, :, 0],
-            action=receiver.action[:, 0],
-            squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
-            trace=receiver.trace[:, 0] / slots.trials,
-            expected_trace=scored[name].expected,
-        )
-        for name, receiver in slots.receivers.items()
-    }
-    moved = None
-    if showing is not None and slots.inputs is not None:
-        estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
-        moved = showing.take(slots.inputs.u[:, :, 0], estimates)
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0] + around, nu=slots.nu[:, 0], peers=peers, moved=moved)

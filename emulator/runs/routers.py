@@ -28,17 +28,19 @@ class Routers:
         """All at the router; or, if there is a relay, the sensor and the relay there, and all others at the relay."""
         if places.relay is None:
             return cls(places, users, {}, None)
-        far = {user: password for user, password in users.items() if user != SENSOR}
+        # Router and relay are users too: of themselves, which ask whether they are there.
+        near = {**{user: users[user] for user in (ROUTER, SENSOR)}, RELAY: secrets.token_urlsafe(24)}
+        far = {**{user: password for user, password in users.items() if user not in near}, RELAY: near[RELAY]}
         # Zenoh takes ids of up to 16 bytes, in hexadecimal without zeros at the ends.
         zid = f"e{secrets.token_hex(15)}e"
-        return cls(places, {SENSOR: users[SENSOR], RELAY: secrets.token_urlsafe(24)}, far, zid)
+        return cls(places, near, far, zid)
 
     def endpoint(self, process: str) -> str:
         """What a process connects to."""
         return str((self.places.router if process in self.at_router else self.places.far).connect)
 
     def password(self, process: str) -> str:
-        """A process's; the router has none."""
+        """A process's."""
         return {**self.at_router, **self.at_relay}.get(process, "")
 
     def relay_part(self, receivers: tuple[str, ...], relay: Meeting) -> dict[str, Any]:
@@ -55,7 +57,7 @@ def identities_of(run: str, places: Places, users: tuple[str, ...]) -> dict[str,
 
     authority = Authority(run)
     return {
-        ROUTER: authority.identity(ROUTER, hosts=places.router.names, connects=False),
+        ROUTER: authority.identity(ROUTER, hosts=places.router.names),
         **({} if places.relay is None else {RELAY: authority.identity(RELAY, hosts=places.relay.names)}),
         **{user: authority.identity(user) for user in users},
     }

@@ -1,4 +1,4 @@
-"""The viewer as a child process of ours, on loopback only. Neither Rerun nor Zenoh is imported here.
+"""The viewer as a child process of ours, on loopback unless told otherwise. Neither Rerun nor Zenoh is imported here.
 
 Rerun's own ways to start a viewer listen on every interface; its command, told so, does not.
 """
@@ -6,6 +6,7 @@ Rerun's own ways to start a viewer listen on every interface; its command, told 
 from __future__ import annotations
 
 import importlib.util
+import ipaddress
 import os
 import socket
 import subprocess
@@ -13,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 from urllib.parse import quote
@@ -58,18 +60,55 @@ def choose(mode: str) -> str:
     return mode
 
 
+@dataclass(frozen=True)
+class Stand:
+    """Where browsers find a view: the page at a port, and what it shows at the next one."""
+
+    host: str
+    port: int
+
+    @classmethod
+    def of(cls, text: str) -> Stand:
+        """From HOST:PORT. Raises UsageError if it is none."""
+        host, _, port = text.rpartition(":")
+        try:
+            address, number = ipaddress.IPv4Address(host), int(port)
+        except ValueError:
+            number = 0
+        if not 0 < number < 2**16 - 1:
+            raise UsageError(f"--serve {text} is no address and port; give one such as 127.0.0.1:17450")
+        return cls(str(address), number)
+
+    @property
+    def seen(self) -> str:
+        """The address to type into a browser of this machine."""
+        return _HOST if self.host == "0.0.0.0" else self.host  # noqa: S104 - what was asked for
+
+    def check_free(self) -> None:
+        """Raise UsageError if somebody else is there: he would be taken for the viewer."""
+        for port in (self.port, self.port + 1):
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind((self.host, port))
+                except OSError as error:
+                    raise UsageError(
+                        f"--serve {self.host}:{self.port}: {self.host}:{port} cannot be had ({error.strerror}); give another"
+                    ) from error
+
+
 class Viewer:
     """A running viewer. Final; made by `start`.
 
-    It listens on loopback only, in a session of its own so that Ctrl-C in the terminal does not reach it, and on Linux
-    it dies with the thread that started it, however that ends.
+    It listens on loopback only unless a stand says otherwise, in a session of its own so that Ctrl-C in the terminal does
+    not reach it, and on Linux it dies with the thread that started it, however that ends.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], port: int, web_port: int | None) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], port: int, web_port: int | None, host: str = _HOST) -> None:
         self._process = process
-        self.url = f"rerun+http://{_HOST}:{port}/proxy"
+        self.url = f"rerun+http://{host}:{port}/proxy"
         """Where a recording is streamed to."""
-        self.address = None if web_port is None else f"http://{_HOST}:{web_port}/?url={quote(self.url, safe='')}"
+        self.address = None if web_port is None else f"http://{host}:{web_port}/?url={quote(self.url, safe='')}"
         """What to open in a browser; None for a window."""
 
     @classmethod
@@ -96,6 +135,17 @@ class Viewer:
             return cls(process, port, web_port)
         return None
 
+    @classmethod
+    def serve(cls, stand: Stand, logs: Path, files: Sequence[Path] = ()) -> Viewer:
+        """Start one for browsers, at a place that is known beforehand.
+
+        Raises UsageError if it cannot be started, for one because the place is taken.
+        """
+        stand.check_free()
+        arguments = ["--serve-web", "--web-viewer-port", str(stand.port), *map(str, files)]
+        process = spawn(stand.port + 1, arguments, logs, web_port=stand.port, host=stand.host)
+        return cls(process, stand.port + 1, stand.port, stand.seen)
+
     def alive(self) -> bool:
         """Whether it still runs; a window may have been closed."""
         return self._process.poll() is None
@@ -109,14 +159,16 @@ class Viewer:
         end(self._process)
 
 
-def open_run(run: Path, mode: str) -> Viewer:
-    """A viewer with the recording of a finished run's results folder.
+def open_run(run: Path, mode: str, stand: Stand | None = None) -> Viewer:
+    """A viewer with the recording of a finished run's results folder; for browsers, at a stand if there is one.
 
     Raises UsageError if there is none, or no viewer can be started.
     """
     recording = run / "recording.rrd"
     if not recording.is_file():
         raise UsageError(f"{recording} does not exist; give the results folder of a run made without --view off")
+    if stand is not None:
+        return Viewer.serve(stand, run / "logs", [recording])
     viewer = Viewer.start(mode, run / "logs", [recording])
     if viewer is None:
         raise UsageError("a finished run cannot be opened with --view off; give auto, native or web")
@@ -129,13 +181,14 @@ def spawn(
     logs: Path,
     *,
     web_port: int | None = None,
+    host: str = _HOST,
     environment: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Rerun's command with these arguments, listening on a loopback port; returns when it does, on web_port too.
+    """Rerun's command with these arguments, listening on a port of `host`; returns when it does, on web_port too.
 
     Raises UsageError, with the last lines of its log, if it ends before or does not get there in time.
     """
-    command = [str(executable()), "--bind", _HOST, "--port", str(port), *arguments]
+    command = [str(executable()), "--bind", host, "--port", str(port), *arguments]
     if sys.platform == "linux":
         command = [sys.executable, "-I", "-S", "-c", _GUARD, str(os.getpid()), *command]
     with _log(logs) as log:
@@ -149,7 +202,7 @@ def spawn(
             env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
-            if all(_listens(process, awaited) for awaited in (port, web_port) if awaited):
+            if all(_listens(process, host, awaited) for awaited in (port, web_port) if awaited):
                 return process
         except BaseException:
             end(process)
@@ -181,12 +234,12 @@ def executable() -> Path:
     return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
 
 
-def _listens(process: subprocess.Popen[bytes], port: int) -> bool:
+def _listens(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
     deadline = time.monotonic() + _START_SECONDS
     while process.poll() is None and time.monotonic() < deadline:
         with socket.socket() as probe:
             probe.settimeout(1.0)
-            if probe.connect_ex((_HOST, port)) == 0:
+            if probe.connect_ex((host, port)) == 0:
                 return True
         time.sleep(0.02)
     return False

@@ -12,9 +12,9 @@ import pyarrow.compute as pc
 from emulator.errors import UsageError
 from emulator.model.process import Floats
 from emulator.model.receiver import Action
-from emulator.runs.observer import open_recording, showing_of
 from emulator.runs.results import Results, load_results
 from emulator.runs.scorekeeper import event_line
+from emulator.runs.shown import open_recording, showing_of
 from emulator.scenario import load
 from emulator.view.scene import PeerSlots, Slots
 

@@ -176,7 +176,7 @@ def test_eavesdropper_gets_nothing_by_asking(stage: Bench) -> None:
 
 
 def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
-    """It learns of no token, neither by watching, with history, nor by asking; the observer sees them."""
+    """It learns of no token but its own, neither by watching, with history, nor by asking; the observer sees them."""
     with connect(stage.briefs[EVE]) as attacker, ExitStack() as stack:
         ear, control = Ear(), Ear()
         alive = {name: stage.keys.alive(name) for name in PROCESSES}
@@ -186,7 +186,8 @@ def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
             if key.startswith("@"):
                 continue
             attacker.liveliness().declare_subscriber(key, ear, history=True)
-            assert list(attacker.liveliness().get(key, timeout=5.0)) == []
+            found = [str(reply.ok.key_expr) for reply in attacker.liveliness().get(key, timeout=5.0)]
+            assert found == ([key] if key == alive[EVE] else [])
         seen = {stage.tokens.hear()[0] for _ in PROCESSES}
         assert seen == set(alive.values())
         attacker.declare_subscriber(stage.keys.downlink(EVE), control)
@@ -313,7 +314,7 @@ def test_eavesdropper_has_no_part_in_the_loop(acts_on: str, tmp_path: Path) -> N
 def test_the_table_grants_nothing_twice_and_no_wildcard() -> None:
     """Every key has one writer, no rule covers more than exact keys, and no eavesdropper may read what is not its own."""
     table = grants("r", ("legitimate", "eve"))
-    written = [key for grant in table for key in (*grant.writes, grant.token)]
+    written = [key for grant in table for key in (*grant.writes, grant.token) if key is not None]
     assert len(written) == len(set(written))
     for rule in access_control(table)["rules"]:
         assert rule["permission"] == "allow"
@@ -324,6 +325,7 @@ def test_the_table_grants_nothing_twice_and_no_wildcard() -> None:
         writes=("evedrop/r/telemetry/eve", "evedrop/r/progress/eve"),
         reads=("evedrop/r/downlink/eve", "evedrop/r/control/eve"),
         token="evedrop/r/alive/eve",  # noqa: S106 - a liveliness token is no secret
+        checks=("evedrop/r/alive/eve",),
     )
     assert eve == own
     assert access_control(table)["default_permission"] == "deny"

@@ -218,7 +218,7 @@ def certificate_of(brief: Brief) -> x509.Certificate:
 
 
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
-    """The router's names its hosts and is for a server; the others' name no host and are for a client."""
+    """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
     made = briefs_of(
         scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
     )
@@ -229,7 +229,7 @@ def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
         found = certificate_of(brief)
         assert found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == name
         uses = {use._name for use in found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value}
-        assert uses == ({"serverAuth"} if name == "router" else {"clientAuth"})
+        assert uses == {"clientAuth", *({"serverAuth"} if name == "router" else ())}
         if name != "router":
             with pytest.raises(x509.ExtensionNotFound):
                 found.extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -268,7 +268,7 @@ def test_an_identity_that_fits_is_taken() -> None:
 def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
     """A router that shows a certificate of another time: the process names the clock."""
     old = Authority(stage.keys.run, datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=365))
-    router, eve = old.identity("router", ["127.0.0.1"], connects=False), old.identity(EVE)
+    router, eve = old.identity("router", ["127.0.0.1"]), old.identity(EVE)
     endpoint = f"tls/127.0.0.1:{free_port()}"
     config = client_config(replace(stage.briefs[EVE], router=endpoint, identity=eve))
     tls = {**config["transport"]["link"]["tls"]}

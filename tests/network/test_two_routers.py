@@ -17,6 +17,7 @@ from emulator.brief import Brief
 from emulator.errors import UsageError
 from emulator.network import wire
 from emulator.network.access import RELAY, Grant, Keys, access_control, grants
+from emulator.network.health import is_there
 from emulator.network.linked import at_relay, at_router
 from emulator.network.session import client_config
 from emulator.runs.ports import loopback_places, places_at
@@ -100,6 +101,13 @@ def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> N
     for ears in (stage.controls, stage.progress, stage.telemetry):
         assert {name: ear.all() for name, ear in ears.items()} == {name: [] for name in ears}
     assert (stage.router.poll(), stage.relay.poll()) == (None, None)
+
+
+def test_each_router_is_asked_for_itself(stage: Bench) -> None:
+    """Each answers for itself with its own credentials, and the relay for those at its site."""
+    assert is_there(stage.briefs["router"])
+    assert is_there(stage.briefs["relay"])
+    assert not is_there(replace(stage.briefs["relay"], password="of another run"))  # noqa: S106 - that is the point
 
 
 @pytest.mark.parametrize("who", ["eve", "legitimate", "observer"])

@@ -308,3 +308,18 @@ def test_a_router_is_known_by_its_names(listen: str, connect: str | None, names:
     assert (str(found.listen), str(found.connect)) == (listen, connect or listen)
     assert found.secure == listen.startswith("tls/")
     assert isinstance(meeting_at("tcp/0.0.0.0:7447", "tcp/a:7447", insecure=True), Meeting)
+
+
+def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
+    """There is no launcher: the observer tells the others why the run has failed, and they end, whatever they wait for."""
+    briefs = written(
+        evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", "longest_outage=1.0", slots=10_000_000
+    )
+    running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
+    wait_until((evedrop.folder / "results" / "control.json").is_file, "a run under way")
+    running["smart"].process.kill()
+    ended = {name: live.end() for name, live in running.items()}
+    assert {name: done.status for name, done in ended.items()} == {**dict.fromkeys(briefs, 3), "smart": -9}
+    why = "smart cut off from the network for 1 s; look at the logs"
+    for name, done in ended.items():
+        assert name in {"smart", "observer"} or f"evedrop: {name}: the observer gave the run up: {why}" in done.err, name

@@ -13,7 +13,8 @@ from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
 from emulator.errors import UsageError
-from emulator.runs.viewer import Viewer, choose, open_run
+from emulator.runs.ports import free_port
+from emulator.runs.viewer import Stand, Viewer, choose, open_run
 from emulator.view.recording import Recording
 from tests.conftest import LIMIT, wait_until
 
@@ -177,3 +178,30 @@ def test_live_viewer_gets_the_run(simulated: Callable[..., Simulated], viewer: V
         recording.add(slots)
     recording.close()
     assert recording.dropped == 0
+
+
+def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
+    """The page at the port that was asked for, the data at the next; whoever asks for the same place is refused."""
+    stand = Stand("127.0.0.1", free_port())
+    viewer = Viewer.serve(stand, tmp_path / "logs")
+    try:
+        data = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{stand.port + 1}%2Fproxy"
+        assert viewer.address == f"http://127.0.0.1:{stand.port}/?url={data}"
+        with urllib.request.urlopen(f"http://127.0.0.1:{stand.port}/") as page:
+            assert page.status == 200
+        with pytest.raises(UsageError, match=f":{stand.port} cannot be had"):
+            Viewer.serve(stand, tmp_path / "logs")
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize("text", ["", "17450", "here:17450", "127.0.0.1:", "127.0.0.1:65535", "127.0.0.1:x"])
+def test_a_place_that_is_none_is_refused(text: str) -> None:
+    """An address and a port that has a next one."""
+    with pytest.raises(UsageError, match=r"is no address and port; give one such as 127\.0\.0\.1:17450"):
+        Stand.of(text)
+
+
+def test_every_address_is_seen_at_loopback() -> None:
+    """What a browser on this machine is to be pointed at."""
+    assert Stand.of("0.0.0.0:17450").seen == Stand.of("127.0.0.1:17450").seen == "127.0.0.1"

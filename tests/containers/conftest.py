@@ -1,0 +1,95 @@
+"""Docker, the image, and a project to bring up; or, said loudly, why there is none here."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.containers.machine import BASE, CannotRun, Docker, bootstrap, checkout, install, run
+from tests.containers.project import Project
+
+_REASON = pytest.StashKey[str]()
+_TIMES = pytest.StashKey[dict[str, float]]()
+
+
+@pytest.fixture(scope="session")
+def docker(request: pytest.FixtureRequest) -> Iterator[Docker]:
+    """A daemon that has the image `evedrop`."""
+    times: dict[str, float] = {}
+    request.config.stash[_TIMES] = times
+    with tempfile.TemporaryDirectory(prefix="evedrop-docker-") as made:
+        folder = Path(made)
+        try:
+            install()
+            daemon = Docker(folder)
+        except CannotRun as error:
+            request.config.stash[_REASON] = str(error)
+            pytest.skip(str(error))
+        try:
+            _image(daemon, folder, times)
+            yield daemon
+        except CannotRun as error:
+            request.config.stash[_REASON] = str(error)
+            pytest.skip(str(error))
+        finally:
+            daemon.end()
+
+
+def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
+    """Build the image of a copy of the checkout, on Debian's packages and without a network. Raises CannotRun."""
+    copy, begun = checkout(folder), time.monotonic()
+    fetching = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"),
+            *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
+            *("--requirement", str(copy / "constraints.txt"), "--dest", str(copy / "build" / "wheels")),
+        ],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        daemon("import", str(bootstrap(folder)), BASE)
+        said, _ = fetching.communicate()
+    finally:
+        fetching.kill()
+        fetching.wait()
+    if fetching.returncode:
+        raise CannotRun(f"the packages of constraints.txt cannot be fetched: {said[-2000:]}")
+    times["base image and packages"], begun = time.monotonic() - begun, time.monotonic()
+    environment = {**os.environ, "DOCKER_HOST": daemon.address, "EVEDROP_BASE": BASE, "DOCKER_BUILDKIT": "0"}
+    run("docker-compose", "build", cwd=copy, env=environment)
+    times["image"] = time.monotonic() - begun
+
+
+@pytest.fixture
+def project(tmp_path: Path, docker: Docker) -> Iterator[Callable[..., Project]]:
+    """Makes the project of a test; takes it down afterwards, whatever became of it."""
+    made: list[Project] = []
+
+    def make(**variables: str) -> Project:
+        one = Project.of(tmp_path, docker, **variables)
+        made.append(one)
+        return one
+
+    yield make
+    for one in made:
+        one.down()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """How long the preparations took, or that nothing was tested."""
+    for what, seconds in config.stash.get(_TIMES, {}).items():
+        terminalreporter.write_line(f"{what}: {seconds:.0f} s")
+    reason = config.stash.get(_REASON, None)
+    if reason is not None:
+        terminalreporter.section("THE CONTAINERS WERE NOT TESTED", sep="!", red=True)
+        terminalreporter.write_line(reason)

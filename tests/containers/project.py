@@ -1,0 +1,90 @@
+"""One run by docker-compose, in a folder of its own, from a copy of the checkout's docker-compose.yml."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emulator.runs.results import Results, load_results
+from tests.conftest import wait_until
+from tests.containers.machine import ROOT, Docker, run
+
+ROLES = ("router", "sensor", "legitimate", "eavesdropper-1", "eavesdropper-2", "observer")
+"""The services that are processes of a run."""
+
+
+@dataclass(frozen=True)
+class Project:
+    """The folder, the daemon, and what `docker-compose` is told by its environment."""
+
+    folder: Path
+    docker: Docker
+    environment: dict[str, str]
+
+    @classmethod
+    def of(cls, folder: Path, docker: Docker, **variables: str) -> Project:
+        """A project whose services are those of the checkout."""
+        shutil.copy(ROOT / "docker-compose.yml", folder)
+        names = {"COMPOSE_PROJECT_NAME": folder.name.replace("_", "-"), "DOCKER_HOST": docker.address}
+        return cls(folder, docker, {**os.environ, **names, **variables})
+
+    def compose(self, *arguments: str, may_fail: bool = False) -> subprocess.CompletedProcess[str]:
+        """What `docker-compose` says."""
+        command, options = (
+            ("docker-compose", "--ansi", "never", *arguments),
+            {"cwd": self.folder, "env": self.environment},
+        )
+        if may_fail:
+            return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600, **options)
+        try:
+            return run(*command, **options)
+        except AssertionError as error:
+            said = subprocess.run(
+                ("docker-compose", "logs", "--no-color"), capture_output=True, text=True, check=False, **options
+            )
+            raise AssertionError(f"{error}\n{said.stdout}") from error
+
+    def container(self, service: str) -> str:
+        """The id of a service's container."""
+        project = f"label=com.docker.compose.project={self.environment['COMPOSE_PROJECT_NAME']}"
+        found = self.docker("ps", "-aq", "-f", project, "-f", f"label=com.docker.compose.service={service}")
+        assert found, f"no container of {service}"
+        return found
+
+    def state(self, service: str) -> dict[str, Any]:
+        """What Docker knows of a service's container."""
+        found: dict[str, Any] = self.docker.inspected("container", self.container(service))["State"]
+        return found
+
+    def ended(self, service: str) -> int:
+        """The status with which a service ends, once it has."""
+        return int(self.docker("wait", self.container(service)))
+
+    def said(self, service: str) -> str:
+        """All that a service has said so far."""
+        done = run("docker", "-H", self.docker.address, "logs", self.container(service))
+        return done.stdout + done.stderr
+
+    def progress(self) -> int:
+        """The slots that the run has done."""
+        lines = [line for line in self.said("observer").splitlines() if line.startswith("{") and '"progress"' in line]
+        return max((json.loads(line)["done"] for line in lines), default=0)
+
+    def running(self, more_than: int = 0) -> None:
+        """Wait until more than so many slots are done."""
+        wait_until(lambda: self.progress() > more_than, "a run under way")
+        assert self.state("observer")["Running"], "the run must not end before it is disturbed"
+
+    def results(self) -> Results:
+        """The newest results."""
+        newest: Path = max((self.folder / "runs").iterdir(), key=lambda folder: folder.stat().st_mtime_ns)
+        return load_results(newest)
+
+    def down(self) -> None:
+        """Take everything down."""
+        self.compose("down", "--volumes", "--timeout", "5")
