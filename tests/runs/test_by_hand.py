@@ -322,4 +322,6 @@ def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
     assert {name: done.status for name, done in ended.items()} == {**dict.fromkeys(briefs, 3), "smart": -9}
     why = "smart cut off from the network for 1 s; look at the logs"
     for name, done in ended.items():
-        assert name in {"smart", "observer"} or f"evedrop: {name}: the observer gave the run up: {why}" in done.err, name
+        assert name in {"smart", "observer"} or f"evedrop: {name}: the observer gave the run up: {why}" in done.err, (
+            name
+        )
