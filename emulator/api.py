@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link_law import law_of
+from emulator.model.outcomes import GENIE_SCHEMES
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.runs.results import Results, load_results
 from emulator.scenario import Scenario, checked, load
+from emulator.scenario.words import listed
 
 if TYPE_CHECKING:
     from emulator.model.design import Design
@@ -129,17 +131,14 @@ def design(
 
     max_trace: Ω, for which the least μ_d is sought; changes: entries by dotted key.
 
-    Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω.
+    Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω or the scheme is not one of states and innovations.
     """
     from emulator.model.design import Adversary  # noqa: PLC0415 - a run does not need it
     from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
-    if SCHEMES.foreign(made.encoding.scheme):
-        raise UsageError(
-            f"the design of μ_d is for the paper's scheme; no closed form is known for {made.encoding.scheme}; give "
-            "--set 'encoding={scheme = \"innovation\", state_probability = 0.6}', or study it by evedrop sweep"
-        )
+    if made.encoding.scheme not in GENIE_SCHEMES:
+        raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
     quality = {}
@@ -162,6 +161,21 @@ def design(
             adversaries.append(Adversary.who(name, quality[name], outcomes_at(1.0)))
     process, mu, mu_d = made.process.process, quality[LEGITIMATE], made.encoding.mu_d
     return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
+
+
+def _not_for(scheme: str) -> str:
+    """Why nothing is designed for a scheme, and what to do instead."""
+    why = f"the design of μ_d is for the scheme {listed(GENIE_SCHEMES)}"
+    instead = "give --set 'encoding={scheme = \"innovation\", state_probability = 0.6}' to design that on this process"
+    if SCHEMES.foreign(scheme):
+        return f"{why}; no closed form is known for {scheme}; {instead}, or study it by evedrop sweep"
+    if SCHEMES[scheme].needs_acknowledgements:
+        instead = (
+            f"evedrop compare SCENARIO --schemes {scheme},innovation --out DIR measures both on this process, and writes "
+            "DIR/scenarios/innovation.toml, which can be designed"
+        )
+        return f"{why}, and this scenario has {scheme}; {instead}"
+    return f"{why}, and this scenario has {scheme}; {instead}, or see by evedrop compare what {scheme} gives"
 
 
 def _prepared(

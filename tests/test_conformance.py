@@ -47,7 +47,11 @@ EVERY = [
 @pytest.mark.parametrize(("option", "name"), EVERY)
 def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
     """On the same small problems as anybody's own."""
-    beside = {"reference": {"scheme": "acknowledged"}, "selective": {"scheme": "encrypted-schedule"}}
+    beside = {
+        "reference": {"scheme": "acknowledged"},
+        "selective": {"scheme": "encrypted-schedule"},
+        "tracker": {"scheme": "twin-track"},
+    }
     for one in examined({option: name, **(beside.get(name, {}) if option == "eavesdropper" else {})}, {}):
         assert [verdict for verdict in one.verdicts if verdict.broken is not None] == [], one.title
         assert len(one.verdicts) >= 4

@@ -79,7 +79,7 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
             "twin-track or withholding; did you mean innovation?",
         ),
         ("encoding.scheme", "rot13", 'encoding.scheme: is "rot13"; expected acknowledged, cipher, encrypted-schedule, '),
-        ("eavesdroppers.smart.strategy", "suspicous", "smart or suspicious; did you mean suspicious?"),
+        ("eavesdroppers.smart.strategy", "suspicous", "smart, suspicious or tracker; did you mean suspicious?"),
         ("legitimate.link", {"loss": {"model": "gilbert-eliott"}}, "did you mean gilbert-elliott?"),
         ("legitimate.link", {"loss": {"model": 7}}, "legitimate.link.loss.model: is 7; expected bernoulli"),
         ("encoding.scheme", "plain", "encoding.state_probability: is set, but the scheme plain"),
@@ -218,7 +218,7 @@ def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entr
     (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
         f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by what it knows of the schedule, and the scheme '
-        "plain has none; expected bayesian, constant, likelihood, naive, reference or selective"
+        "plain has none; expected bayesian, constant, likelihood, naive, reference, selective or tracker"
     )
 
 

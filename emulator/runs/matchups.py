@@ -28,6 +28,7 @@ _BEST_READER = {
     "cipher": "constant",
     "encrypted-schedule": "selective",
     "innovation": "bayesian",
+    "twin-track": "tracker",
 }
 _ANY_READER = "naive"  # of every other scheme: whatever is sent is the state, or cannot be told from it
 
@@ -40,6 +41,7 @@ _MEANT_FOR = {
         "encrypted-schedule",
         "heeds a header that says what is encrypted, and there is none: it is naive here",
     ),
+    "tracker": ("twin-track", "goes half-way between two tracks, and there is one"),
 }
 _CHANCES = {"use_state": 0.8, "use_innovation": 0.2}  # of a suspicious one that the scenario says nothing of
 _WAY_BACK = {"link": {"quality": 1.0}}

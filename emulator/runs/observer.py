@@ -28,7 +28,8 @@ from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Question, Session
-from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
+from emulator.network.telemetry import is_held, is_leaving, read_leaving
+from emulator.network.wire import Reader
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots

@@ -35,7 +35,7 @@ class Outage:
     until: int | None
     """The same when the run went on; None if it did not."""
     seconds: float
-    """From when it was noticed to when the run went on."""
+    """From the last slot that was joined before to when the run went on: it may be noticed late."""
 
 
 class Recovery:
@@ -51,7 +51,7 @@ class Recovery:
         self._done = 0
         self._target = 0
         """Slots below were on the way when a connection was lost."""
-        self._moved = time.monotonic()
+        self._moved = self._joined = time.monotonic()
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
@@ -71,7 +71,7 @@ class Recovery:
         elif self._missing:
             self._all_back(now)
         elif self._steering.at is not None and done >= self._steering.at:
-            self._moved = now  # held, and nothing is expected
+            self._moved = self._joined = now  # held, and nothing is expected
             self._close(done, now)
         elif now - self._moved > self._limit:
             self._round(now)
@@ -89,7 +89,7 @@ class Recovery:
     def _go_on(self, done: int, now: float) -> None:
         if not self._missing and not self._wait:
             self._longest = max(self._longest, now - self._moved)
-        self._done, self._moved, self._wait = done, now, 0.0
+        self._done, self._moved, self._joined, self._wait = done, now, now, 0.0
         self._close(done, now)
 
     def _close(self, done: int, now: float) -> None:
@@ -102,7 +102,7 @@ class Recovery:
 
     def _miss(self, done: int, now: float) -> None:
         for name in self._conductor.missing:
-            self._missing.setdefault(name, (done, self._conductor.lost.get(name, now)))
+            self._missing.setdefault(name, (done, min(self._joined, self._conductor.lost.get(name, now))))
         gone = [
             name
             for name in self._conductor.missing

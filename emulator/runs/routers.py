@@ -57,7 +57,7 @@ def identities_of(run: str, places: Places, users: tuple[str, ...]) -> dict[str,
 
     authority = Authority(run)
     return {
+        **{user: authority.identity(user) for user in users},
         ROUTER: authority.identity(ROUTER, hosts=places.router.names),
         **({} if places.relay is None else {RELAY: authority.identity(RELAY, hosts=places.relay.names)}),
-        **{user: authority.identity(user) for user in users},
     }

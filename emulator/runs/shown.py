@@ -79,4 +79,5 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], s
     if showing is not None and slots.inputs is not None:
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
         moved = showing.take(slots.inputs.u[:, :, 0], estimates)
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0] + around, nu=slots.nu[:, 0], peers=peers, moved=moved)
+    sent = None if slots.sent is None else slots.sent[:, 0]
+    return ShownSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)

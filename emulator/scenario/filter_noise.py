@@ -19,7 +19,7 @@ from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import numbers
 
 FILTER = "filter"
-_INVERTS_NOISE = ("bayesian", "genie", "likelihood")
+_INVERTS_NOISE = ("bayesian", "genie", "likelihood", "tracker")
 
 
 def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:

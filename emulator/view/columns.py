@@ -52,15 +52,16 @@ class Columns:
             columns.append(scalars(f"{paths.PLANE}/{paths.TRUTH}", k, slots.x[:, 0]))
         else:
             columns.extend(self._truth(k, slots))
-        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu), columns, opening)
+        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu, slots.sent), columns, opening)
         for i, shown in enumerate(self._scene.receivers):
             peer = slots.peers[shown.name]
             columns.extend(self._curves(shown.name, k, peer))
             columns.extend(self._estimate(shown.name, k, peer))
-            codes = lanes.received(peer.action, slots.nu)
-            words = lanes.LEGITIMATE if shown.role == "legitimate" else lanes.EAVESDROPPER
-            if shown.role == "legitimate":
-                codes = peer.action
+            legitimate = shown.role == "legitimate"
+            words = lanes.LEGITIMATE if legitimate else lanes.EAVESDROPPER
+            # The legitimate estimator knows every type, and is never misled.
+            types = np.zeros_like(slots.nu) if legitimate else slots.nu
+            codes = lanes.received(peer.action, types, slots.sent)
             self._lane(paths.lane(self._scene, i), words, k, codes, columns, opening)
             events = self._watchers[shown.name].watch(slots.first, codes)
             if events:

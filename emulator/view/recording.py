@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
+from emulator.model.receiver import Flags
 from emulator.view.blueprint import layout
 from emulator.view.columns import Batch, Columns, lines, log_styles, opening
 from emulator.view.events import Event, introduction
@@ -222,7 +223,14 @@ def _joined(chunks: list[Slots]) -> Slots:
         np.concatenate([chunk.nu for chunk in chunks]),
         peers,
         _joined_moves([chunk.moved for chunk in chunks if chunk.moved is not None]),
+        _joined_packets(chunks),
     )
+
+
+def _joined_packets(chunks: list[Slots]) -> Flags | None:
+    if all(chunk.sent is None for chunk in chunks):
+        return None
+    return np.concatenate([np.ones(chunk.count, np.bool_) if chunk.sent is None else chunk.sent for chunk in chunks])
 
 
 def _joined_moves(moves: list[Moved]) -> Moved | None:

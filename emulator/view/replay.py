@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from emulator.errors import UsageError
 from emulator.model.process import Floats
-from emulator.model.receiver import Action
+from emulator.model.receiver import Action, Flags
 from emulator.runs.results import Results, load_results
 from emulator.runs.scorekeeper import event_line
 from emulator.runs.shown import open_recording, showing_of
@@ -37,7 +37,7 @@ def replay(folder: Path) -> Path:
     scenario = load(folder / "scenario.toml", beyond_horizon=True)
     path = folder / "recording.rrd"
     peers = {name: _peer(results, name) for name in scenario.receivers}
-    x, nu = _truth(results, scenario.receivers[0])
+    x, nu, sent = _truth(results, scenario.receivers[0])
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again without --covariance-only or the like")
     _check_shapes(folder, len(scenario.process.A), x, peers)
@@ -51,7 +51,7 @@ def replay(folder: Path) -> Path:
         deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
         moved = None if showing is None else showing.take(inputs[rows], deviations)
         shown = {name: _cut(peer, rows) for name, peer in peers.items()}
-        recording.add(Slots(first, x[rows], nu[rows], shown, moved))
+        recording.add(Slots(first, x[rows], nu[rows], shown, moved, sent[rows]))
     for event in results.summary.get("events", ()):
         recording.note(event["slot"], "INFO", event_line(event))
     recording.close()
@@ -80,10 +80,12 @@ def _first_trial(results: Results, name: str) -> pa.Table:
     return rows.sort_by("slot")
 
 
-def _truth(results: Results, name: str) -> tuple[Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
+def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
+    """True states, ν and whether there was a packet."""
     rows = _first_trial(results, name)
-    sent = rows["sent"].cast(pa.string()).to_pylist()
-    return _matrix(rows["x"]), np.array([word == "innovation" for word in sent], np.bool_)
+    words = rows["sent"].cast(pa.string()).to_pylist()
+    nu = np.array([word == "innovation" for word in words], np.bool_)
+    return _matrix(rows["x"]), nu, np.array([word != "nothing" for word in words], np.bool_)
 
 
 def _inputs(results: Results) -> Floats:

@@ -102,6 +102,8 @@ class Slots:
     """By name, one for each receiver of the scene."""
     moved: Moved | None = None
     """Of a closed loop."""
+    sent: Flags | None = None
+    """Whether the sensor sent a packet in the first recorded trial, (c,); None: in every slot."""
 
     @property
     def count(self) -> int:

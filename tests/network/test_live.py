@@ -20,7 +20,7 @@ from bench import LIMIT_SECONDS, Ear, connect, until
 
 from emulator import montecarlo
 from emulator.brief import Brief, read_brief
-from emulator.network import wire
+from emulator.network import packets, wire
 from emulator.network.access import Keys
 from emulator.runs.briefs import StreamKeys
 from emulator.runs.results import load_results
@@ -131,7 +131,7 @@ def disturb(eve: Brief, keys: Keys) -> None:
             if key in own:
                 continue
             attacker.declare_queryable(key, lambda query: query.reply(query.key_expr, b"\xc1"))
-            for payload in (wire.control("end"), wire.progress(10**9), wire.uplink(0, np.zeros((2, 3))), b"\xc1"):
+            for payload in (wire.control("end"), wire.progress(10**9), packets.uplink(0, np.zeros((2, 3))), b"\xc1"):
                 attacker.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
             attacker.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
             if key.rpartition("/")[2] in PROCESSES and "/alive/" in key:
@@ -225,7 +225,8 @@ def test_those_who_may_hear_did(evidence: Evidence) -> None:
 
 def test_the_attacker_heard_nothing(evidence: Evidence) -> None:
     """No subscription, query, watch or question for tokens brought anything but what is its own."""
-    own = {f"evedrop/{evidence.briefs['eve'].run}/control/eve"}
+    run = evidence.briefs["eve"].run
+    own = {f"evedrop/{run}/control/eve", f"evedrop/{run}/alive/eve"}
     assert {how: keys - own for how, keys in evidence.overheard.items() if keys - own} == {}
     assert len(evidence.overheard) > 100
 

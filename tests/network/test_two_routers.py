@@ -15,7 +15,7 @@ from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 from emulator.brief import Brief
 from emulator.errors import UsageError
-from emulator.network import wire
+from emulator.network import packets, wire
 from emulator.network.access import RELAY, Grant, Keys, access_control, grants
 from emulator.network.health import is_there
 from emulator.network.linked import at_relay, at_router
@@ -39,7 +39,7 @@ def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def flow(stage: Bench) -> None:
     """Let one slot pass, in which everybody gets a delivery across the link."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
     for ear in stage.downlinks.values():
         assert wire.Reader(*ear.hear()).integer("k") == k
 

@@ -31,6 +31,8 @@ VERDICTS = {
     ("acknowledged", "blocks-all"): Kept.BROKEN,
     ("acknowledged", "forges"): Kept.BROKEN,
     ("twin-track", "naive"): Kept.PERFECT,
+    ("twin-track", "tracker"): Kept.PERFECT,
+    ("twin-track", "replay-informed"): Kept.RELATIVE,
     ("innovation", "genie"): Kept.RELATIVE,
 }
 
@@ -80,6 +82,7 @@ def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
         ("plain", "bayesian", "innovations"),
         ("innovation", "reference", "references"),
         ("acknowledged", "selective", "header"),
+        ("innovation", "tracker", "two tracks"),
         ("innovation", "blocks-critical", "acknowledgements"),
     ],
 )

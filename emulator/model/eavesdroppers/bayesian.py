@@ -9,15 +9,16 @@ Source: docs/mathematics.md, bayesian eavesdropper.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from emulator.model.elementary import cholesky, exp
-from emulator.model.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from emulator.model.factored import Factor, Factors, covariance, grown, squared_length
 from emulator.model.leak import Leak, Leaks
+from emulator.model.mixture import NEGLIGIBLE, Mixture, merge, pruned, summed, with_a_place
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Belief, Flags, Heard
 from emulator.streams import Batch
@@ -26,29 +27,9 @@ _Kind = TypeVar("_Kind", bound=np.generic)
 
 CAPACITY = 12
 """Components a trial may have; beyond it the two least probable ones become one of the same mean and covariance."""
-NEGLIGIBLE = 1e-12
-"""Probability up to which a component is dropped."""
 _CERTAIN = 300.0  # an exponent at which a packet is the state beyond all doubt, and still far from overflow
 _SURE = 1e300  # odds of any greater amount
 _IMPOSSIBLE = -700.0  # one at which it is not, and still far from underflow
-
-
-class Mixture(NamedTuple):
-    """Up to C components for every trial; what has the weight 0 is none. A component keeps its place."""
-
-    weight: Floats
-    """(C, R); sums to 1 in every trial."""
-    mean: Floats
-    """(n, C, R)."""
-    lower: Floats
-    """Of the covariances' factors, (n (n−1)/2, C, R)."""
-    diagonal: Floats
-    """(n, C, R)."""
-
-    @property
-    def spread(self) -> Factors:
-        """The covariances."""
-        return Factors(self.lower, self.diagonal)
 
 
 class Bayesian(PacketReader):
@@ -165,22 +146,6 @@ def _weighed_ratios(
     return ratios
 
 
-def summed(values: Floats) -> Floats:
-    """Sum over components: (C, R) → (R,), one after the other, so that places that are empty in a trial change no bit."""
-    total = np.zeros(values.shape[1:])
-    for row in values:
-        total += row
-    return total
-
-
-def pruned(of: Mixture) -> Mixture:
-    """Without what is negligible, and without places that no trial needs."""
-    weight = np.where(of.weight > NEGLIGIBLE, of.weight, 0.0)
-    used = np.flatnonzero(weight.any(axis=1))
-    count = int(used[-1]) + 1 if used.size else 0
-    return Mixture(weight[:count], *(part[:, :count] for part in of[1:]))
-
-
 def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
     """With a component of each packet z (n, R) in its trial's first empty place, by its probability `state` (R,).
 
@@ -191,7 +156,7 @@ def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
     full = new[~free.any(axis=0)]
     if full.size:
         if len(of.weight) < capacity:
-            of = Mixture(*(_with_a_place(part, part.ndim - 2) for part in of))
+            of = Mixture(*(with_a_place(part, part.ndim - 2) for part in of))
         else:
             merge(of, full)
         free = of.weight[:, new] == 0.0
@@ -202,33 +167,6 @@ def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
         of.lower[:, place, new] = 0.0
         of.diagonal[:, place, new] = 0.0
     return of._replace(weight=of.weight / summed(of.weight))
-
-
-def _with_a_place(part: Floats, axis: int) -> Floats:
-    shape = list(part.shape)
-    shape[axis] = 1
-    return np.concatenate([part, np.zeros(shape)], axis=axis)
-
-
-def merge(of: Mixture, trials: NDArray[np.intp]) -> None:
-    """Make one of the two least probable components of some trials, in place; the other place is empty then."""
-    weight = of.weight[:, trials]
-    columns = np.arange(len(trials))
-    first = np.argmin(weight, axis=0)
-    without = weight.copy()
-    without[first, columns] = np.inf
-    second = np.argmin(without, axis=0)
-    one, two = ((place, trials) for place in (first, second))
-    total = of.weight[one] + of.weight[two]
-    a, b = of.weight[one] / total, of.weight[two] / total
-    apart = [m[two] - m[one] for m in of.mean]
-    U, V = ([[*row] for row in Factors(of.lower[:, p, t], of.diagonal[:, p, t]).unit()] for p, t in (one, two))
-    weights = [*(a * of.diagonal[(slice(None), *one)]), *(b * of.diagonal[(slice(None), *two)]), a * b]
-    lower, diagonal = orthogonalised([u + v + [d] for u, v, d in zip(U, V, apart, strict=True)], weights)
-    for m, d in zip(of.mean, apart, strict=True):
-        m[one] += b * d
-    of.lower[(slice(None), *one)], of.diagonal[(slice(None), *one)] = lower, diagonal
-    of.weight[one], of.weight[two] = total, 0.0
 
 
 def moments(of: Mixture) -> tuple[Floats, Floats]:

@@ -14,6 +14,7 @@ from emulator.model.eavesdroppers.reference import Reference
 from emulator.model.eavesdroppers.selective import Selective
 from emulator.model.eavesdroppers.smart import Smart
 from emulator.model.eavesdroppers.suspicious import Suspicious
+from emulator.model.eavesdroppers.tracker import Tracker
 from emulator.model.registry import Registry
 
 GROUP = "evedrop.eavesdroppers"
@@ -30,5 +31,6 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "genie": Genie,
     "reference": Reference,
     "selective": Selective,
+    "tracker": Tracker,
 }
 READERS: Registry[Eavesdropper] = Registry("eavesdropper", Eavesdropper, GROUP, _BUILT_IN, (*RESERVED, "reads_as"))  # type: ignore[type-abstract]
