@@ -47,8 +47,10 @@ def list_scenarios(_: argparse.Namespace) -> int:
 
     from emulator.scenario import shipped
 
-    for name, path in shipped().items():
-        print(f"{name:<16}{tomllib.loads(path.read_text(encoding='utf-8'))['title']}")
+    scenarios = shipped()
+    width = max(map(len, scenarios)) + 2
+    for name, path in scenarios.items():
+        print(f"{name:<{width}}{tomllib.loads(path.read_text(encoding='utf-8'))['title']}")
     return 0
 
 
