@@ -19,6 +19,8 @@ from emulator.streams import Batch, BlockReader
 
 _SETTLED = 1e-14
 _LONGEST = 200_000  # slots after which a filter counts as never settled
+_JUDGED = 32_768  # slots after which one that does not even come nearer does
+_NEARER = 0.45  # what is left of it by then, as 1/k: ½ of the last halving; as an exponential of any use: ⅓; as k: twice
 
 
 class Step(NamedTuple):
@@ -67,10 +69,15 @@ class Steps:
 def settled(process: Process, plant: Plant) -> Step:
     """The filter in the end. Raises ValueError if it never settles, or is of no use: it trusts no measurement any more."""
     steps = Steps(process, plant)
-    for _ in range(_LONGEST):
+    marks = []
+    for k in range(1, _LONGEST + 1):
         step = steps.next()
         if not np.isfinite(step.covariance).all():
             break
+        if k in {_JUDGED // 4, _JUDGED // 2, _JUDGED}:
+            marks.append(step.covariance)
+            if k == _JUDGED and np.abs(marks[2] - marks[1]).max() > _NEARER * np.abs(marks[1] - marks[0]).max():
+                break
         if steps.settled:
             if not step.innovation.any():
                 break
