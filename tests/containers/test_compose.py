@@ -142,15 +142,41 @@ def test_who_can_reach_what(going: Project) -> None:
         )
 
 
+PAGE = """
+import urllib.request
+try:
+    print(urllib.request.urlopen('http://127.0.0.1:17450/').read())
+except OSError as error:
+    print(error)
+"""
+PAGE_ANSWERS = "Rerun"
+
+
+def listening(project: Project) -> set[str]:
+    """The ports of the machine that are listened on; all of them on loopback."""
+    table = project.docker.inside("cat", "/proc/net/tcp").splitlines()[1:]
+    found = [line.split()[1].split(":") for line in table if line.split()[3] == "0A"]
+    assert {address for address, _ in found} <= {"0100007F"}
+    return {str(int(port, 16)) for _, port in found}
+
+
 def test_the_view_is_on_loopback_alone(going: Project) -> None:
     """The page answers at the address that the observer tells, and nothing else of the machine's listens for others."""
     address = next(line for line in going.said("observer").splitlines() if '"view"' in line)
     assert "http://127.0.0.1:17450/?url=" in address
-    page = "import urllib.request; print(urllib.request.urlopen('http://127.0.0.1:17450/').read())"
-    assert "Rerun" in going.docker.inside("python3", "-c", page)
-    table = going.docker.inside("cat", "/proc/net/tcp").splitlines()[1:]
-    listening = {line.split()[1].split(":")[0] for line in table if line.split()[3] == "0A"}
-    assert listening == {"0100007F"}
+    wait_until(lambda: PAGE_ANSWERS in going.docker.inside("python3", "-c", PAGE), "a page")
+    assert listening(going) == {"17450", "17451"}
+
+
+def test_a_finished_run_is_looked_at_without_an_installation(project: Make) -> None:
+    """As docs/containers.md says: the observer's service shows a results folder instead of conducting a run."""
+    one = project(EVEDROP_OPTIONS=SHORT)
+    one.compose("up")
+    folder = one.results().folder.name
+    how = ("run", "--detach", "--rm", "--no-deps", "--service-ports", "observer")
+    one.compose(*how, "view", f"/runs/{folder}", "--serve", "0.0.0.0:17450")
+    wait_until(lambda: listening(one) == {"17450", "17451"}, "the ports of a view")
+    wait_until(lambda: PAGE_ANSWERS in one.docker.inside("python3", "-c", PAGE), "a page")
 
 
 def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Make) -> None:
