@@ -4,16 +4,20 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-long test-compose lint setup clean
+.PHONY: demo test test-long test-hosts test-compose lint setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long and not containers"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long and not hosts and not containers"
 
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long
+
+# As root: every process in a network namespace of its own. Where that cannot be, it says so and fails nothing.
+test-hosts: $(READY)
+	$(BIN)/python -m pytest -m hosts tests/hosts
 
 # As root: docker-compose.yml brought up by a Docker daemon of its own. Where that cannot be, it says so and fails nothing.
 test-compose: $(READY)

@@ -1,6 +1,7 @@
 """Speed of live runs, side by side with raw Zenoh carrying the same messages. Prints a table; about three minutes.
 
     python benchmarks/live.py [--quick]
+    python benchmarks/live.py tls       # what certificates and a second router cost; about two minutes
 
 Machines are noisy: compare the columns of one table, not tables; every pair is measured in turn, the median is quoted.
 """
@@ -155,6 +156,24 @@ def memory(slots: int) -> None:
         print(f"    {name:<12} {quarter:6.0f} {one.resident[-1]:6.0f}   (peak {max(one.resident):.0f})")
 
 
+def connections(rounds: int) -> None:
+    """In clear, with certificates, and with two routers and certificates, in turn."""
+    ways = {
+        "in clear": lambda: (),
+        "with certificates": lambda: ("--listen", f"tls/127.0.0.1:{free_port()}"),
+        "two routers, with certificates": lambda: ("--set", "network.routers=2"),
+    }
+    for slots, trials in ((10_000, 1), (1_000, 1000)):
+        found: dict[str, list[float]] = {name: [] for name in ways}
+        for _ in range(rounds):
+            for name, options in ways.items():
+                summary, _usage = run("--slots", str(slots), "--trials", str(trials), *options())
+                found[name].append(summary["slots_per_second"])
+        for name, rates in found.items():
+            ratio = statistics.median(a / b for a, b in zip(rates, found["in clear"], strict=True))
+            print(f"{trials:>5} trials, {name}: {statistics.median(rates):>8,.0f} slots/s; ratio {ratio:.2f}")
+
+
 def start_up(rounds: int) -> None:
     """How long --help takes, and a run until its first slot."""
     times = {"evedrop --help": [sys.executable, "-m", "emulator", "--help"]}
@@ -194,7 +213,9 @@ def main(quick: bool) -> None:
 if __name__ == "__main__":
     from emulator.brief import read_brief
 
-    if len(sys.argv) > 2:
+    if sys.argv[1:] == ["tls"]:
+        connections(3)
+    elif len(sys.argv) > 2:
         {"send": _send, "receive": _receive, "watch": _watch}[sys.argv[1]](read_brief(Path(sys.argv[2])))
     else:
         main("--quick" in sys.argv)

@@ -19,6 +19,11 @@ for brief in $(cat /tmp/written); do
   process=$(basename "$brief" .json)
   case $process in
     router | sensor | legitimate | observer) ;;
+    controller | relay)
+      echo "evedrop: $scenario has a $process; docker-compose.yml has no service for one: add it (docs/containers.md), or start" \
+        "the run with \`evedrop run\` or, on several hosts, by \`evedrop brief\`" >&2
+      exit 2
+      ;;
     *) eavesdroppers="$eavesdroppers $process" ;;
   esac
 done

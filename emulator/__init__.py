@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from emulator import run, montecarlo, design, load_results
+    from emulator import run, montecarlo, compare, design, load_results
 
 Names are loaded when they are used: a peer imports this package too, and needs none of them.
 """
@@ -11,12 +11,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from emulator.api import design, montecarlo, run
+    from emulator.api import compare, design, montecarlo, run
     from emulator.runs.results import load_results
 
-__all__ = ["design", "load_results", "montecarlo", "run"]
+__all__ = ["compare", "design", "load_results", "montecarlo", "run"]
 
 _HOMES = {
+    "compare": "emulator.api",
     "design": "emulator.api",
     "load_results": "emulator.runs.results",
     "montecarlo": "emulator.api",

@@ -1,10 +1,10 @@
-"""The Python calls: `run`, `montecarlo`, `design`, `load_results`. They do what the commands of the same name do."""
+"""The Python calls: `run`, `montecarlo`, `compare`, `design`, `load_results`. They do what the commands of the same name do."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING, Any
 from emulator.errors import UsageError
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link_law import law_of
+from emulator.model.outcomes import GENIE_SCHEMES
+from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.runs.results import Results, load_results
 from emulator.scenario import Scenario, checked, load
+from emulator.scenario.words import listed
 
 if TYPE_CHECKING:
     from emulator.model.design import Design
+    from emulator.runs.compare import Comparison
     from emulator.runs.montecarlo import Plan
 
 Tell = Callable[[Mapping[str, Any]], None]
@@ -86,6 +90,40 @@ def montecarlo(
     return load_results(folder)
 
 
+def compare(
+    scenario: str | Path | Scenario,
+    *,
+    schemes: Sequence[str] | None = None,
+    adversaries: Sequence[str] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    trials: int = 200,
+    out: str | Path | None = None,
+    plan: Plan | None = None,
+    tell: Tell = _silent,
+    **changes: Any,
+) -> Comparison:
+    """Every scheme against every adversary, on a scenario's process and links.
+
+    schemes, adversaries: names, all of them unless said; parameters: of schemes that are not the scenario's own, such as
+    `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
+
+    Raises UsageError with every name that is none, ScenarioError with every mistake of the scenario, RunError if a worker
+    fails, Interrupted on Ctrl-C; after the last two the folder holds the schemes that were done.
+
+    >>> found = compare("acknowledged", schemes=["acknowledged", "innovation"])        # doctest: +SKIP
+    >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
+    >>> found.table.to_pandas()                                                        # doctest: +SKIP
+    """
+    from emulator.runs.compare import compare_all  # noqa: PLC0415 - no other call needs it
+    from emulator.runs.matchups import matchups_of  # noqa: PLC0415 - the same
+    from emulator.runs.montecarlo import Plan  # noqa: PLC0415 - the same
+
+    made, _ = _prepared(scenario, None, {**changes, "trials": trials})
+    name = "scenario" if isinstance(scenario, Scenario) else Path(scenario).name
+    place = Path(out) if out is not None else default_folder(f"compare-{name}")
+    return compare_all(matchups_of(made, schemes, adversaries, parameters), place, tell, plan or Plan())
+
+
 def design(
     scenario: str | Path | Scenario, *, max_trace: float | None = None, changes: Mapping[str, Any] | None = None
 ) -> Design:
@@ -93,12 +131,14 @@ def design(
 
     max_trace: Ω, for which the least μ_d is sought; changes: entries by dotted key.
 
-    Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω.
+    Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω or the scheme is not one of states and innovations.
     """
     from emulator.model.design import Adversary  # noqa: PLC0415 - a run does not need it
     from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
+    if made.encoding.scheme not in GENIE_SCHEMES:
+        raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
     quality = {}
@@ -121,6 +161,21 @@ def design(
             adversaries.append(Adversary.who(name, quality[name], outcomes_at(1.0)))
     process, mu, mu_d = made.process.process, quality[LEGITIMATE], made.encoding.mu_d
     return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
+
+
+def _not_for(scheme: str) -> str:
+    """Why nothing is designed for a scheme, and what to do instead."""
+    why = f"the design of μ_d is for the scheme {listed(GENIE_SCHEMES)}"
+    instead = "give --set 'encoding={scheme = \"innovation\", state_probability = 0.6}' to design that on this process"
+    if SCHEMES.foreign(scheme):
+        return f"{why}; no closed form is known for {scheme}; {instead}, or study it by evedrop sweep"
+    if SCHEMES[scheme].needs_acknowledgements:
+        instead = (
+            f"evedrop compare SCENARIO --schemes {scheme},innovation --out DIR measures both on this process, and writes "
+            "DIR/scenarios/innovation.toml, which can be designed"
+        )
+        return f"{why}, and this scenario has {scheme}; {instead}"
+    return f"{why}, and this scenario has {scheme}; {instead}, or see by evedrop compare what {scheme} gives"
 
 
 def _prepared(

@@ -26,13 +26,15 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements"),
-    "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart"),
-    "legitimate": ("scheme", "window", "outages"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller", "zid"),
+    "relay": ("users", "receivers", "listen", "zid", "controller"),
+    "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart", "plant", "controller"),
+    "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
-    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity"),
+    "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
+    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity", "shard"),
 }
-ROLES = ("router", "sensor", "legitimate", "eavesdropper", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 
 
 @dataclass(frozen=True)
@@ -58,11 +60,13 @@ class Model:
     """μ_d."""
     header: int = 0
     """Numbers that a packet has in clear beside its payload."""
+    singular_noise: bool = False
+    """Whether Q may be singular."""
 
     @property
     def process(self) -> Process:
         """The process of the model."""
-        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance))
+        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
 
 
 @dataclass(frozen=True)
@@ -179,5 +183,6 @@ def _check_numbers(brief: Brief) -> None:
     if min(brief.slots, brief.trials, brief.recorded, brief.flow.window, brief.flow.batch) < 1 or brief.first_trial < 0:
         raise ValueError("slots, trials, recorded, flow.window and flow.batch must be at least 1")
     model = brief.model
-    if mistakes_of(*(np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance))):
+    A, Q, initial = (np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance))
+    if mistakes_of(A, Q, initial, model.singular_noise):
         raise ValueError("its model is no process")

@@ -135,12 +135,13 @@ def _parser() -> argparse.ArgumentParser:
     add("step", operate.step, "let some slots of a run pass, and hold it again", _going_on, _slots)
     add("status", operate.status, "how a run that goes on is doing", _going_on, _as_json)
     add("sweep", commands.sweep, "Monte Carlo over a grid of values of any entries", _scenario, _over, *_MEMORY)
+    add("compare", commands.compare, "every scheme against every adversary", _scenario, _entries, _output, _compares)
     add("design", commands.design, "admissible μ_d, secrecy, optimum, per eavesdropper", _scenario, _set, _designs)
     add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view, _served)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
     add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
-    add("check", commands.check, "validate scenarios only", _scenarios, _set)
+    add("check", commands.check, "validate scenarios, or classes of your own", _scenarios, _set, _classes)
     links = top.group("links", "what can be found out about links")
     links.add(
         "fit", commands.fit_link, "the loss model, and delays, of a recorded link", _argument("trace", "TRACE"), _fits
@@ -148,7 +149,7 @@ def _parser() -> argparse.ArgumentParser:
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
     add("health", commands.health, "whether the process of a brief is on the network", _argument("brief", "BRIEF"))
-    for role in ("router", "sensor", "legitimate", "eavesdropper", "observer"):
+    for role in ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
         of_role = (_role(role), _observed, _served) if role == "observer" else (_role(role),)
         add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser
@@ -171,7 +172,18 @@ def _scenario(parser: argparse.ArgumentParser) -> None:
 
 
 def _scenarios(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenarios", nargs="+", metavar="SCENARIO")
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO")
+
+
+def _classes(parser: argparse.ArgumentParser) -> None:
+    for kind, what in (
+        ("scheme", "a scheme, or the one that an eavesdropper is checked beside"),
+        ("eavesdropper", "an eavesdropper"),
+        ("link", "a loss model"),
+        ("delay", "a delay model"),
+    ):
+        text = f"check {what}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+        parser.add_argument(f"--{kind}", metavar="NAME", help=text)
 
 
 def _places(parser: argparse.ArgumentParser) -> None:
@@ -244,6 +256,7 @@ def _output(parser: argparse.ArgumentParser) -> None:
 def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
     parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint: tcp or tls, /127.0.0.1:PORT")
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's, of a scenario with two")
 
 
 def _finished_view(parser: argparse.ArgumentParser) -> None:
@@ -293,6 +306,20 @@ def _over(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _compares(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--schemes", metavar="A,B", help="default all")
+    parser.add_argument("--adversaries", metavar="X,Y", help="default all")
+    parser.add_argument(
+        "--with",
+        dest="parameters",
+        action="append",
+        default=[],
+        metavar="SCHEME.PARAMETER=VALUE",
+        help="a parameter of a scheme that is not the scenario's own; repeatable",
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="worker processes; the results do not depend on them")
+
+
 def _designs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-trace", type=float, metavar="Ω", help="least μ_d whose limiting trace stays below Ω")
     parser.add_argument("--json", action="store_true", help="for programs")
@@ -327,6 +354,10 @@ def _briefs(parser: argparse.ArgumentParser) -> None:
         help="where the router listens, such as tls/router.lan:7447",
     )
     parser.add_argument("--connect", metavar="ENDPOINT", help="what the others connect to; default as --listen says")
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, of a scenario with two")
+    parser.add_argument(
+        "--relay-connect", metavar="ENDPOINT", help="what those at it connect to; default as --relay says"
+    )
     parser.add_argument(
         "--wait", type=int, default=600, metavar="SECONDS", help="how long everybody waits for the others; default 600"
     )

@@ -45,11 +45,13 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
-    """A line for each shipped scenario."""
-    from emulator.scenario import load, shipped
+    """A line for each shipped scenario, also for those that need an extra which is not there."""
+    import tomllib
 
-    for name in shipped():
-        print(f"{name:<16}{load(name).title}")
+    from emulator.scenario import shipped
+
+    for name, path in shipped().items():
+        print(f"{name:<16}{tomllib.loads(path.read_text(encoding='utf-8'))['title']}")
     return 0
 
 
@@ -78,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     folder = options.out or default_folder(options.scenario)
     with ProgressLine(scenario.slots, "slots", options.json) as line:
         try:
-            ended = launch(scenario, folder, options.view, options.listen, line.tell)
+            ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
         except (RunError, Interrupted):
             with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
                 _print_results(folder, options.json)
@@ -122,6 +124,7 @@ def _replay(folder: Path) -> str | None:
     except UsageError:  # float64 cannot follow the states of so many slots
         return None
     recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
+    recorded += " --set shards=1" if scenario.shards > 1 else ""
     # A quantile over trials can be expected of many alone.
     expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
     return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"
@@ -192,6 +195,47 @@ def sweep(options: argparse.Namespace) -> int:
     else:
         print_sweep(table, tuple(grid), str(folder))
     return 0
+
+
+def compare(options: argparse.Namespace) -> int:
+    """Compare schemes and adversaries."""
+    from emulator.api import compare as compare_all
+    from emulator.api import default_folder
+    from emulator.runs.compare_report import print_comparison
+    from emulator.runs.montecarlo import Plan
+    from emulator.runs.report import ProgressLine
+    from emulator.scenario import value_of
+
+    changes = _changes(options)
+    parameters = {}
+    for text in options.parameters:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(
+                f"--with {text}: expected SCHEME.PARAMETER=VALUE, such as innovation.state_probability=0.7"
+            )
+        parameters[key] = value_of(value)
+    folder = options.out or default_folder(f"compare-{Path(options.scenario).name}")
+    with ProgressLine(0, "trial-slots", options.json) as line:
+        found = compare_all(
+            options.scenario,
+            schemes=_names(options.schemes),
+            adversaries=_names(options.adversaries),
+            parameters=parameters,
+            out=folder,
+            plan=Plan(workers=options.workers),
+            tell=line.tell,
+            **{"trials": 200, **changes},
+        )
+    if options.json:
+        print(found.as_json(indent=None))
+    else:
+        print_comparison(found, str(folder))
+    return 0
+
+
+def _names(listed: str | None) -> list[str] | None:
+    return None if listed is None else [name.strip() for name in listed.split(",")]
 
 
 def design(options: argparse.Namespace) -> int:
@@ -286,10 +330,15 @@ def test(options: argparse.Namespace) -> int:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Validate scenarios."""
+    """Validate scenarios, or classes."""
     from emulator.runs.estimates import warnings_of
     from emulator.scenario import load
 
+    names = {kind: name for kind in ("scheme", "eavesdropper", "link", "delay") if (name := getattr(options, kind))}
+    if bool(names) == bool(options.scenarios):
+        raise UsageError("check: expected scenarios, or classes by --scheme, --eavesdropper, --link or --delay")
+    if names:
+        return _check_classes(names, _changes(options))
     status = 0
     for name in options.scenarios:
         try:
@@ -301,6 +350,24 @@ def check(options: argparse.Namespace) -> int:
         print(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
         for warning in warnings_of(scenario):
             print(f"  warning: {warning}")
+    return status
+
+
+def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
+    from emulator.conformance.examine import examined
+
+    status = 0
+    for one in examined(names, parameters):
+        broken = [verdict for verdict in one.verdicts if verdict.broken is not None]
+        print(
+            f"{one.title}: {f'{len(broken)} broken' if broken else 'all'} of {len(one.verdicts)} rules"
+            + ("" if broken else " kept")
+        )
+        for verdict in one.verdicts:
+            print(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}")
+            if verdict.broken is not None:
+                print(f"          {verdict.broken}")
+        status = UsageError.exit_status if broken else status
     return status
 
 
@@ -334,12 +401,13 @@ def fit_link(options: argparse.Namespace) -> int:
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
-    from emulator.runs.ports import meeting_at
+    from emulator.runs.ports import places_at
 
     if not 1 <= options.wait <= 30 * 86_400:
         raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
-    meeting = meeting_at(options.listen, options.connect, options.insecure)
-    for path in write_briefs(_loaded(options), meeting, options.results, options.out, options.wait):
+    scenario = _loaded(options)
+    places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
+    for path in write_briefs(scenario, places, options.results, options.out, options.wait):
         print(path)
     return 0
 
@@ -347,11 +415,14 @@ def brief(options: argparse.Namespace) -> int:
 def process(options: argparse.Namespace) -> int:
     """Be one process of a run."""
     from emulator.brief import read_brief
+    from emulator.modules import look_in
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
     if getattr(options, "out", None) is not None:
         brief = replace(brief, part={**brief.part, "results": str(options.out)})
+    if brief.part.get("modules") is not None:
+        look_in(str(brief.part["modules"]))
     try:
         return _play(brief, getattr(options, "serve", None))
     except BriefError as error:
@@ -360,6 +431,8 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: Brief, serve: str | None) -> int:
     """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    from emulator.model.registry import NotRegistered
+
     if brief.identity is not None:
         from emulator.network.certificates import check_identity
 
@@ -367,19 +440,26 @@ def _play(brief: Brief, serve: str | None) -> int:
     match brief.role:
         case "router":
             from emulator.network.router import route as play
+        case "relay":
+            from emulator.network.relay import relay as play
         case "sensor":
             from peers.sensor import sense as play
         case "legitimate":
             from peers.legitimate import estimate as play
         case "eavesdropper":
             from peers.eavesdropper import eavesdrop as play
+        case "controller":
+            from peers.controller import steer as play
         case "observer":
             from emulator.runs.observer import observe
 
             return observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
-    play(brief)
+    try:
+        play(brief)
+    except NotRegistered as error:
+        raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
     return 0
 
 

@@ -50,6 +50,12 @@ def no_run(folder: Path, why: str) -> UsageError:
     )
 
 
+def read_controls(folder: Path) -> list[Control]:
+    """The control file of a run that goes on, or those of its shards. Raises UsageError as `read_control` does."""
+    shards = sorted(path.parent for path in folder.glob(f"shards/*/{_NAME}"))
+    return [read_control(shard) for shard in shards] or [read_control(folder)]
+
+
 def read_control(folder: Path) -> Control:
     """The control file of a run that goes on. Raises UsageError if there is none, or it is none."""
     path = folder / _NAME

@@ -3,7 +3,8 @@
 EvedropError                    exit status
 ├── UsageError                  2   the command line or a file it names cannot be used
 │   ├── ScenarioError           2   the scenario has mistakes: all of them, listed
-│   └── TraceError              2   a recording cannot be read as one
+│   ├── TraceError              2   a recording cannot be read as one
+│   └── DisturbanceError        2   a table of disturbances cannot be read as one: all that is wrong, listed
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
@@ -43,6 +44,14 @@ class TraceError(UsageError):
         self.entry = entry
         self.what = what
         super().__init__(f"{path}: {what}")
+
+
+class DisturbanceError(UsageError):
+    """A table of disturbances that is none: `mistakes` lists every one, with its line in the file."""
+
+    def __init__(self, path: str, mistakes: list[str]) -> None:
+        self.mistakes = mistakes
+        super().__init__("\n".join(f"{path}: {line}" for line in mistakes))
 
 
 class BriefError(EvedropError):

@@ -8,12 +8,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.errors import UsageError
+from emulator.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
+    from emulator.control import Control
     from emulator.network.operator import Answer, Request
 
 _PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has started again
@@ -45,9 +47,13 @@ def step(options: argparse.Namespace) -> int:
 
 def status(options: argparse.Namespace) -> int:
     """Say how the run is doing."""
+    from emulator.control import read_controls
     from emulator.network.operator import Request
 
-    found = dict(_answer(options.run, Request("status"), "status", _PATIENCE).status or {})
+    answers = [
+        _answer(options.run, control, Request("status"), "status", _PATIENCE) for control in read_controls(options.run)
+    ]
+    found = _of_all([answer.status or {} for answer in answers])
     if options.json:
         print(json.dumps(found, ensure_ascii=False))
     else:
@@ -56,20 +62,29 @@ def status(options: argparse.Namespace) -> int:
 
 
 def _ask(run: Path, do: str, what: str, patience: float = _PATIENCE, **fields: Any) -> int:
+    from emulator.control import read_controls
     from emulator.network.operator import Request
 
-    print(_answer(run, Request(do, **fields), what, patience).said)
+    control = read_controls(run)[0]  # of a run in shards any of them says that they are not steered
+    print(_answer(run, control, Request(do, **fields), what, patience).said)
     return 0
 
 
-def _answer(run: Path, request: Request, what: str, patience: float) -> Answer:
-    """What the observer of a run answers. Raises UsageError if there is none, or it refuses."""
+def _answer(run: Path, control: Control, request: Request, what: str, patience: float) -> Answer:
+    """What the observer of a run, or of one of its shards, answers. Raises UsageError if there is none, or it refuses."""
     import zenoh
 
-    from emulator.control import no_run, read_control
+    from emulator.control import no_run
     from emulator.network.operator import ask
 
-    control, began = read_control(run), time.monotonic()
+    began = time.monotonic()
+    if control.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        try:
+            check_identity(control.identity, control.user)
+        except BriefError as error:
+            raise UsageError(f"{run / 'control.json'}: {error}") from error
     try:
         found = ask(control, request, patience)
     except zenoh.ZError as error:
@@ -113,6 +128,17 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     except TypeError:  # a date is no value that a link could have, and no message either
         value = text
     inner[last] = value
+
+
+def _of_all(statuses: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """How the shards of a run are doing as one: the slowest one's, who is there in all of them, and all packets."""
+    found = dict(min(statuses, key=lambda status: int(status["slot"])))
+    found["processes"] = {name: all(one["processes"][name] for one in statuses) for name in found["processes"]}
+    for name in found["links"]:
+        offered, delivered = (sum(one["links"][name][what] for one in statuses) for what in ("offered", "delivered"))
+        fraction = delivered / offered if offered else None
+        found["links"] = {**found["links"], name: {"offered": offered, "delivered": delivered, "fraction": fraction}}
+    return found
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

@@ -12,16 +12,24 @@ import numpy as np
 from emulator.brief import Brief
 from emulator.model.follower import Follower
 from emulator.model.receiver import Belief, Receiver
+from emulator.model.transit import Arrival
 from emulator.network.reporting import BeliefReporter
 from emulator.network.resending import Due
 from emulator.network.session import Inbox, Session
 from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_acknowledgement, read_delivery
+from peers.loop import Consultation
 
 
-def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None:
-    """Run a receiver over all slots of its brief, but for those in which it is away; it may acknowledge what it receives.
+def follow(
+    brief: Brief,
+    receiver: Receiver,
+    acknowledges: bool = False,
+    consult: Callable[[Session], Consultation] | None = None,
+) -> None:
+    """Run a receiver over all slots of its brief, but for those in which it is away.
 
-    What it has had already is acknowledged once more and else ignored: the first acknowledgement may have been lost.
+    It may acknowledge what it receives, and be consulted by a controller.
+    What it has had already is acknowledged once more and else ignored.
     """
     name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part["window"]
     outages = {start: (stop, keeps) for start, stop, keeps in brief.part["outages"]}
@@ -34,7 +42,7 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
         put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in outages.items() for slot in (start, stop)]
         put_progress = session.kept(session.keys.progress(name), 0)
-        put_acknowledgement = session.outlet(session.keys.acknowledged) if acknowledges else None
+        answers = Answers(brief, session, acknowledges, None if consult is None else consult(session))
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
         due = Due(downlink, brief.flow.longest_outage)
         session.ready()
@@ -60,37 +68,59 @@ def follow(brief: Brief, receiver: Receiver, acknowledges: bool = False) -> None
                 reporter.skip(stop)
                 k = stop
             if found != k:
-                if found < k and put_acknowledgement is not None:
-                    put_acknowledgement(_acknowledged(message, brief.trials))
+                if found < k:
+                    answers.had(found, message)
                 due.missed(k, found)
                 continue
             arrival = read_delivery(message, k, shape, brief.model.header)
-            if put_acknowledgement is not None:
-                put_acknowledgement(acknowledgement(k, arrival.heard.gamma))
+            answers.before(k, arrival)
             belief = follower.take(k, arrival)
+            answers.after(k, belief)
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
-        if put_acknowledgement is not None:
-            # Who has all it needs may still be asked for its acknowledgements; the thread ends with the session.
-            _acknowledge_again(deliveries, put_acknowledgement, downlink, brief.trials)
+        answers.over(deliveries, downlink)
         session.wait_for("end")
 
 
-def _acknowledge_again(deliveries: Inbox, put: Callable[[bytes], None], key: str, trials: int) -> None:
-    """Acknowledge whatever still comes, on a thread of its own."""
+class Answers:
+    """What a receiver says to others than the observer: acknowledgements, and its estimate to a controller. Final."""
 
-    def go_on() -> None:
+    def __init__(self, brief: Brief, session: Session, acknowledges: bool, consultation: Consultation | None) -> None:
+        self._trials = brief.trials
+        self._acknowledge = session.outlet(session.keys.acknowledged) if acknowledges else None
+        self._consultation = consultation
+
+    def had(self, k: int, delivery: Reader) -> None:
+        """A delivery of slot k has come once more: the first acknowledgement may have been lost."""
+        if self._acknowledge is not None:
+            self._acknowledge(_acknowledged(delivery, k, self._trials))
+
+    def before(self, k: int, arrival: Arrival) -> None:
+        """Slot k's delivery is here."""
+        if self._acknowledge is not None:
+            self._acknowledge(acknowledgement(k, arrival.heard.gamma))
+        if self._consultation is not None:
+            self._consultation.before(k)
+
+    def after(self, k: int, belief: Belief) -> None:
+        """Slot k's delivery has been dealt with."""
+        if self._consultation is not None:
+            self._consultation.after(k, belief)
+
+    def over(self, deliveries: Inbox, key: str) -> None:
+        """All slots are done: acknowledge whatever still comes, on a thread of its own that ends with the session."""
+        if self._acknowledge is not None:
+            threading.Thread(target=self._go_on, args=(deliveries, key), name="acknowledges", daemon=True).start()
+
+    def _go_on(self, deliveries: Inbox, key: str) -> None:
         for delivery in deliveries:
             message = Reader(key, delivery.payload.to_bytes())
             if not is_hold(message):
-                put(_acknowledged(message, trials))
-
-    threading.Thread(target=go_on, name="acknowledges", daemon=True).start()
+                self.had(message.integer("k"), message)
 
 
-def _acknowledged(delivery: Reader, trials: int) -> bytes:
+def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
     """The acknowledgement of a delivery, whose γ is where a delivery has its own."""
-    k = delivery.integer("k")
     return acknowledgement(k, read_acknowledgement(delivery, k, trials))
 
 

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from emulator.brief import Brief
+from emulator.model.informed import Informed
+from emulator.model.plant import Plant
 from emulator.model.schemes import scheme_of
 from peers.following import follow
+from peers.loop import Consultation
 
 
 def estimate(brief: Brief) -> None:
     """Run the legitimate estimator of a brief."""
     scheme = scheme_of(brief.model.process, brief.part["scheme"])
-    follow(brief, scheme.estimator(brief.stream_keys, brief.batch), scheme.needs_acknowledgements)
+    receiver, loop = scheme.estimator(brief.stream_keys, brief.batch), brief.part["controller"]
+    if loop is not None and loop["plant"] is not None:
+        receiver = Informed(receiver, Plant.of(loop["plant"]), brief.part["window"])
+    consult = partial(Consultation, brief, receiver=receiver) if loop is not None else None
+    follow(brief, receiver, scheme.needs_acknowledgements, consult)

@@ -8,6 +8,7 @@ from queue import SimpleQueue
 
 from emulator.brief import Brief
 from emulator.model.detection import Chart, Watch
+from emulator.model.plant import Plant
 from emulator.model.process import Trajectory
 from emulator.model.receiver import Flags
 from emulator.model.schemes import scheme_of
@@ -17,6 +18,7 @@ from emulator.network.reporting import TruthReporter
 from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
 from emulator.network.wire import Beside, Reader, held, hold, once_more, read_acknowledgement, read_progress, uplink
+from peers.loop import Actuator
 
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
@@ -59,12 +61,15 @@ class Window:
 class Holds:
     """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
 
-    def __init__(self, brief: Brief, session: Session, window: Window, scheme: Scheme) -> None:
+    def __init__(
+        self, brief: Brief, session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
+    ) -> None:
         self._session, self._window = session, window
         self._holds = set(brief.part["holds"])
         self._telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
         watches = brief.part["chart"] is not None
-        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches)
+        inputs, measures = (0, False) if actuator is None else (actuator.inputs, actuator.measures)
+        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches, inputs, measures)
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
@@ -99,10 +104,7 @@ class Acknowledgements:
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
-        message = Reader(self._key, self._inbox.recv().payload.to_bytes())
-        while (found := message.integer("k")) != k:  # sent once more
-            self._due.missed(k, found)
-            message = Reader(self._key, self._inbox.recv().payload.to_bytes())
+        message = self._due.take(lambda: Reader(self._key, self._inbox.recv().payload.to_bytes()), k)
         acknowledged = read_acknowledgement(message, k, self._trials)
         self._encoder.acknowledged(k, acknowledged)
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
@@ -113,14 +115,17 @@ def sense(brief: Brief) -> None:
     process, keys = brief.model.process, brief.stream_keys
     scheme = scheme_of(process, brief.part["scheme"])
     encoder = scheme.encoder(keys, brief.batch)
-    trajectory = Trajectory(process, keys["process"], brief.batch, scheme.initial_state(keys, brief.batch))
+    initial, plant = scheme.initial_state(keys, brief.batch), brief.part["plant"]
+    noise = None if plant is None else Plant.of(plant).noise
+    trajectory = Trajectory(process, keys["process"], brief.batch, initial, noise)
     betrayed = set(brief.part["leaks"].values())
     pace = float(brief.part["pace"])
     with Session(brief) as session:
         send = session.kept(session.keys.uplink, head=once_more, back=brief.part["history"])
         window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window, send)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
-        holds = Holds(brief, session, window, scheme)
+        actuator = Actuator(brief, session) if plant is not None else None
+        holds = Holds(brief, session, window, scheme, actuator)
         session.ready()
         session.wait_for("start")
         start = time.monotonic()
@@ -135,10 +140,14 @@ def sense(brief: Brief) -> None:
                 holds.hold(k)
                 start += time.monotonic() - began
                 time.sleep(max(0.0, start + k * pace - time.monotonic()) if pace else 0.0)
-            x = trajectory.advance()
-            packet = encoder.encode(k, x, trajectory.predicted)
+            true = trajectory.advance(None if actuator is None else actuator.pushed(k))
+            x, predicted = true, trajectory.predicted
+            if actuator is not None:
+                x, predicted = actuator.transmitted(k, true, trajectory)
+            packet = encoder.encode(k, x, predicted)
             beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
             send(k, uplink(k, packet.z, **beside.given))
             alarms = back.wait(k, packet) if back is not None else None
-            holds.reporter.add(k, x, packet.nu, packet.sent, alarms)
+            steered = actuator.wait(k, true) if actuator is not None else None
+            holds.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
         session.wait_for("end")

@@ -16,7 +16,7 @@ from typing import Any
 from emulator import montecarlo
 from emulator.brief import read_brief
 from emulator.runs.briefs import write_briefs
-from emulator.runs.ports import meeting_at
+from emulator.runs.ports import places_at
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario
 from tests.conftest import wait_until
@@ -35,13 +35,15 @@ class ByHand:
     """Process → the words before its command line, such as those that enter a network namespace."""
     insecure: bool = False
     """Whether it may be in clear although others could listen."""
+    relay: str | None = None
+    """Where the second router listens, if there is one."""
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     _done: list[int] = field(default_factory=list)
 
     def write(self, **endpoints: str) -> None:
         """Write the briefs; endpoints: process → where it finds the router, if that is elsewhere."""
-        meeting = meeting_at(self.endpoint, insecure=self.insecure)
-        for path in write_briefs(self.scenario, meeting, self.folder / "run", self.folder / "briefs", int(LONG)):
+        places = places_at(self.endpoint, insecure=self.insecure, relay=self.relay)
+        for path in write_briefs(self.scenario, places, self.folder / "run", self.folder / "briefs", int(LONG)):
             if path.stem in endpoints:
                 brief = json.loads(path.read_text())
                 path.write_text(json.dumps({**brief, "router": endpoints[path.stem]}))
@@ -49,7 +51,8 @@ class ByHand:
     @property
     def names(self) -> tuple[str, ...]:
         """All processes."""
-        return ("router", "sensor", *self.scenario.receivers, "observer")
+        relay = () if self.relay is None else ("relay",)
+        return ("router", *relay, "sensor", *self.scenario.digested, "observer")
 
     def start(self, *names: str) -> None:
         """Start these processes, or all."""
@@ -125,3 +128,5 @@ def as_if_undisturbed(summary: Mapping[str, Any], scenario: Scenario, folder: Pa
         assert link["unexplained"] == 0
         assert link == expected["links"][name]
         assert summary["peers"][name]["digest"] == expected["peers"][name]["digest"]
+    if expected["controller"] is not None:
+        assert summary["controller"]["digest"] == expected["controller"]["digest"]

@@ -158,6 +158,42 @@ def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
     )
 
 
+@pytest.mark.parametrize("scheme", ["twin-track", "cipher", "withholding"])
+def test_a_scheme_without_such_a_choice_is_refused(evedrop: Evedrop, scheme: str) -> None:
+    """In one line, with a change that helps, which does."""
+    parameter = ", state_probability = 0.5" if scheme == "withholding" else ""
+    done = evedrop("design", "twin-track", *changes(encoding=f'{{scheme = "{scheme}"{parameter}}}'))
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert f"for the scheme innovation or plain, and this scenario has {scheme}; give --set" in line
+    remedy = line.partition("--set '")[2].partition("'")[0]
+    assert designed(evedrop, "twin-track", "--set", remedy)["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
+
+
+@pytest.mark.parametrize("scheme", ["acknowledged", "scheduled", "encrypted-schedule"])
+def test_a_scheme_that_needs_acknowledgements_is_refused(evedrop: Evedrop, scheme: str) -> None:
+    """In one line, with a command that makes a scenario of it which can be designed."""
+    encoding = f'{{scheme = "{scheme}"{"" if scheme == "acknowledged" else ", threshold = 3"}}}'
+    done = evedrop("design", "acknowledged", *changes(encoding=encoding, expect=[]))
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert f"and this scenario has {scheme}; evedrop compare SCENARIO --schemes {scheme},innovation --out DIR" in line
+    if scheme == "acknowledged":
+        words = ("--schemes", f"{scheme},innovation", "--trials", "1", "--slots", "5", "--workers", "1")
+        assert evedrop("compare", scheme, *words, "--out", "DIR").status == 0
+        assert designed(evedrop, "DIR/scenarios/innovation.toml")["eavesdroppers"]["smart"]["bound"] == pytest.approx(
+            LOW
+        )
+
+
+def test_sending_every_state_is_a_choice(evedrop: Evedrop) -> None:
+    """The scheme plain is μ_d = 1: its trace is that of sending every state, and the range is the same."""
+    naive = changes(encoding='{scheme = "plain"}', eavesdroppers='{eve = {strategy = "naive", link = {quality = 0.9}}}')
+    found = designed(evedrop, "numerical", *naive)
+    assert found["legitimate"]["trace"] == pytest.approx(0.000228372, rel=1e-5)
+    assert found["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
+
+
 def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:
     """A file where the folder should be: one line, exit 2."""
     (evedrop.folder / "file").touch()

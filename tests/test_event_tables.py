@@ -224,3 +224,55 @@ def test_events_survive_being_written_and_read() -> None:
     again = Scenario.model_validate(scenario.model_dump(mode="json"))
     assert again == scenario
     assert again.timeline == scenario.timeline
+
+
+@pytest.mark.parametrize(
+    ("event", "receiver", "more"),
+    [
+        (
+            {"from": 10, "to": 20, "kill": "legitimate"},
+            "legitimate",
+            {"legitimate": {"link": {"quality": 0.9, "delay": {"model": "constant", "value": 1.0}}, "window": 2}},
+        ),
+        (
+            {"from": 10, "to": 20, "jam": "acknowledgements"},
+            "eve",
+            {
+                "encoding": {"scheme": "acknowledged"},
+                "eavesdroppers": {"eve": {"strategy": "reference", "link": {"quality": 0.9}}},
+                "acknowledgements": {"link": {"quality": 0.9}, "attack": "all"},
+            },
+        ),
+    ],
+)
+def test_an_expectation_that_events_leave_without_theory_is_refused(
+    event: dict[str, Any], receiver: str, more: dict[str, Any]
+) -> None:
+    """What would come out as null is refused, also where link and strategy by themselves have a theory."""
+    figure = f"{receiver}.expected_trace_covariance"
+    expect = [{"figure": figure, "below": 1.0}]
+    (line,) = mistakes(event, expect=expect, **more)
+    why = f"there is no theory for {receiver} with these links, attacks and events together"
+    assert line == f'expect.0.figure: is "{figure}", but {why}; expected another figure'
+    assert right(expect=expect, **more)
+
+
+@pytest.mark.parametrize(
+    ("event", "away"),
+    [
+        ({"from": 10, "to": 20, "kill": "spy"}, "down (event.0, from slot 10 on)"),
+        ({"at": 15, "pause": "spy"}, "paused (event.0, from slot 15 on)"),
+        ({"from": 16, "to": 20, "kill": "spy"}, None),
+        ({"from": 10, "to": 15, "pause": "spy"}, None),
+        ({"from": 10, "to": 20, "kill": "legitimate"}, None),
+        ({"from": 10, "to": 20, "cut": "spy"}, None),
+    ],
+)
+def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | None) -> None:
+    """A slot in which it is down or paused is a mistake; a link that is cut is none, for it is not told over that."""
+    spy = {"strategy": "replay-informed", "reads_as": "naive", "learns_at": 15, "link": {"quality": 0.8}}
+    if away is None:
+        assert right(event, eavesdroppers={"spy": spy}).leaks == {"spy": 15}
+    else:
+        (line,) = mistakes(event, eavesdroppers={"spy": spy})
+        assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is there"

@@ -57,6 +57,13 @@ def test_peers_and_network_stay_light() -> None:
         assert not ours(names) & {"emulator.view", "emulator.runs", "emulator.scenario", "emulator.api"}, module
 
 
+def test_a_solver_is_loaded_by_who_uses_it_alone() -> None:
+    """The strategy that needs one is part of the model, and registered in it, but loads it with its first controller."""
+    names = loaded_by("emulator.model.controllers")["emulator.model.controllers"]
+    assert "emulator.model.controllers.mpc" in names
+    assert not packages(names) & {"osqp", "scipy"}
+
+
 THEORY = ("design", "markov", "theory")
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from emulator.errors import ScenarioError, UsageError
 from emulator.runs.estimates import warnings_of
-from emulator.runs.scorekeeper import resolved
+from emulator.runs.scorekeeper import resolved, write_resolved
 from emulator.scenario import Scenario, load, parse, shipped, value_of, write_new
 
 GOOD: dict[str, Any] = {
@@ -59,6 +59,7 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
         ("seed", -1, "seed: is -1; expected a number at least 0"),
         ("trials", 0, "trials: is 0; expected a number at least 1"),
         ("record_trials", 2, "record_trials: is 2; expected at most trials, which is 1"),
+        ("shards", 2, "shards: is 2; expected at most trials, which is 1: a shard has one trial or more"),
         ("pace", -0.1, "pace: is -0.1; expected a number at least 0"),
         ("pace", float("nan"), "pace: is nan; expected"),
         ("process.A", 3, "process.A: is 3; expected a list, such as [[1.0, 0.3], [0.5, 1.001]]"),
@@ -78,7 +79,7 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
             "twin-track or withholding; did you mean innovation?",
         ),
         ("encoding.scheme", "rot13", 'encoding.scheme: is "rot13"; expected acknowledged, cipher, encrypted-schedule, '),
-        ("eavesdroppers.smart.strategy", "suspicous", "smart or suspicious; did you mean suspicious?"),
+        ("eavesdroppers.smart.strategy", "suspicous", "smart, suspicious or tracker; did you mean suspicious?"),
         ("legitimate.link", {"loss": {"model": "gilbert-eliott"}}, "did you mean gilbert-elliott?"),
         ("legitimate.link", {"loss": {"model": 7}}, "legitimate.link.loss.model: is 7; expected bernoulli"),
         ("encoding.scheme", "plain", "encoding.state_probability: is set, but the scheme plain"),
@@ -217,7 +218,7 @@ def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entr
     (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
         f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by what it knows of the schedule, and the scheme '
-        "plain has none; expected bayesian, constant, likelihood, naive, reference or selective"
+        "plain has none; expected bayesian, constant, likelihood, naive, reference, selective or tracker"
     )
 
 
@@ -373,11 +374,12 @@ def test_values_on_the_command_line_are_toml_or_text(value: Any) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(shipped()))
-def test_the_resolved_scenario_is_the_same_scenario(name: str) -> None:
+def test_the_resolved_scenario_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     """What a results folder keeps reads back as what was run, with the versions beside it."""
     scenario = load(name)
-    text = resolved(scenario)
-    again = parse(text, "resolved")
+    write_resolved(tmp_path, scenario)
+    text = (tmp_path / "scenario.toml").read_text(encoding="utf-8")
+    again = parse(text, "resolved", folder=tmp_path)
     assert again.model_dump() == scenario.model_dump()
     assert set(tomllib.loads(text)["made_with"]) >= {"python", "evedrop", "numpy"}
 

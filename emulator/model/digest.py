@@ -1,15 +1,16 @@
 """What makes two runs comparable to the last bit: SHA-256 over all that a receiver received and believed.
 
 For each trial and each aligned block of 256 slots: over, slot by slot, γ (1 byte), x̂ (n) and P (n × n, row by row) as
-little-endian float64. Where an outage of the receiver begins or ends a block ends too, since another process may go on. A
-receiver's digest is that of its block digests, ordered by trial, then block. A block is named by its first slot.
+little-endian float64; of a controller over whether its decision failed (1 byte) and u (m). Where an outage of the receiver
+begins or ends a block ends too, since another process may go on. A receiver's digest is that of its block digests, ordered by
+trial, then block. A block is named by its first slot.
 
 Source: docs/results.md, digests.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Codes
+from emulator.model.receiver import Action, Belief, Codes, Flags
 
 BLOCK_SLOTS = 256
 DIGEST_BYTES = 32
@@ -71,22 +72,51 @@ class BeliefLog:
 
     def _digest(self, length: int) -> Digests:
         _, n, trials = self._x_hat.shape
-        P = self._P.reshape(-1, n * n, trials)
-        digests = np.empty((trials, DIGEST_BYTES), np.uint8)
-        numbers = np.empty((_TILE, length, n + n * n), "<f8")
-        records = np.empty((_TILE, length, 1 + numbers.itemsize * (n + n * n)), np.uint8)
-        for start in range(0, trials, _TILE):
-            tile = slice(start, min(start + _TILE, trials))
-            rows = slice(0, tile.stop - start)
-            for i in range(n):
-                numbers[rows, :, i] = self._x_hat[:length, i, tile].T
-            for i in range(n * n):
-                numbers[rows, :, n + i] = P[:length, i, tile].T
-            records[rows, :, 0] = (self._action[:length, tile] != Action.LOST).T
-            records[rows, :, 1:] = numbers[rows].view(np.uint8)
-            for row, record in enumerate(records[rows], start):
-                digests[row] = np.frombuffer(sha256(record.data).digest(), np.uint8)
-        return digests
+        P = self._P[:length].reshape(length, n * n, trials)
+        return _digests(self._action[:length] != Action.LOST, [self._x_hat[:length], P])
+
+
+class InputLog:
+    """A controller's inputs of the block at hand, and the digests of the blocks that are over.
+
+    Final; slots must be added in order from 0.
+    """
+
+    def __init__(self, inputs: int, trials: int, slots: int) -> None:
+        length = min(BLOCK_SLOTS, slots)
+        self._slots = slots
+        self._u = np.empty((length, inputs, trials))
+        self._failed = np.empty((length, trials), np.bool_)
+
+    def add(self, k: int, u: Floats, failed: Flags) -> tuple[int, Digests] | None:
+        """Take slot k, u (m, R) and failed (R,); at the end of a block, its first slot and its digest, (R, 32)."""
+        row = k % BLOCK_SLOTS
+        self._u[row], self._failed[row] = u, failed
+        if row + 1 != BLOCK_SLOTS and k + 1 != self._slots:
+            return None
+        return k - row, _digests(self._failed[: row + 1], [self._u[: row + 1]])
+
+
+def _digests(marks: Flags, numbers: Sequence[Floats]) -> Digests:
+    """The digest of every trial, (R, 32), over marks (c, R) and numbers, each (c, …, R), slot by slot."""
+    length, trials = marks.shape
+    width = sum(one.shape[1] for one in numbers)
+    digests = np.empty((trials, DIGEST_BYTES), np.uint8)
+    ordered = np.empty((_TILE, length, width), "<f8")
+    records = np.empty((_TILE, length, 1 + ordered.itemsize * width), np.uint8)
+    for start in range(0, trials, _TILE):
+        tile = slice(start, min(start + _TILE, trials))
+        rows = slice(0, tile.stop - start)
+        place = 0
+        for one in numbers:
+            for i in range(one.shape[1]):
+                ordered[rows, :, place] = one[:, i, tile].T
+                place += 1
+        records[rows, :, 0] = marks[:, tile].T
+        records[rows, :, 1:] = ordered[rows].view(np.uint8)
+        for row, record in enumerate(records[rows], start):
+            digests[row] = np.frombuffer(sha256(record.data).digest(), np.uint8)
+    return digests
 
 
 class RunDigest:

@@ -153,6 +153,33 @@ def cholesky(M: Floats) -> Floats:
     return np.array(rows)
 
 
+_NO_VARIANCE = 1e-12  # what is left of a diagonal entry that rounding explains
+
+
+def semidefinite_factor(M: Floats) -> Floats:
+    """Lower triangular L with L Lᵀ = M; M is (n, n), symmetric and positive semidefinite: what has no variance is a column of 0.
+
+    Raises ValueError when M is not positive semidefinite.
+    """
+    n = M.shape[0]
+    rows: Rows = [[0.0] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i + 1):
+            rest = float(M[i, j])
+            for c in range(j):
+                rest -= rows[i][c] * rows[j][c]
+            scale = math.sqrt(abs(float(M[i, i]) * float(M[j, j])))
+            if i == j:
+                if rest < -_NO_VARIANCE * scale or (scale == 0.0 and rest != 0.0):
+                    raise ValueError("not positive semidefinite")
+                rows[i][i] = math.sqrt(rest) if rest > _NO_VARIANCE * scale else 0.0
+            elif rows[j][j] > 0.0:
+                rows[i][j] = rest / rows[j][j]
+            elif abs(rest) > math.sqrt(_NO_VARIANCE) * scale:
+                raise ValueError("not positive semidefinite")
+    return np.array(rows)
+
+
 def triangular_factor(rows: Rows) -> Rows:
     """Lower triangular L with L Lᵀ = M Mᵀ and a non-negative diagonal, for M (n, m) with m ≥ n, by Givens rotations.
 

@@ -117,12 +117,16 @@ def _times(a: Entry, b: Entry) -> Entry:
 def _dot(left: Sequence[Entry], right: Sequence[Entry]) -> Entry:
     """Sum of products, without those that are 0 in all matrices."""
     total: Entry = 0.0
+    ours = False  # what `_times` gives may be one of the factors themselves
     for a, b in zip(left, right, strict=True):
         term = _times(a, b)
         if isinstance(total, float) and total == 0.0:
             total = term
         elif not (isinstance(term, float) and term == 0.0):
-            total = total + term
+            if ours and isinstance(total, np.ndarray):
+                total += term
+            else:
+                total, ours = total + term, True
     return total
 
 

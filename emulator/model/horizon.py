@@ -11,6 +11,7 @@ from emulator.model.theory import NOBODY, ExpectedCovariance
 
 UNIT_ROUNDOFF = 2.0**-53
 TOLERANCE = 0.01
+_NO_NOISE = 1e-12  # of the largest eigenvalue of a singular Q: what rounding explains
 _AHEAD = 65_536  # slots looked at in one step
 
 
@@ -21,7 +22,9 @@ def horizon(process: Process, slots: int) -> int | None:
 
     Source: docs/mathematics.md, horizon.
     """
-    limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * float(np.linalg.eigvalsh(process.Q)[0])
+    noise = np.linalg.eigvalsh(process.Q)
+    least = noise[noise > _NO_NOISE * noise[-1]][0] if process.singular_noise and noise[-1] > 0.0 else noise[0]
+    limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * float(least)
     states = ExpectedCovariance(process, NOBODY)
     for first in range(0, slots, _AHEAD):
         sigma = states.next(min(_AHEAD, slots - first))

@@ -22,6 +22,7 @@ import numpy as np
 from emulator.model.leak import RemainingCovariances, remaining_limit
 from emulator.model.link_law import LinkLaw, Segment
 from emulator.model.links.link import Chain
+from emulator.model.modulated_block import BLOCK, PARTS, Block
 from emulator.model.process import Floats, Process
 from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, OutcomesAt, lyapunov, radius
 
@@ -32,29 +33,71 @@ class ModulatedCovariance:
     def __init__(self, process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> None:
         self._process, self._law = process, law
         never, always = outcomes_at(0.0), outcomes_at(1.0)
-        self._base = {name: getattr(never, name) for name in _PARTS}
-        self._slope = {name: getattr(always, name) - getattr(never, name) for name in _PARTS}
+        self._base = {name: getattr(never, name) for name in PARTS}
+        self._slope = {name: getattr(always, name) - getattr(never, name) for name in PARTS}
         self._remaining = RemainingCovariances(process) if self._slope["leaked"] or self._base["leaked"] else None
         self._sigma = ExpectedCovariance(process, NOBODY)
         self._k = 0
         self._settled: Floats | None = None
         self._window: deque[_Slot] = deque(maxlen=law.window)
         self._before: Floats | None = None
+        self._traces: Floats = np.empty(0)
+        self._blocks: dict[int, Block] = {}
 
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,); inf once it overflows."""
-        traces = np.empty(slots)
-        sigma = self._sigma.next(slots)
-        row = 0
+        while len(self._traces) < slots:
+            self._traces = np.concatenate([self._traces, self._further()])
+        traces, self._traces = self._traces[:slots], self._traces[slots:]
+        return traces
+
+    def _further(self) -> Floats:
+        """The traces of some more slots: a block of them, or slot by slot up to where a block may begin.
+
+        How many these are depends on the law alone, so values do not depend on how many slots are asked for at a time.
+        """
+        k = self._k
+        segment, stop = self._segment(k)
+        marks = [mark for start, end, _ in self._law.outages for mark in (start, end) if mark > k]
+        until = min([stop, *marks])
+        away = any(start <= k < end for start, end, _ in self._law.outages)
+        block = self._block_of(segment) if k > segment.start and not away and until - k >= BLOCK else None
+        if block is not None and (traces := self._in_a_block(block)) is not None:
+            return traces
+        return self._slot_by_slot(segment, 1 if k == segment.start else min(until - k, BLOCK))
+
+    def _block_of(self, segment: Segment) -> Block | None:
+        """The operator of the segment's blocks; None where its slots are not alike, or too large to be worth it."""
+        if self._law.window or self._remaining is not None or segment.quality_at is not None:
+            return None
+        if self._process.n**2 * (len(segment.chain.law) + 1) > _LARGEST:
+            return None
+        if segment.start not in self._blocks:
+            odds = self._odds(segment.quality(range(segment.start, segment.start + 1))[0])
+            with np.errstate(over="ignore", invalid="ignore"):
+                self._blocks[segment.start] = Block.of(self._process, segment.chain, odds)
+        return self._blocks[segment.start]
+
+    def _in_a_block(self, block: Block) -> Floats | None:
+        """The traces of a block; None, and nothing is changed, if something in it is beyond double precision."""
+        assert self._settled is not None  # noqa: S101 - a block does not begin with slot 0
+        assert self._before is not None  # noqa: S101 - the same
         with np.errstate(over="ignore", invalid="ignore"):
-            while row < slots:
-                segment, stop = self._segment(self._k)
-                count = min(slots - row, stop - self._k, _AHEAD)
-                quality = segment.quality(range(self._k, self._k + count))
-                for i in range(count):
-                    total = float(np.trace(self._next(segment, quality[i], sigma[row + i]).sum(axis=0)))
-                    traces[row + i] = total if np.isfinite(total) else np.inf
-                row += count
+            traces, settled = block.ahead(self._settled, self._before)
+        if not (np.isfinite(traces).all() and np.isfinite(settled).all()):
+            return None
+        self._settled, self._before = settled, self._sigma.next(BLOCK)[-1]
+        self._k += BLOCK
+        return traces
+
+    def _slot_by_slot(self, segment: Segment, count: int) -> Floats:
+        traces = np.empty(count)
+        sigma = self._sigma.next(count)
+        quality = segment.quality(range(self._k, self._k + count))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i in range(count):
+                total = float(np.trace(self._next(segment, quality[i], sigma[i]).sum(axis=0)))
+                traces[i] = total if np.isfinite(total) else np.inf
         return traces
 
     def _segment(self, k: int) -> tuple[Segment, int]:
@@ -87,11 +130,15 @@ class ModulatedCovariance:
         assert states is not None  # noqa: S101 - the window holds slot k
         return states
 
+    def _odds(self, quality: Floats) -> dict[str, Floats]:
+        """The outcomes' probabilities in every state, (states,) each."""
+        return {name: self._base[name] + self._slope[name] * quality for name in PARTS}
+
     def _step(self, states: Floats | None, slot: _Slot, lag: int) -> Floats:
         """E(s) after a slot, from that before it, when the slot is so many slots ago."""
         A, chain = self._process.A, slot.segment.chain
         quality = slot.quality * slot.segment.arrived[lag]
-        odds = {name: (self._base[name] + self._slope[name] * quality)[:, None, None] for name in _PARTS}
+        odds = {name: one[:, None, None] for name, one in self._odds(quality).items()}
         law = chain.law[:, None, None]
         if states is None or slot.before is None:
             first: Floats = odds["initial"] * law * self._process.initial_covariance
@@ -107,8 +154,7 @@ class ModulatedCovariance:
         return kept
 
 
-_PARTS = ("kept", "predicted", "misled", "leaked", "initial")
-_AHEAD = 256  # slots whose qualities are looked up at once
+_LARGEST = 160  # numbers that a block carries along: with more of them its operator costs more than it saves
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ GENIE_SCHEMES = ("innovation", "plain")
 
 
 _CLOSED = {
-    ("acknowledged", "reference"): "reference",
+    **{("acknowledged", reader): "reference" for reader in ("legitimate", "reference")},
     ("encrypted-schedule", "selective"): "selective",
     **{("scheduled", reader): "scheduled" for reader in ("legitimate", "naive", "reference", "selective")},
 }
@@ -47,8 +47,8 @@ def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str
     kind = STRATEGIES[strategy]
     if kind.outcomes(parameters, scheme.state_probability) is None:
         return None
-    reader = READERS[parameters["reads_as"]] if kind.parameters and "reads_as" in kind.parameters else kind
-    if isinstance(scheme, Innovation) or reader is Constant:
+    reader = READERS[parameters["reads_as"]] if "reads_as" in kind.parameters else kind
+    if type(scheme) is Innovation or reader is Constant:
         return kind.outcomes(parameters, scheme.state_probability)
     if not issubclass(reader, PacketTaker):
         return None

@@ -8,13 +8,14 @@ Source: docs/mathematics.md, model.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.elementary import Rows, cholesky, triangular_factor
+from emulator.model.elementary import Rows, cholesky, semidefinite_factor, triangular_factor
 from emulator.streams import Batch, BlockReader
 
 Floats = NDArray[np.float64]
@@ -25,7 +26,7 @@ _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding d
 
 
 def product(M: Floats, x: Floats) -> Floats:
-    """M x for every trial: M (…, n, n), x (…, n, R) → (…, n, R)."""
+    """M x for every trial: M (…, m, n), x (…, n, R) → (…, m, R)."""
     y: Floats = M[..., :, 0, None] * x[..., None, 0, :]
     for j in range(1, M.shape[-1]):
         y += M[..., :, j, None] * x[..., None, j, :]
@@ -67,6 +68,13 @@ class Process:
     A: Floats
     Q: Floats
     initial_covariance: Floats
+    singular_noise: bool = False
+    """Whether Q may be singular, as that of a filter's innovations is."""
+
+    @cached_property
+    def noise_factor(self) -> Floats:
+        """Lower triangular G with G Gᵀ = Q, (n, n)."""
+        return semidefinite_factor(self.Q) if self.singular_noise else cholesky(self.Q)
 
     @property
     def n(self) -> int:
@@ -102,14 +110,21 @@ class Process:
 class ProcessNoise:
     """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`. Final.
 
-    initial: x_0 (n, R), where a scheme's secret decides it.
+    initial: x_0 (n, R), where a scheme's secret decides it; covariance: of w, (n, n), semidefinite, where it is not Q.
     """
 
-    def __init__(self, process: Process, key: bytes, batch: Batch, initial: Floats | None = None) -> None:
+    def __init__(
+        self,
+        process: Process,
+        key: bytes,
+        batch: Batch,
+        initial: Floats | None = None,
+        covariance: Floats | None = None,
+    ) -> None:
         self._initial = initial
         self._reader = BlockReader(key, batch, process.n)
         self._initial_factor = cholesky(process.initial_covariance)
-        self._factor = cholesky(process.Q)
+        self._factor = process.noise_factor if covariance is None else semidefinite_factor(covariance)
         self._slots = range(0)
         self._noise: Floats
 
@@ -131,25 +146,34 @@ class ProcessNoise:
 class Trajectory:
     """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Final. Must be read slot by slot.
 
-    initial: x_0 (n, R), where a scheme's secret decides it.
+    initial, covariance: as of `ProcessNoise`.
     """
 
-    def __init__(self, process: Process, key: bytes, batch: Batch, initial: Floats | None = None) -> None:
+    def __init__(
+        self,
+        process: Process,
+        key: bytes,
+        batch: Batch,
+        initial: Floats | None = None,
+        covariance: Floats | None = None,
+    ) -> None:
         self._process = process
-        self._noise = ProcessNoise(process, key, batch, initial)
+        self._noise = ProcessNoise(process, key, batch, initial, covariance)
         self._next = 0
         self.x: Floats = np.zeros((process.n, batch.trials))
         self.predicted: Floats = self.x
         """A x_{k−1}, (n, R): what the innovation of this slot is measured against."""
 
-    def advance(self) -> Floats:
-        """The next slot's state, (n, R)."""
+    def advance(self, pushed: Floats | None = None) -> Floats:
+        """The next slot's state, (n, R); pushed: what else moves it there, (n, R) or (n, 1)."""
         noise = self._noise.at(self._next)
         if self._next == 0:
             self.x = noise
         else:
             self.predicted = self._process.predict(self.x)
             self.x = self.predicted + noise
+        if pushed is not None:
+            self.x = self.x + pushed
         self._next += 1
         return self.x
 
@@ -164,7 +188,7 @@ class StateFactors:
 
     def __init__(self, process: Process) -> None:
         self._A: Rows = process.A.tolist()
-        self._noise_factor: Rows = cholesky(process.Q).tolist()
+        self._noise_factor: Rows = process.noise_factor.tolist()
         self._initial = self._times_A(cholesky(process.initial_covariance).tolist())
         self._k = 1
         self._carried = self._initial
@@ -192,8 +216,12 @@ class StateFactors:
         return product_rows
 
 
-def mistakes_of(A: Floats, Q: Floats, initial_covariance: Floats) -> list[tuple[str, str]]:
+def mistakes_of(
+    A: Floats, Q: Floats, initial_covariance: Floats, singular_noise: bool = False
+) -> list[tuple[str, str]]:
     """Everything that keeps the three from being a process: (entry, sentence) for each mistake, none if it is one.
+
+    singular_noise: Q may be singular.
 
     Source: docs/mathematics.md, model (assumptions).
     """
@@ -204,6 +232,12 @@ def mistakes_of(A: Floats, Q: Floats, initial_covariance: Floats) -> list[tuple[
         return found
     for name, M in (("Q", Q), ("initial_covariance", initial_covariance)):
         found += [(name, sentence) for sentence in _covariance_mistakes(M)]
+    if singular_noise:
+        found = [entry for entry in found if entry[0] != "Q" or "positive definite" not in entry[1]]
+        with suppress(ValueError):
+            semidefinite_factor(Q)
+            return found
+        return [*found, ("Q", "has an eigenvalue below 0; expected a covariance")]
     if any(name == "Q" and "positive definite" in sentence for name, sentence in found):
         reached = _reachable(A, Q)
         if reached < A.shape[0]:

@@ -7,7 +7,7 @@ Source: docs/protocol.md, keys.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,11 @@ LEGITIMATE = "legitimate"
 ROUTER = "router"
 OBSERVER = "observer"
 OPERATOR = "operator"
+CONTROLLER = "controller"
 ACKNOWLEDGEMENTS = "acknowledgements"
 """No process: the name of their way back, whose random stream is `link/acknowledgements`."""
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, OBSERVER, OPERATOR, ACKNOWLEDGEMENTS)
+RELAY = "relay"
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,21 @@ class Keys:
         """Acknowledgements that were neither lost nor blocked, and those that are forged: router to sensor."""
         return self._under("ack/delivered")
 
+    @property
+    def estimate(self) -> str:
+        """What the legitimate estimator believes, to the controller."""
+        return self._under("estimate")
+
+    @property
+    def state(self) -> str:
+        """The true state, sensor to controller, where that acts on the truth."""
+        return self._under("state")
+
+    @property
+    def input(self) -> str:
+        """What the controller decides, to the sensor, and to a legitimate estimator that is told it."""
+        return self._under("input")
+
     def downlink(self, receiver: str) -> str:
         """Deliveries, router to one receiver."""
         return self._under(f"downlink/{receiver}")
@@ -72,11 +89,20 @@ class Keys:
 
 
 def reader_of(key: str) -> str:
-    """The process that reads a key: all of them have one reader."""
+    """The process that reads a key; of inputs, which the legitimate estimator may read too, the one that always does."""
     kind, _, name = key.split("/", 2)[2].partition("/")
     if kind == "ack":
         return ROUTER if name == "sent" else SENSOR
-    return {"uplink": ROUTER, "journal": OBSERVER, "telemetry": OBSERVER, "progress": SENSOR}.get(kind, name)
+    readers = {
+        "uplink": ROUTER,
+        "journal": OBSERVER,
+        "telemetry": OBSERVER,
+        "progress": SENSOR,
+        "estimate": CONTROLLER,
+        "state": CONTROLLER,
+        "input": SENSOR,
+    }
+    return readers.get(kind, name)
 
 
 @dataclass(frozen=True)
@@ -94,43 +120,89 @@ class Grant:
     asks: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     """Liveliness tokens that it may ask for: its own, and so learns no more than that it is there."""
+    further_tokens: tuple[str, ...] = ()
+    """Of those on whose behalf it speaks."""
+    zid: str | None = None
+    """Its Zenoh id, of who has no user: the router, which does not ask to be let in."""
 
 
-def grants(run: str, receivers: tuple[str, ...]) -> list[Grant]:
-    """The table of docs/protocol.md for a run; the router itself needs no grant but to ask whether it is there."""
+@dataclass(frozen=True)
+class Wiring:
+    """How a controller is connected."""
+
+    acts_on: str
+    """`estimate` or `truth`."""
+    knows_input: bool
+    """Whether the legitimate estimator is told the inputs."""
+
+    @classmethod
+    def of(cls, part: Mapping[str, Any] | None) -> Wiring | None:
+        """As a brief tells it; None without a controller."""
+        return None if part is None else cls(**part)
+
+    @property
+    def on_truth(self) -> bool:
+        """Whether the controller is told the true state."""
+        return self.acts_on == "truth"
+
+
+def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, relayed: bool = False) -> list[Grant]:
+    """The table of docs/protocol.md for a run, with a controller if there is a loop; routers need none but to ask for themselves.
+
+    relayed: whether there is a relay, which the observer watches and tells the end.
+    """
     keys = Keys(run)
     followers = (*receivers, OBSERVER)
-    processes = (SENSOR, *receivers)
+    processes = (SENSOR, *receivers) if loop is None else (SENSOR, *receivers, CONTROLLER)
+    state = (keys.state,) if loop is not None and loop.on_truth else ()
+    estimate = (keys.estimate,) if loop is not None and not loop.on_truth else ()
+    routers = (ROUTER, RELAY) if relayed else (ROUTER,)
     table = [
         Grant(
             SENSOR,
-            writes=(keys.uplink, keys.telemetry(SENSOR)),
-            reads=(*(keys.progress(name) for name in followers), keys.control(SENSOR), keys.acknowledgements),
+            writes=(keys.uplink, keys.telemetry(SENSOR), *state),
+            reads=(
+                *(keys.progress(name) for name in followers),
+                keys.control(SENSOR),
+                keys.acknowledgements,
+                *(() if loop is None else (keys.input,)),
+            ),
             token=keys.alive(SENSOR),
             checks=(keys.alive(SENSOR),),
         ),
         Grant(
             OBSERVER,
-            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, ROUTER))),
+            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, *routers))),
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
             token=keys.alive(OBSERVER),
             checks=(keys.alive(OBSERVER),),
-            watches=tuple(keys.alive(name) for name in (*processes, ROUTER)),
+            watches=tuple(keys.alive(name) for name in (*processes, *routers)),
             answers=(keys.control(OBSERVER),),
         ),
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
-        Grant(ROUTER, writes=(), reads=(), token=None, checks=(keys.alive(ROUTER),)),
+        *(Grant(name, writes=(), reads=(), token=None, checks=(keys.alive(name),)) for name in routers),
     ]
+    if loop is not None:
+        table.append(
+            Grant(
+                CONTROLLER,
+                writes=(keys.input, keys.telemetry(CONTROLLER)),
+                reads=(*estimate, *state, keys.control(CONTROLLER)),
+                token=keys.alive(CONTROLLER),
+                checks=(keys.alive(CONTROLLER),),
+            )
+        )
     for name in receivers:
+        user, told = name == LEGITIMATE, loop is not None and loop.knows_input
         table.append(
             Grant(
                 name,
                 writes=(
                     keys.telemetry(name),
                     keys.progress(name),
-                    *((keys.acknowledged,) if name == LEGITIMATE else ()),
+                    *((keys.acknowledged, *estimate) if user else ()),
                 ),
-                reads=(keys.downlink(name), keys.control(name)),
+                reads=(keys.downlink(name), keys.control(name), *((keys.input,) if user and told else ())),
                 token=keys.alive(name),
                 checks=(keys.alive(name),),
             )
@@ -148,16 +220,14 @@ def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [
-            {
-                "id": grant.process,
-                "usernames": [grant.process],
-                **({"cert_common_names": [grant.process]} if certified else {}),
-            }
-            for grant in table
-        ],
+        "subjects": [_subject(grant, certified) for grant in table],
         "policies": [{"subjects": [grant.process], "rules": [rule["id"] for rule in _rules(grant)]} for grant in table],
     }
+
+
+def _subject(grant: Grant, certified: bool) -> dict[str, Any]:
+    shown = {"usernames": [grant.process]} if grant.zid is None else {"zids": [grant.zid]}
+    return {"id": grant.process, **shown, **({"cert_common_names": [grant.process]} if certified else {})}
 
 
 def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
@@ -167,7 +237,7 @@ def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
         ("reader", "egress", "declare_subscriber", grant.writes),
         ("subscribe", "ingress", "declare_subscriber", grant.reads),
         ("read", "egress", "put", grant.reads),
-        ("token", "ingress", "liveliness_token", () if grant.token is None else (grant.token,)),
+        ("token", "ingress", "liveliness_token", (*grant.further_tokens, *filter(None, [grant.token]))),
         ("check", "ingress", "liveliness_query", grant.checks),
         ("checked", "egress", "liveliness_token", grant.checks),
         ("watch", "ingress", "declare_liveliness_subscriber", grant.watches),

@@ -72,7 +72,7 @@ def _first_line(error: Exception) -> str:
     return str(error).partition("\n")[0].rstrip(".")
 
 
-def tls_section(identity: Identity, listens: bool = False, connects: bool = True) -> dict[str, Any]:
+def tls_section(identity: Identity, listens: bool = False) -> dict[str, Any]:
     """The `tls` section of Zenoh's configuration: both ends show a certificate, and the router's must name its host."""
     encoded = {name: base64.b64encode(getattr(identity, name).encode()).decode() for name in ("certificate", "key")}
     section: dict[str, Any] = {
@@ -80,8 +80,7 @@ def tls_section(identity: Identity, listens: bool = False, connects: bool = True
         "enable_mtls": True,
         "verify_name_on_connect": True,
     }
-    for used, end in ((listens, "listen"), (connects, "connect")):
-        if used:
-            section[f"{end}_certificate_base64"] = encoded["certificate"]
-            section[f"{end}_private_key_base64"] = encoded["key"]
+    for end in ("connect", "listen") if listens else ("connect",):
+        section[f"{end}_certificate_base64"] = encoded["certificate"]
+        section[f"{end}_private_key_base64"] = encoded["key"]
     return section

@@ -23,9 +23,10 @@ def is_there(brief: Brief) -> bool:
     zenoh.init_log_from_env_or("off")
     config = client_config(brief)
     config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
-    if brief.role == "router":
-        # Its endpoint says where it listens, which may be everywhere: by that name it has no certificate.
-        config["connect"]["endpoints"] = [str(Endpoint.of(brief.router).nearby)]
+    if brief.role in {"router", "relay"}:
+        # Asked of itself; where it listens may be everywhere: by that name it has no certificate.
+        listens = brief.part["listen"] if brief.role == "relay" else brief.router
+        config["connect"]["endpoints"] = [str(Endpoint.of(listens).nearby)]
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
     try:
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:

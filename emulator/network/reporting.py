@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.brief import Brief
-from emulator.model.digest import BeliefLog, Digests
+from emulator.model.digest import BeliefLog, Digests, InputLog
 from emulator.model.process import Floats
 from emulator.model.receiver import Belief, Flags, trace_of
+from emulator.network.loop_wire import Decisions
 from emulator.network.wire import Report, Truth, progress
 
 
@@ -24,10 +25,19 @@ def is_due(brief: Brief, k: int) -> bool:
 
 
 class TruthReporter:
-    """The sensor's reports: states and schedule; what was sent at all, and alarms, where there are such things. Final."""
+    """The sensor's reports: states and schedule; what was sent at all, alarms, and inputs, where there are such things. Final.
+
+    inputs: how many a controller decides; measures: whether the sensor filters what it measures.
+    """
 
     def __init__(
-        self, brief: Brief, put: Callable[[int, bytes], None], may_be_silent: bool = False, watches: bool = False
+        self,
+        brief: Brief,
+        put: Callable[[int, bytes], None],
+        may_be_silent: bool = False,
+        watches: bool = False,
+        inputs: int = 0,
+        measures: bool = False,
     ) -> None:
         self._brief = brief
         self._put = put
@@ -35,16 +45,35 @@ class TruthReporter:
         self._nu = np.empty((brief.flow.batch, brief.trials), np.bool_)
         self._sent = np.ones_like(self._nu) if may_be_silent else None
         self._alarms = np.zeros_like(self._nu) if watches else None
+        self._u = np.empty((brief.flow.batch, inputs, brief.trials)) if inputs else None
+        self._failed = np.zeros_like(self._nu) if inputs else None
+        self._true = np.empty_like(self._x) if measures else None
         self._first = 0
 
-    def add(self, k: int, x: Floats, nu: Flags, sent: Flags | None = None, alarms: Flags | None = None) -> None:
-        """Take slot k, and report if it is time."""
+    def add(
+        self,
+        k: int,
+        x: Floats,
+        nu: Flags,
+        sent: Flags | None = None,
+        alarms: Flags | None = None,
+        steered: tuple[Floats, Flags] | None = None,
+        true: Floats | None = None,
+    ) -> None:
+        """Take slot k, and report if it is time.
+
+        steered: its inputs (m, R), and where their decision failed, (R,); true: its true state, (n, R), if x is a filter's.
+        """
         row = k % self._brief.flow.batch
         self._x[row] = x
         self._nu[row] = nu
         for column, values in ((self._sent, sent), (self._alarms, alarms)):
             if column is not None:
                 column[row] = values
+        if steered is not None and self._u is not None and self._failed is not None:
+            self._u[row], self._failed[row] = steered
+        if true is not None and self._true is not None:
+            self._true[row] = true
         if is_due(self._brief, k):
             self.flush(k + 1)
 
@@ -53,9 +82,34 @@ class TruthReporter:
         if end > self._first:
             row = self._first % self._brief.flow.batch
             rows = slice(row, row + end - self._first)
-            flags = (None if column is None else column[rows] for column in (self._sent, self._alarms))
-            self._put(end - 1, Truth(self._first, self._x[rows], self._nu[rows], *flags).pack())
+            sent, alarms, failed = (
+                None if column is None else column[rows] for column in (self._sent, self._alarms, self._failed)
+            )
+            u, true = (None if column is None else column[rows] for column in (self._u, self._true))
+            self._put(end - 1, Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed, true).pack())
         self._first = end
+
+
+class DecisionReporter:
+    """The controller's reports: how long it took to decide, and digests of what was decided. Final."""
+
+    def __init__(self, brief: Brief, put: Callable[[int, bytes], None], inputs: int, period: int) -> None:
+        self._brief, self._put, self._period = brief, put, period
+        self._log = InputLog(inputs, brief.trials, brief.slots)
+        self._digests: dict[int, Digests] = {}
+        self._seconds: list[float] = []
+        self._first = 0
+
+    def add(self, k: int, u: Floats, failed: Flags, seconds: float) -> None:
+        """Take the decision of slot k, which holds until the next; report if it is time."""
+        end, batch = min(k + self._period, self._brief.slots), self._brief.flow.batch
+        for slot in range(k, end):
+            self._digests.update(filter(None, [self._log.add(slot, u, failed)]))
+        self._seconds.append(seconds)
+        if end // batch > self._first // batch or end == self._brief.slots:
+            seconds_taken = np.array(self._seconds)
+            self._put(end - 1, Decisions(self._first, end - self._first, seconds_taken, self._digests).pack())
+            self._first, self._seconds, self._digests = end, [], {}
 
 
 class BeliefReporter:

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable
 
 from emulator.errors import Gap
+from emulator.network.wire import Reader
 
 
 class Kept:
@@ -68,6 +69,12 @@ class Due:
         """patience: how many seconds later slots may arrive while the one that is due does not."""
         self._key, self._patience = key, patience
         self._slot, self._since = -1, 0.0
+
+    def take(self, receive: Callable[[], Reader], due: int) -> Reader:
+        """The message of slot `due`, as soon as it is received. Raises Gap as `missed` does."""
+        while (found := (message := receive()).integer("k")) != due:
+            self.missed(due, found)
+        return message
 
     def missed(self, due: int, found: int) -> None:
         """Slot `found` arrived where `due` was due. Raises Gap if that one has been missing for too long."""

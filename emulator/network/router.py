@@ -11,13 +11,8 @@ routes them once more, to the same fates, as a router does that was started anew
 
 from __future__ import annotations
 
-import os
-import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
@@ -30,8 +25,10 @@ from emulator.model.link import Change, Course, Fates, Link, streams_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
 from emulator.model.transit import Late, Transit
-from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, access_control, grants
+from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
 from emulator.network.commands import Anew, Commands
+from emulator.network.doorkeeping import until_all_left, users_file
+from emulator.network.linked import at_router
 from emulator.network.postman import Postman
 from emulator.network.resending import Due
 from emulator.network.session import Session, router_config
@@ -50,8 +47,6 @@ from emulator.network.wire import (
     read_beside,
     read_uplink,
 )
-
-_FAREWELL_SECONDS = 10.0
 
 
 class Downlink:
@@ -152,6 +147,27 @@ class Downlink:
             self._put(hold(k), 0.0)
 
 
+class Burst:
+    """Deliveries to who keeps nobody waiting, passed on many at a time. Final.
+
+    Where the sensor waits for somebody in every slot, a message by itself costs a receiver's waking up, and most of the time.
+    """
+
+    def __init__(self, put: Callable[[bytes], None]) -> None:
+        self._put = put
+        self._held: list[bytes] = []
+
+    def hold(self, payload: bytes, _: float) -> None:
+        """Take one."""
+        self._held.append(payload)
+
+    def flush(self) -> None:
+        """Pass on all that are held."""
+        for payload in self._held:
+            self._put(payload)
+        self._held.clear()
+
+
 class WayBackLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and who attacks it. Final."""
 
@@ -192,15 +208,12 @@ class WayBackLink:
 
 def route(brief: Brief) -> None:
     """Run the router of a brief until the conductor ends it and everybody has left."""
-    table = grants(brief.run, tuple(brief.part["links"]))
-    with _opened(brief, access_control(table, brief.identity is not None)) as session:
-        present = {grant.process: False for grant in table if grant.token is not None}
-        for name in present:
-            session.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+    table = grants(brief.run, tuple(brief.part["links"]), Wiring.of(brief.part["controller"]))
+    let_in = table if brief.part["zid"] is None else at_router(brief.run, table)
+    with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
+        present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
-        deadline = time.monotonic() + _FAREWELL_SECONDS
-        while any(present.values()) and time.monotonic() < deadline:
-            time.sleep(0.005)
+        until_all_left(present, session.linked)
 
 
 class Routing:
@@ -213,9 +226,13 @@ class Routing:
         self._due = Due(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
         postman = Postman() if brief.part["pace"] else None
+        self._bursts: list[Burst] = []
 
         def outlet(name: str, course: Course) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
+            if postman is None and brief.part["controller"] is not None and not self._is_waited_for(name):
+                self._bursts.append(Burst(put))
+                return self._bursts[-1].hold
             delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
             return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
 
@@ -230,6 +247,14 @@ class Routing:
         self._stale = False
         """Whether what comes is of no interest until it is said to come once more."""
         self._begin(0, 0)
+
+    def _is_waited_for(self, receiver: str) -> bool:
+        """Whether the sensor waits in some slots for what a receiver makes of them."""
+        part = self._brief.part
+        wiring = Wiring(**part["controller"])
+        return receiver == LEGITIMATE and (
+            not wiring.on_truth or wiring.knows_input or part["acknowledgements"] is not None
+        )
 
     def carry_on(self) -> None:
         """Route all slots, once more as often as it is asked for, until the conductor's end."""
@@ -247,6 +272,7 @@ class Routing:
         done: all slots below have been delivered, acknowledged and journaled.
         """
         self._stale = False
+        self._flush()  # of no use to anybody, but in no way of what comes now
         self._k, self._done, self._journaled = start, done, start
         self._downlinks = {
             name: Downlink(name, course, self._brief, self._outlets[name]) for name, course in self._courses.items()
@@ -286,6 +312,7 @@ class Routing:
             return
         self._route(k, message)
         if k + 1 == self._slots.stop:
+            self._flush()
             self._journal(k + 1)
             self._plan(k + 1)
 
@@ -299,6 +326,10 @@ class Routing:
         if self._way_back is not None and not known:
             self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
         self._k = k + 1
+
+    def _flush(self) -> None:
+        for burst in self._bursts:
+            burst.flush()
 
     def _once_more(self, message: Reader) -> None:
         """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
@@ -324,6 +355,7 @@ class Routing:
         """Pass a mark on, and do what the conductor says until it lets us go on."""
         for downlink in self._downlinks.values():
             downlink.mark(k)
+        self._flush()
         while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
             if command.text("do") == "change":
                 self._amend(command.text("link"), k, tuple(_change(one) for one in command.maps("changes")))
@@ -341,18 +373,5 @@ def _change(found: Reader) -> Change:
 
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:
-    with _users_file(brief.part["users"]) as users:
-        return Session(brief, router_config(brief, str(users), access))
-
-
-@contextmanager
-def _users_file(users: Mapping[str, str]) -> Iterator[Path]:
-    """The dictionary of users and passwords that Zenoh reads once, when the session opens; then it must not stay."""
-    handle, name = tempfile.mkstemp(prefix="evedrop-users-")
-    path = Path(name)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.writelines(f"{user}:{password}\n" for user, password in users.items())
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
+    with users_file(brief.part["users"]) as users:
+        return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from queue import SimpleQueue
 from types import TracebackType
@@ -50,7 +50,7 @@ def _transport(identity: Identity | None, listens: bool = False) -> dict[str, An
     if identity is not None:
         from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
 
-        link |= {"protocols": ["tls"], "tls": tls_section(identity, listens, connects=not listens)}
+        link |= {"protocols": ["tls"], "tls": tls_section(identity, listens)}
     # Shared memory would put what the router sends to one receiver into the memory of all.
     return {"link": link, "shared_memory": {"enabled": False}}
 
@@ -100,37 +100,38 @@ def door_of(entry: Credentials) -> Door:
     return Door(entry.router, entry.run, client_config(entry), entry.identity)
 
 
-def router_config(brief: Brief, users_file: str, access: dict[str, Any]) -> dict[str, Any]:
-    """Configuration of the router: it listens, asks for user and password, and denies what is not granted."""
+def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
+    """Configuration of a router: it listens, asks for user and password, and denies what is not granted."""
     return {
         "mode": "router",
-        "listen": {"endpoints": [brief.router], "exit_on_failure": True},
+        **({"id": brief.part["zid"]} if brief.role == "router" and brief.part["zid"] is not None else {}),
+        "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {**_transport(brief.identity, listens=True), "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
     }
 
 
-def _listening(brief: Brief, config: dict[str, Any]) -> zenoh.Session:
-    """The router's session. Raises BriefError if it cannot listen where its brief says."""
-    endpoint = endpoint_of(brief.router, brief.identity)
+def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -> zenoh.Session:
+    """A router's session. Raises BriefError if it cannot listen where its brief says."""
+    endpoint = endpoint_of(listen, identity)
     try:
         endpoint.try_to_listen()
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except socket.gaierror as error:
         raise BriefError(
-            f"the host of {brief.router} is not known here ({error.strerror}); write it into /etc/hosts, or write the "
+            f"the host of {listen} is not known here ({error.strerror}); write it into /etc/hosts, or write the "
             f"briefs again with --listen {endpoint.protocol}/0.0.0.0:{endpoint.port} and --connect"
         ) from error
     except OSError as error:
         other = f"--listen {endpoint.protocol}/HOST:PORT"
         raise BriefError(
-            f"the router cannot listen at {brief.router} ({error.strerror}); end the program that does, or write the briefs "
+            f"the router cannot listen at {listen} ({error.strerror}); end the program that does, or write the briefs "
             f"again with another {other}, of the host that the router is started on"
         ) from error
     except zenoh.ZError as error:
         raise BriefError(
-            f"the router cannot listen at {brief.router} ({error}); write the briefs again with another --listen"
+            f"the router cannot listen at {listen} ({error}); write the briefs again with another --listen"
         ) from error
 
 
@@ -156,9 +157,13 @@ class Session:
     """A process's session. Final; use it as a context manager, or its threads outlive the program."""
 
     def __init__(
-        self, brief: Brief, config: dict[str, Any] | None = None, meanwhile: Callable[[], None] = lambda: None
+        self,
+        brief: Brief,
+        config: dict[str, Any] | None = None,
+        listen: str | None = None,
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> None:
-        """config: the router's own, who waits for nobody; meanwhile: called while there is no router yet."""
+        """config, listen: of a router, and where it listens; meanwhile: called while there is no router to connect to yet."""
         zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
@@ -166,19 +171,20 @@ class Session:
         self._process = brief.process
         self.patience = float(brief.patience)
         """Seconds that are waited for the others."""
-        if config is None:
+        if config is None or listen is None:
             self._session = connected(door_of(brief), self.patience, meanwhile)
         else:
-            self._session = _listening(brief, config)
+            self._session = _listening(listen, brief.identity, config)
         self._publishers: list[zenoh.Publisher] = []
         self._token: zenoh.LivelinessToken | None = None
         self._kept: list[Kept] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
-        self._lifeline = _Lifeline(brief) if brief.role not in ("router", "observer") else None
+        self._lifeline = _Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         if self._lifeline is not None:
             self._session.info.declare_transport_events_listener(self._lifeline.changed)
+        self._by_hand = not brief.ends_with_stdin
         self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
@@ -238,6 +244,27 @@ class Session:
         """Which router there is a connection with; one that was started again is another one."""
         return next((str(found) for found in self._session.info.routers_zid()), None)
 
+    def attendance(self, processes: Iterable[str]) -> dict[str, bool]:
+        """Process → whether it is there, kept up to date by a thread of Zenoh's."""
+        present = dict.fromkeys(processes, False)
+        for name in present:
+            self.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+        return present
+
+    def linked(self) -> bool:
+        """Whether there is a link with another router."""
+        return bool(self._session.info.routers_zid())
+
+    def wait_for_link(self) -> None:
+        """Wait until there is one. Raises RunError after the brief's patience."""
+        deadline = time.monotonic() + self.patience
+        while not self.linked():
+            if time.monotonic() > deadline:
+                raise RunError(
+                    f"{self._process}: no link with the router within {self.patience:.0f} s; look at its log"
+                )
+            time.sleep(_POLL_SECONDS)
+
     def ready(self) -> None:
         """Wait until every publisher has a reader, then show that this process is there.
 
@@ -281,8 +308,10 @@ class Session:
         """Sort what the conductor says; what is no message is for whoever reads commands, who says so."""
         with suppress(MalformedMessage):
             command = Reader(self._control, payload)
-            if command.text("do") == "abandon":  # whatever this process is waiting for
-                print(f"evedrop: the run has failed: {command.text('why')}", file=sys.stderr, flush=True)  # noqa: T201
+            if self._by_hand and command.text("do") == "abandon":
+                # Whatever this process waits for will not come, and nobody has launched it who would end it.
+                sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
+                sys.stderr.flush()
                 os._exit(RunError.exit_status)
             if self._kept and command.text("do") == "again":
                 command.integer("n"), command.integer("k")

@@ -195,6 +195,13 @@ def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
     return flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
 
 
+def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
+    """Where decisions failed, (…, R): nowhere, unless it is said."""
+    if not message.has("failed"):
+        return np.zeros(shape, np.bool_)
+    return flags_of(message.array("failed", "u1", (*shape[:-1], (shape[-1] + 7) // 8)), shape[-1])
+
+
 def hold(k: int) -> bytes:
     """A mark between slots k − 1 and k, on uplink and downlinks: everybody reports all slots below k."""
     return pack({"k": k, "hold": True})
@@ -324,6 +331,12 @@ class Truth:
     """Whether there was a packet, (c, R); None of a scheme that sends in every slot."""
     alarms: Flags | None = None
     """Whether the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch them."""
+    u: Floats | None = None
+    """The inputs as they were decided, (c, m, R); None without a controller."""
+    failed: Flags | None = None
+    """Where their decision failed, (c, R)."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters: x is what it makes of them; None where they are x."""
 
     @property
     def count(self) -> int:
@@ -337,11 +350,17 @@ class Truth:
             fields["sent"] = packed_flags(self.sent).tobytes()
         if self.alarms is not None:
             fields["alarms"] = packed_flags(self.alarms).tobytes()
+        if self.u is not None:
+            fields["u"] = self.u.tobytes()
+        if self.failed is not None and self.failed.any():
+            fields["failed"] = packed_flags(self.failed).tobytes()
+        if self.true is not None:
+            fields["true"] = self.true.tobytes()
         return pack(fields)
 
 
-def read_truth(message: Reader, first: int, shape: tuple[int, int]) -> Truth:
-    """The sensor's telemetry that must begin at slot `first`."""
+def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int = 0, measures: bool = False) -> Truth:
+    """The sensor's telemetry that must begin at slot `first`, with so many inputs, and of one that filters or not."""
     k, c = message.slot(first), message.integer("c", 1)
     n, trials = shape
     flags = {
@@ -349,7 +368,26 @@ def read_truth(message: Reader, first: int, shape: tuple[int, int]) -> Truth:
         for name in ("sent", "alarms")
     }
     masks = message.array("nu", "u1", (c, (trials + 7) // 8))
-    return Truth(k, message.finite("x", (c, n, trials)), flags_of(masks, trials), **flags)
+    return Truth(
+        k,
+        message.finite("x", (c, n, trials)),
+        flags_of(masks, trials),
+        flags["sent"],
+        flags["alarms"],
+        message.finite("u", (c, inputs, trials)) if inputs else None,
+        read_failed(message, (c, trials)) if inputs else None,
+        message.finite("true", (c, n, trials)) if measures else None,
+    )
+
+
+def read_digests(message: Reader, trials: int) -> dict[int, Digests]:
+    """Block, by its first slot → digests, (R, 32)."""
+    digests: dict[int, Digests] = {}
+    for block, value in message.map("digests").items():
+        if type(block) is not int or not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
+            raise message.malformed(f"digests of block {block!r}", f"{trials * DIGEST_BYTES} bytes a block")
+        digests[block] = np.frombuffer(value, np.uint8).reshape(trials, DIGEST_BYTES)
+    return digests
 
 
 @dataclass(frozen=True)
@@ -401,11 +439,6 @@ def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: i
     action = message.array("action", "u1", (c, trials))
     if action.size and int(action.max()) > max(Action):
         raise message.malformed(f"action {int(action.max())}", f"actions from 0 to {int(max(Action))}")
-    digests: dict[int, Digests] = {}
-    for block, value in message.map("digests").items():
-        if type(block) is not int or not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
-            raise message.malformed(f"digests of block {block!r}", f"{trials * DIGEST_BYTES} bytes a block")
-        digests[block] = np.frombuffer(value, np.uint8).reshape(trials, DIGEST_BYTES)
     return Report(
         k,
         message.finite("x_hat", (c, n, trials)),
@@ -413,7 +446,7 @@ def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: i
         message.finite("P", (c, n, n, recorded)),
         message.finite("trace", (c, 2)),
         message.array("late", "<u2", (c, trials)) if message.has("late") else None,
-        digests,
+        read_digests(message, trials),
         message.array("late_used", "<u2", (c, trials)) if message.has("late_used") else None,
     )
 

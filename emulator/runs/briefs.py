@@ -8,15 +8,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from emulator.brief import Brief, Flow, Identity, Model
+from emulator.brief import Brief, Flow, Model
 from emulator.errors import UsageError
 from emulator.model.account import COUNTED_BURSTS
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
-from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.modules import named_in
+from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 from emulator.runs.acknowledging import chart_of, way_back_of
-from emulator.runs.ports import Meeting, meeting_at
+from emulator.runs.loop_briefs import LoopBriefs
+from emulator.runs.ports import Places, places_at
+from emulator.runs.routers import Routers, identities_of
 from emulator.scenario import Scenario
 from emulator.streams import root_of_seed, stream_key
 
@@ -69,6 +72,11 @@ class StreamKeys:
         return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
 
     @property
+    def measurement(self) -> bytes:
+        """Of the noise of what the sensor measures."""
+        return stream_key(self.seed_root, "measurement")
+
+    @property
     def way_back(self) -> bytes:
         """Of the losses of acknowledgements."""
         return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
@@ -111,39 +119,53 @@ class Observation:
     results: Path
     recording: bool
     live: str | None
+    shard: bool = False
+    """Whether the run is a shard of a larger one: it leaves its score to be merged, and is not steered by itself."""
 
 
 def briefs_of(
     scenario: Scenario,
-    meeting: Meeting | str,
+    places: Places | str,
     observation: Observation,
     ends_with_stdin: bool = True,
     patience: int = _LAUNCHED_PATIENCE,
 ) -> dict[str, Brief]:
     """Process name → brief, with run name, passwords and, where the router takes them, certificates made afresh.
 
-    meeting: a text is an endpoint that is both listened on and connected to.
+    places: a text is an endpoint of one router, that is both listened on and connected to. Raises UsageError if they are
+    not as many as the scenario's routers.
     """
     run = f"r{secrets.token_hex(4)}"
-    if isinstance(meeting, str):
-        meeting = meeting_at(meeting)
+    if isinstance(places, str):
+        places = places_at(places)
+    places.check(scenario.relayed)
     keys = StreamKeys.of(scenario)
-    users = {name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, OBSERVER, OPERATOR)}
+    steered = () if scenario.controller is None else (CONTROLLER,)
+    users = {
+        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
+    }
+    routers = Routers.of(users, places)
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d
-    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header))
+    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
-    identities = _identities(run, meeting, tuple(users))
+    identities = identities_of(run, places, tuple(users))
+    loop = LoopBriefs(scenario)
+
+    def imports(process: str, part: Mapping[str, Any]) -> bool:
+        """Whether a process may need a class that is not built in. Of links, somebody may set another while the run goes on."""
+        own = process != OBSERVER and (process == ROUTER or any(named_in(part)))
+        return own and scenario.modules is not None
 
     def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
         return Brief(
             run=run,
             process=process,
             role=role,
-            router=str(meeting.listen if role == "router" else meeting.connect),
+            router=str(places.router.listen if role == "router" else routers.endpoint(process)),
             user=process,
-            password=users.get(process, ""),
+            password=routers.password(process),
             slots=scenario.slots,
             trials=scenario.trials,
             first_trial=scenario.first_trial,
@@ -151,7 +173,7 @@ def briefs_of(
             flow=flow_of(scenario),
             model=model,
             keys={name: key.hex() for name, key in owned.items()},
-            part=part,
+            part={**part, "modules": scenario.modules} if imports(process, part) else part,
             ends_with_stdin=ends_with_stdin,
             patience=patience,
             identity=identities.get(process),
@@ -170,15 +192,17 @@ def briefs_of(
             {
                 "links": links,
                 "pace": scenario.pace,
-                "users": users,
+                "users": routers.at_router,
                 "leaks": leaks,
                 "acknowledgements": None if back is None else back._asdict(),
+                "controller": loop.wiring,
+                "zid": routers.zid,
             },
         ),
         brief(
             SENSOR,
             "sensor",
-            {"process": keys.process, **keys.secret(scheme.secret_streams)},
+            {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)},
             {
                 "scheme": spec,
                 "pace": scenario.pace,
@@ -187,13 +211,15 @@ def briefs_of(
                 "history": history_of(scenario),
                 "leaks": leaks,
                 "chart": None if chart is None else asdict(chart),
+                "plant": loop.plant,
+                "controller": loop.of_sensor,
             },
         ),
         brief(
             LEGITIMATE,
             "legitimate",
             keys.secret(scheme.estimator_streams),
-            {"scheme": spec, **_presence(scenario, LEGITIMATE)},
+            {"scheme": spec, **_presence(scenario, LEGITIMATE), "controller": loop.of_legitimate},
         ),
         brief(
             OBSERVER,
@@ -205,27 +231,20 @@ def briefs_of(
                 "recording": observation.recording,
                 "live": observation.live,
                 "operator": users[OPERATOR],
+                "shard": observation.shard,
                 "operator_identity": asdict(identities[OPERATOR]) if identities else None,
             },
         ),
     ]
+    if loop.of_controller is not None:
+        made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
+    if places.relay is not None:
+        part = routers.relay_part(scenario.receivers, places.relay)
+        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring}))
     for name, table in scenario.eavesdroppers.items():
         part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
         made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
     return {one.process: one for one in made}
-
-
-def _identities(run: str, meeting: Meeting, users: tuple[str, ...]) -> dict[str, Identity]:
-    """Process name, or operator → its certificate; nobody has one of a router that listens in clear."""
-    if not meeting.secure:
-        return {}
-    from emulator.runs.authority import Authority  # noqa: PLC0415 - 50 ms that most runs need not
-
-    authority = Authority(run)
-    return {
-        **{user: authority.identity(user) for user in users},
-        ROUTER: authority.identity(ROUTER, hosts=meeting.names),
-    }
 
 
 def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
@@ -234,18 +253,24 @@ def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
     return {"window": scenario.window(receiver), "outages": outages}
 
 
-def write_briefs(scenario: Scenario, meeting: Meeting, results: Path, folder: Path, patience: int) -> list[Path]:
+def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path, patience: int) -> list[Path]:
     """Write the briefs into a folder, for processes that are started by hand, on whichever hosts.
 
     results: the observer's folder, on its host; relative to where it is started. patience: seconds that everybody waits for
-    the others. Raises UsageError if the folder has something in it or cannot be written.
+    the others. Raises UsageError if the folder has something in it or cannot be written, and for a scenario in
+    shards.
     """
+    if scenario.shards > 1:
+        raise UsageError(
+            f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
+            "itself, with its own --first-trial and --trials"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty; give another --out, or empty it")
         observation = Observation(results, True, None)
-        made = briefs_of(scenario, meeting, observation, ends_with_stdin=False, patience=patience)
+        made = briefs_of(scenario, places, observation, ends_with_stdin=False, patience=patience)
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

@@ -44,6 +44,8 @@ def channel_of(scenario: Scenario, receiver: str, tally: Tally) -> dict[str, Any
         "expected_mean_burst": None if tally.lost.get("overflow") else _expected_burst(pieces),
         **_delays(course, tally),
     }
+    if tally.offered != tally.done * tally.trials:
+        return found  # trials that were cut short at different slots, in which other models may have ruled
     if tally.unsent:
         # What a scheme sends may depend on what came before: of a loss model with a memory these packets are no fair sample.
         if len(pieces) != 1 or len(pieces[0][0]) < tally.done or not _independent(pieces[0][1]):

@@ -18,8 +18,8 @@ from typing import Any
 
 from emulator.brief import Brief
 from emulator.errors import RunError
-from emulator.network.access import OBSERVER, ROUTER, SENSOR
-from emulator.runs.environment import own_environment
+from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
+from emulator.runs.environment import lock_step_environment, own_environment
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -34,13 +34,24 @@ _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
 
 
+_SENDERS: Mapping[str, str] = {
+    "uplink": SENSOR,
+    "state": SENSOR,
+    "estimate": LEGITIMATE,
+    "input": CONTROLLER,
+    "journal": ROUTER,
+    "downlink": ROUTER,
+    "control": OBSERVER,
+}
+
+
 def _sender(complaint: str) -> str | None:
     """The process that sent what a complaint about a message is about (docs/protocol.md, keys)."""
     found = _REFUSED.search(complaint)
     if found is None:
         return None
     kind, _, name = found[1].partition("/")
-    return {"uplink": SENSOR, "journal": ROUTER, "downlink": ROUTER, "control": OBSERVER}.get(kind, name)
+    return _SENDERS.get(kind, name)
 
 
 @dataclass(frozen=True)
@@ -61,8 +72,10 @@ class Exit:
 class Children:
     """The processes of a run. Final; on leaving the block all are gone."""
 
-    def __init__(self, logs: Path, private: Path) -> None:
+    def __init__(self, logs: Path, private: Path, lock_step: bool = False) -> None:
+        """lock_step: the processes wait for each other in every slot, or every few."""
         self._logs = logs
+        self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
@@ -107,13 +120,14 @@ class Children:
             state_file = str((self._private / f"{brief.process}.state").absolute())
             brief = replace(brief, part={**brief.part, "state_file": state_file})
         environment = {
+            **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUNBUFFERED": "1",
         }
-        if brief.role == "router":
-            environment["TMPDIR"] = str(self._private)  # its file of passwords goes with the briefs
+        if brief.role in {"router", "relay"}:
+            environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
             with (self._logs / f"{brief.process}.log").open("ab" if again else "wb") as log:
@@ -143,12 +157,12 @@ class Children:
             self._news.put(Exit(name, status))
 
     def restart_router(self, ended: Exit) -> bool:
-        """Start the router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process != ROUTER or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        """Start a router again if a signal ended it, a few times at most; whether it was started."""
+        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
-        self._killed.add(self._processes[ROUTER].pid)
-        self.start(self._briefs[ROUTER], again=True)
+        self._killed.add(self._processes[ended.process].pid)
+        self.start(self._briefs[ended.process], again=True)
         return True
 
     def act(self, request: News) -> None:

@@ -85,7 +85,9 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
     kind = closed_form(scenario.encoding.scheme, reader)
     threshold = scenario.encoding.parameters.get("threshold", 1)
-    if kind == "reference" and not ReferenceCode(process).decorrelates:
+    # Unless acknowledgements are forged the user never misses a reference, and what it does with a slot tells more.
+    told = receiver != LEGITIMATE or table.attack == "forge"
+    if kind == "reference" and told and not ReferenceCode(process).decorrelates:
         return Closed(process, scenario.slots, quality[receiver], split, None)
     if kind == "scheduled":
         chain = scheduled(threshold, quality[receiver], split)

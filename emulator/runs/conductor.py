@@ -8,12 +8,12 @@ from queue import Empty, SimpleQueue
 from typing import Any, NoReturn
 
 from emulator.errors import Interrupted, RunError
-from emulator.network.access import OBSERVER, ROUTER, SENSOR
+from emulator.network.access import OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.network.session import Question, Session
 from emulator.network.wire import control, progress
 
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
-_FAREWELL_SECONDS = 3.0  # for everybody to hear that the run has failed
+_ABANDON_SECONDS = 2.0  # for who is told to go
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 _END_SECONDS = 0.5  # after which who is still there is told once more that the run is over
 
@@ -39,19 +39,27 @@ class Conductor:
     """Final. Its news are (source, payload): telemetry and journal as they come; everything else it keeps to itself."""
 
     def __init__(
-        self, session: Session, receivers: tuple[str, ...], stop: Stop, beat: Callable[[], None] = lambda: None
+        self,
+        session: Session,
+        reporters: tuple[str, ...],
+        stop: Stop,
+        beat: Callable[[], None] = lambda: None,
+        relayed: bool = False,
     ) -> None:
+        """reporters: who reports besides router and sensor: the receivers, and a controller."""
         self._session = session
         self._stop = stop
         self._beat = beat
         self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
-        self._present = dict.fromkeys((ROUTER, SENSOR, *receivers), False)
+        self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
+        self.relayed = relayed
+        """Whether we are connected to a relay, and not to the router itself."""
         self._router: str | None = None
         self.lost: dict[str, float] = {}
         """Process → when it vanished from the network, of those that have, on the clock of `time.monotonic`."""
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
-        self.keys.update({name: keys.telemetry(name) for name in receivers})
+        self.keys.update({name: keys.telemetry(name) for name in reporters})
         for source, key in self.keys.items():
             session.funnel(key, lambda payload, source=source: self._news.put((source, payload)))  # type: ignore[misc]
         for name in self._present:
@@ -70,7 +78,7 @@ class Conductor:
         return [name for name, there in self._present.items() if not there and name not in self.absent]
 
     def router_changed(self) -> bool:
-        """Whether the router is another one than that which the run began with, or than when this was asked last."""
+        """Whether we are connected to another router than that which the run began with, or than when this was asked last."""
         before, self._router = self._router, self._session.router_id
         return before != self._router
 
@@ -90,7 +98,7 @@ class Conductor:
             self._stop.check()
             if time.monotonic() > deadline:
                 # Who waits for somebody else is not the one to be named.
-                names = [name for name in self.missing if not self._session.reaches(self._session.keys.control(name))]
+                names = [name for name in self.missing if not self._reaches(name)]
                 names = names or self.missing
                 do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
                 raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
@@ -136,7 +144,9 @@ class Conductor:
         said = 0.0
         while time.monotonic() < deadline:
             left = [
-                name for name in self._present if name != ROUTER and name not in self.absent and self._present[name]
+                name
+                for name in self._present
+                if name not in {ROUTER, RELAY} and name not in self.absent and self._present[name]
             ]
             if not left and self._present[ROUTER]:
                 break
@@ -146,16 +156,24 @@ class Conductor:
                     self.command(name, "end")
             self._note(self._next())
         self.command(ROUTER, "end")
+        if RELAY in self._present:
+            self.command(RELAY, "end")
 
     def abandon(self, why: str) -> None:
-        """Tell everybody that the run has failed: each ends at once, and the router when the others had time to hear it."""
-        for name, command in self._commands.items():
-            if name != ROUTER:
-                command(control("abandon", why=why))
-        deadline = time.monotonic() + _FAREWELL_SECONDS
-        while any(there for name, there in self._present.items() if name != ROUTER) and time.monotonic() < deadline:
-            self._note(self._next())
-        self._commands[ROUTER](control("abandon", why=why))
+        """Tell everybody who is there that the run will not go on."""
+        others = [name for name in self._commands if name not in {ROUTER, RELAY}]
+        # The routers last, and the relay after the router: what they still have to pass on would go with them.
+        for names in (others, [ROUTER], [RELAY]):
+            told = [name for name in names if name in self._commands]
+            for name in told:
+                self.command(name, "abandon", why=why)
+            deadline = time.monotonic() + _ABANDON_SECONDS
+            while any(self._reaches(name) for name in told) and time.monotonic() < deadline:
+                time.sleep(0.01)
+
+    def _reaches(self, name: str) -> bool:
+        """Whether a process has opened its session, whatever it waits for."""
+        return self._session.reaches(self._session.keys.control(name))
 
     def _next(self) -> tuple[str, bytes | bool] | None:
         self._beat()

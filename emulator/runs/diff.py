@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,9 +10,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.model.digest import BLOCK_SLOTS
+from emulator.network.access import CONTROLLER
 from emulator.runs.results import Results
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")
+_INPUTS = ("u", "d", "failed")
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ def difference(a: Results, b: Results) -> Difference:
     blocks_a, blocks_b = _blocks(a), _blocks(b)
     ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
     common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]
-    first = _first_row(a.trials, b.trials)
+    first = _first(a, b)
     if not common and first is None:
         return Difference(
             False, "the runs have no whole block of a trial and receiver in common; compare runs of one scenario"
@@ -79,31 +81,45 @@ class _Row:
     text: str
 
 
-def _first_row(a: pa.Table, b: pa.Table) -> _Row | None:
-    """The first recorded row that differs."""
-    keys = ["slot", "trial", "peer"]
-    tables = [_plain(table).sort_by([(key, "ascending") for key in keys]) for table in (a, b)]
-    joined = tables[0].join(tables[1], keys, join_type="inner", right_suffix="_b")
+def _first(a: Results, b: Results) -> _Row | None:
+    """The first recorded row that differs, of a receiver, or of the controller."""
+    found = _first_row(a.trials, b.trials, ("slot", "trial", "peer"), _COMPARED)
+    inputs = (a.inputs, b.inputs)
+    if inputs[0] is None or inputs[1] is None:
+        return found
+    compared = [name for name in _INPUTS if name in inputs[0].schema.names and name in inputs[1].schema.names]
+    steered = _first_row(inputs[0], inputs[1], ("slot", "trial"), compared)
+    # What is decided in a slot is decided from what is believed after it.
+    return steered if steered is not None and (found is None or steered.slot < found.slot) else found
+
+
+def _first_row(a: pa.Table, b: pa.Table, keys: Sequence[str], compared: Sequence[str]) -> _Row | None:
+    order = [(key, "ascending") for key in keys]
+    tables = [_plain(table, (*keys, *compared)).sort_by(order) for table in (a, b)]
+    joined = tables[0].join(tables[1], [*keys], join_type="inner", right_suffix="_b")
     unequal = None
-    for name in _COMPARED:
+    for name in compared:
         differs = pc.not_equal(joined[name], joined[f"{name}_b"])
         unequal = differs if unequal is None else pc.or_(unequal, differs)
-    rows = joined.filter(unequal).sort_by([(key, "ascending") for key in keys]).slice(0, 1).to_pylist()
+    rows = joined.filter(unequal).sort_by(order).slice(0, 1).to_pylist()
     if not rows:
         return None
     row = rows[0]
     values = "; ".join(
         f"{name} {_shown(row[name])} against {_shown(row[f'{name}_b'])}"
-        for name in _COMPARED
+        for name in compared
         if row[name] != row[f"{name}_b"]
     )
-    return _Row(row["slot"], f"first difference: slot {row['slot']}, trial {row['trial']}, {row['peer']}: {values}")
+    return _Row(
+        row["slot"],
+        f"first difference: slot {row['slot']}, trial {row['trial']}, {row.get('peer', CONTROLLER)}: {values}",
+    )
 
 
-def _plain(table: pa.Table) -> pa.Table:
+def _plain(table: pa.Table, names: Sequence[str]) -> pa.Table:
     """Columns that can be joined and compared: strings for dictionaries, the numbers' bytes for lists."""
     columns = {}
-    for name in ("slot", "trial", "peer", *_COMPARED):
+    for name in names:
         column = table[name]
         if pa.types.is_dictionary(column.type):
             column = column.cast(pa.string())
@@ -123,8 +139,8 @@ def _as_bytes(column: pa.ChunkedArray) -> pa.Array:
     )
 
 
-def _shown(value: str | bytes) -> str:
-    if isinstance(value, str):
-        return value
+def _shown(value: str | bytes | bool) -> str:
+    if not isinstance(value, bytes):
+        return str(value)
     numbers = memoryview(value).cast("d").tolist()
     return "[" + ", ".join(repr(number) for number in numbers) + "]"

@@ -49,6 +49,18 @@ def own_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name in _NEEDED or name.startswith(_NEEDED_KINDS)}
 
 
+_CLIENT = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx), app: (handover: rx))"
+# What a router receives must never wait for a thread that sends what it passes on.
+_ROUTER = (
+    "(rx: (worker_threads: 1), tx: (worker_threads: 1), net: (handover: tx), acc: (handover: tx), app: (handover: tx))"
+)
+
+
+def lock_step_environment(role: str) -> dict[str, str]:
+    """For a process of a run whose messages come one by one: few threads of Zenoh, for each must be woken for each message."""
+    return {"ZENOH_RUNTIME": _ROUTER if role == "router" else _CLIENT}
+
+
 def viewer_environment() -> Mapping[str, str]:
     """For a viewer: besides, how to reach the screen and the graphics card."""
     shows = {name: value for name, value in os.environ.items() if name in _SHOWING or name.startswith(_SHOWING_KINDS)}

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from emulator.model.local_filter import settled
 from emulator.model.theory import stability_bound
+from emulator.modules import sources_of
 from emulator.network.access import LEGITIMATE
 from emulator.runs.expectation import expectations_of
 from emulator.scenario import Scenario
+from emulator.scenario.filter_noise import is_singular
 
 _LARGE_BYTES = 1e9
+_NEAR = 0.01  # of a covariance's largest entry
 
 
 def warnings_of(scenario: Scenario) -> list[str]:
@@ -36,10 +42,36 @@ def warnings_of(scenario: Scenario) -> list[str]:
             f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
             + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
         )
+    found += _filter_warnings(scenario)
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
         found.append(
             f"this run will write about {size / 1e9:.1f} GB of results; fewer slots or record_trials write less"
+        )
+    for module, source in sources_of(scenario.model_dump(mode="json")).items():
+        if scenario.made_with.get(module, source) != source:
+            found.append(f"the {module} is not the one these results were made with; its digests may be others")
+    return found
+
+
+def _filter_warnings(scenario: Scenario) -> list[str]:
+    """What a sensor that filters does to Q, and what a singular Q does to the secret.
+
+    Source: docs/mathematics.md, a filter at the sensor.
+    """
+    found = []
+    process, driven = scenario.process.process, scenario.driven
+    if driven is not None and driven.output_matrix is not None:
+        wanted = settled(process, driven).innovation
+        if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
+            found.append(
+                f"process.Q is {process.Q.tolist()}, but what the sensor's filter adds a slot has the covariance "
+                f'{wanted.tolist()}: process.Q = "filter" takes that; inputs and disturbances come to it'
+            )
+    if process.singular_noise and is_singular(process.Q):
+        found.append(
+            "process.Q is singular: two states one after the other differ, but for A and what inputs and disturbances do, "
+            "within its range alone, and that gives the type of packets away to whoever looks"
         )
     return found
 

@@ -15,7 +15,17 @@ from emulator.model.digest import Digests
 from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
-from emulator.network.wire import Journal, Reader, Report, Truth, read_journal, read_report, read_truth
+from emulator.network.access import CONTROLLER
+from emulator.network.loop_wire import read_decisions
+from emulator.network.wire import (
+    Journal,
+    Reader,
+    Report,
+    Truth,
+    read_journal,
+    read_report,
+    read_truth,
+)
 
 Message = TypeVar("Message")
 
@@ -47,6 +57,16 @@ class ReceiverSlots:
 
 
 @dataclass(frozen=True)
+class InputSlots:
+    """What the controller decided, over c slots."""
+
+    u: Floats
+    """As decided, (c, m, R); the plant may clip it."""
+    failed: Flags
+    """Whether the decision that holds failed, so that the inputs before are held, (c, R)."""
+
+
+@dataclass(frozen=True)
 class Slots:
     """c consecutive slots of all trials, complete."""
 
@@ -60,6 +80,10 @@ class Slots:
     """Whether there was a packet, as the sensor says, (c, R); None: always."""
     alarms: Flags | None = None
     """As in `Truth`."""
+    inputs: InputSlots | None = None
+    """None without a controller."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters; None where they are x."""
 
     @property
     def count(self) -> int:
@@ -78,7 +102,8 @@ class Slots:
             for name, one in self.receivers.items()
         }
         sent = None if self.sent is None else self.sent.copy()
-        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent)
+        inputs = None if self.inputs is None else InputSlots(self.inputs.u.copy(), self.inputs.failed.copy())
+        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent, inputs=inputs)
 
 
 def concatenated(parts: Sequence[Slots]) -> Slots:
@@ -92,7 +117,11 @@ def concatenated(parts: Sequence[Slots]) -> Slots:
     }
     x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
     sent = None if parts[0].sent is None else np.concatenate([_all(part.sent, part.nu) for part in parts])
-    return Slots(parts[0].first, x, nu, receivers, sent)
+    inputs = None
+    if parts[0].inputs is not None:
+        of_parts = [part.inputs for part in parts if part.inputs is not None]
+        inputs = InputSlots(*(np.concatenate([getattr(one, name) for one in of_parts]) for name in ("u", "failed")))
+    return Slots(parts[0].first, x, nu, receivers, sent, inputs=inputs)
 
 
 def _all(flags: Flags | None, like: Flags) -> Flags:
@@ -106,17 +135,32 @@ _ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
 class Joiner:
     """Takes the messages of all processes as they come and gives back slots as soon as all have reported them. Final."""
 
-    def __init__(self, windows: Mapping[str, int], shape: tuple[int, int], recorded: int) -> None:
-        """windows: receiver → slots by which a packet may be late for it."""
+    def __init__(
+        self,
+        windows: Mapping[str, int],
+        shape: tuple[int, int],
+        recorded: int,
+        loop: tuple[int, int] | None = None,
+        measures: bool = False,
+    ) -> None:
+        """windows: receiver → slots by which a packet may be late for it; loop: a controller's inputs, and its period.
+
+        measures: whether the sensor filters what it measures.
+        """
+        self._measures = measures
         self._windows = windows
         self._shape = shape
         self._recorded = recorded
+        self._loop = loop
+        self._decided = 0
         self._truth = _Column[Truth]()
         self._journal = _Column[Journal]()
         self._reports = {name: _Column[Report]() for name in windows}
         self._done = 0
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
-        """Receiver → block, by its first slot → digests."""
+        """Receiver, or controller → block, by its first slot → digests."""
+        if loop is not None:
+            self.digests[CONTROLLER] = {}
 
     @property
     def done(self) -> int:
@@ -134,12 +178,24 @@ class Joiner:
         return self._journal.end
 
     def reported(self, name: str) -> int:
-        """The first slot that a receiver has not reported."""
-        return self._reports[name].end
+        """The first slot that a receiver, or the controller, has not reported."""
+        return self._decided if name == CONTROLLER else self._reports[name].end
+
+    def complete(self, slots: int) -> bool:
+        """Whether so many slots have been given back, and a controller has reported them."""
+        return self._done == slots and (self._loop is None or self._decided == slots)
+
+    def decisions(self, telemetry: Reader) -> Floats:
+        """Take the controller's telemetry; what its decisions took."""
+        message = read_decisions(telemetry, self._decided, self._shape[1], 1 if self._loop is None else self._loop[1])
+        self._decided += message.count
+        self.digests[CONTROLLER].update(message.digests)
+        return message.seconds
 
     def truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
-        message = read_truth(telemetry, self._truth.end, self._shape)
+        inputs = 0 if self._loop is None else self._loop[0]
+        message = read_truth(telemetry, self._truth.end, self._shape, inputs, self._measures)
         self._truth.add(message, message.count)
 
     def report(self, name: str, telemetry: Reader) -> None:
@@ -191,7 +247,12 @@ class Joiner:
             else _rows(truth, [_all(getattr(part, name), part.nu) for part, _ in truth])
             for name in ("sent", "alarms")
         )
-        return Slots(first, x, nu, receivers, sent, alarms)
+        inputs = None
+        if self._loop is not None:
+            u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
+            inputs = InputSlots(u, failed)
+        true = _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._measures else None
+        return Slots(first, x, nu, receivers, sent, alarms, inputs, true)
 
 
 def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:

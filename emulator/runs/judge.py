@@ -19,6 +19,7 @@ from emulator.runs.score import Tally
 from emulator.runs.verdict import Secrecy, Verdict
 from emulator.runs.watched import watch_of
 from emulator.scenario import ExpectTable, Scenario, link_figure
+from emulator.scenario.household import HOUSEHOLD
 
 Found = float | str | None
 """None: the run does not tell, or, of a receiver that must be in step, it never was."""
@@ -58,6 +59,8 @@ class Evidence:
     tallies: Mapping[str, Tally]
     theory: Mapping[str, Expectation]
     secrecy: Mapping[str, Secrecy]
+    household: Mapping[str, Any] | None = None
+    """As in the summary."""
 
     def judged(self, replay: str | None) -> list[dict[str, Any]]:
         """Every expectation of the scenario as in the summary; `replay` is the command that shows a failure again."""
@@ -72,7 +75,10 @@ class Evidence:
     def _figure(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         name = str(expect.figure)
         link = link_figure(name)
-        found = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
+        if name.startswith(f"{HOUSEHOLD}."):
+            found = self._of_household(*name.split(".")[1:])
+        else:
+            found = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
         return found, None if found is None else expect.holds(found)
 
     def _of_link(self, receiver: str, path: tuple[str, ...]) -> float | None:
@@ -80,6 +86,15 @@ class Evidence:
         for part in path:
             inner = inner.get(part) if isinstance(inner, Mapping) else None
         return inner if isinstance(inner, (int, float)) else None
+
+    def _of_household(self, figure: str, of_receiver: str | None = None) -> float | None:
+        """A figure of the house, or what a receiver, the first of two, can tell of it; None where there is no such run."""
+        if self.household is None:
+            return None
+        found: float | None = (
+            self.household[figure] if of_receiver is None else self.household["receivers"][figure][of_receiver]
+        )
+        return found
 
     def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:
         """A figure of the whole run, of some slots, or a quantile over trials of either."""

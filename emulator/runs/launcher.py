@@ -7,10 +7,9 @@ Ctrl-C reaches the launcher only; each holds the other end of a pipe, so none ou
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +19,8 @@ from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import Children, Exit, News
 from emulator.runs.folder import new_folder
-from emulator.runs.ports import loopback_meeting
+from emulator.runs.ports import Places, loopback_places
+from emulator.runs.private import private_folder
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.viewer import Viewer, choose
 from emulator.scenario import Scenario
@@ -38,22 +38,58 @@ class Ended:
     viewer: Viewer | None
 
 
-def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell: Callable[[News], None]) -> Ended:
+def launch(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Callable[[News], None],
+    relay: str | None = None,
+) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
+
+    listen, relay: the endpoints of router and, if there is one, relay; free ports by default.
 
     Raises UsageError before anything is started, RunError when the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases what was measured is in the folder and no process is left.
     """
     view = choose(view)
-    meeting = loopback_meeting(listen)
-    with stop_on_signals() as stop, _private_folder() as private:
+    with stop_on_signals() as stop:
+        if scenario.shards == 1:
+            return launch_one(scenario, folder, view, loopback_places(listen, relay, scenario.relayed), tell, stop)
+        from emulator.runs.shards import launch_shards  # noqa: PLC0415 - it launches each of them by the function below
+
+        given = {"--listen": listen, "--relay": relay}
+        for option, endpoint in given.items():
+            if endpoint is not None:
+                raise UsageError(
+                    f"{option} {endpoint} is one router's endpoint, and each of the {scenario.shards} shards has its own; "
+                    "leave it out, or give --set shards=1"
+                )
+        return launch_shards(scenario, folder, view, tell, stop)
+
+
+def launch_one(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    places: Places,
+    tell: Callable[[News], None],
+    stop: threading.Event,
+    shard: bool = False,
+) -> Ended:
+    """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
+
+    shard: whether others carry further trials.
+    """
+    with private_folder() as private:
         new_folder(folder)
         (folder / "logs").mkdir()
         viewer = None
         try:
-            briefs = briefs_of(scenario, meeting, Observation(folder.absolute(), view != "off", None))
+            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None, shard))
             observer = briefs.pop(OBSERVER)
-            with Children(folder / "logs", private) as children:
+            with Children(folder / "logs", private, scenario.controller is not None) as children:
                 for brief in briefs.values():
                     children.start(brief)
                 # The others find their feet while the viewer does; only the observer must know it.
@@ -74,17 +110,6 @@ def launch(scenario: Scenario, folder: Path, view: str, listen: str | None, tell
         finally:
             remove_control(folder)
     return Ended(status, viewer)
-
-
-@contextlib.contextmanager
-def _private_folder() -> Iterator[Path]:
-    """For the briefs: nobody else may look into it."""
-    try:
-        made = tempfile.TemporaryDirectory(prefix="evedrop-", ignore_cleanup_errors=True)
-    except OSError as error:
-        raise UsageError(f"no temporary folder can be made ({error.strerror}); set TMPDIR to one") from error
-    with made as private:
-        yield Path(private)
 
 
 def _forget(folder: Path) -> None:
@@ -108,9 +133,9 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
             summary = {**load_results(folder).summary, "ended": how}
         except UsageError:
             tallies = {name: Tally(scenario.slots, scenario.trials) for name in scenario.receivers}
-            summary = summary_of(scenario, tallies, dict.fromkeys(scenario.receivers), Ending(0.0, how))
+            summary = summary_of(scenario, tallies, dict.fromkeys(scenario.digested), Ending(0.0, how))
             if not any(folder.glob("*.parquet")):
-                with ResultsWriter(folder, scenario.receivers, len(scenario.process.A)):
+                with ResultsWriter.of(folder, scenario):
                     pass
         write_summary(folder, summary)
 

@@ -23,10 +23,12 @@ from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.schemes import scheme_of
 from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
+from emulator.runs.filtering import FilterTally
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
 from emulator.runs.judge import replay_of
+from emulator.runs.loop_tally import LoopTally, SolveTimes
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.score import SlotSums, Tally, merged, squared_errors
 from emulator.runs.scorekeeper import Ending, events_of, summary_of, write_resolved
@@ -79,7 +81,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
         with said_of(folder):
             write_resolved(folder, scenario)
             with (
-                ResultsWriter(folder, scenario.receivers, len(scenario.process.A)) as writer,
+                ResultsWriter.of(folder, scenario) as writer,
                 contextlib.closing(results_of(tasks, workers, client, told, stop.is_set)) as results,
             ):
                 try:
@@ -117,6 +119,11 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
     """Raise UsageError where a mode cannot follow the scenario: who reads packets, numbers that leave double precision."""
     if mode is Mode.EXACT:
         return
+    if mode is Mode.ERROR_COORDINATES and scenario.plant is not None:
+        raise UsageError(
+            f"--mode {mode.value} follows errors, not states, and the plant's inputs and disturbances depend on these; give "
+            "--mode exact, or covariance-only for what network and estimators believe of it"
+        )
     _check_scheme(scenario, mode)
     for name in scenario.receivers:
         if scenario.timeline.outages[name] or scenario.window(name):
@@ -207,11 +214,14 @@ class Merger:
         names = scenario.receivers
         self._sums = {name: SlotSums.zero(scenario.slots) for name in names}
         self._tallies: dict[str, dict[int, Tally]] = {name: {} for name in names}
-        self._digests = {name: RunDigest() for name in names}
+        self._digests = {name: RunDigest() for name in scenario.digested}
         self._errors: dict[str, SlotHistograms] = {}
         self._traces: dict[str, SlotHistograms] = {}
         self._whole = mode is Mode.EXACT
         self._detections: list[Detection] = []
+        self._loops: list[LoopTally | None] = []
+        self._solve_times = SolveTimes()
+        self._filters: list[FilterTally | None] = []
         self.trials = 0
 
     @property
@@ -226,11 +236,14 @@ class Merger:
         for block in result.blocks:
             self.trials += block.trials
             self._detections.append(block.detection)
+            self._loops.append(block.loop)
+            self._filters.append(block.filter)
             for name in self._scenario.receivers:
                 self._sums[name].add(0, block.sums[name])
                 self._tallies[name][block.start] = block.tallies[name]
             if self._mode is Mode.EXACT:
                 self._add_digests(block.start, block.digests, writer)
+        self._solve_times.merge(result.solve_times)
         for mine, theirs in ((self._errors, result.errors), (self._traces, result.traces)):
             for name, histograms in theirs.items():
                 if name in mine:
@@ -239,6 +252,7 @@ class Merger:
                     mine[name] = histograms
         if writer is not None and result.recorded:
             slots = concatenated(result.recorded)
+            writer.input_rows(slots, result.start)
             errors = {name: squared_errors(slots.x, one.x_hat) for name, one in slots.receivers.items()}
             writer.trial_rows(slots, errors, result.start)
 
@@ -263,12 +277,22 @@ class Merger:
             covariances = self._mode is Mode.COVARIANCE_ONLY
             writer.slot_rows(0, name, sums, expected[name][:count], quantiles[:count], covariances)
 
+    @property
+    def totals(self) -> dict[str, Tally]:
+        """Receiver → the tally of all that was added."""
+        return {name: merged(tallies) for name, tallies in self._tallies.items()}
+
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> dict[str, Any]:
         """The summary of all that was added."""
-        totals = {name: merged(tallies) for name, tallies in self._tallies.items()}
+        totals = self.totals
         whole = self._whole and self.complete
         digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
         detection = Detection.merged(self._detections) if self._mode is Mode.EXACT else None
         events = events_of(self._scenario, min(total.done for total in totals.values()))
-        return summary_of(self._scenario, totals, digests, ending, self._mode.value, events, detection)
+        loop = LoopTally.merged(self._loops) if self._mode is Mode.EXACT else None
+        looped = None if loop is None else (loop, self._solve_times)
+        filtered = FilterTally.merged(self._filters) if self._mode is Mode.EXACT else None
+        return summary_of(
+            self._scenario, totals, digests, ending, self._mode.value, events, detection, looped, filtered
+        )

@@ -24,7 +24,7 @@ from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
-from emulator.network.access import OPERATOR, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Question, Session
@@ -33,17 +33,20 @@ from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
+from emulator.runs.loop_tally import SolveTimes
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
-from emulator.runs.shown import open_recording, shown
+from emulator.runs.shard_score import Score
+from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
+    from emulator.runs.showing import Showing
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
@@ -62,7 +65,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     by_hand = not brief.ends_with_stdin
-    if brief.ends_with_stdin:
+    if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
     scenario = Scenario.model_validate(brief.part["scenario"])
@@ -120,14 +123,18 @@ class Observation:
     def __init__(
         self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
-        """by_hand: whether there is no launcher to end the other processes when the run fails."""
+        """by_hand: whether nobody has launched the others who would end them."""
         self.folder = Path(brief.part["results"])
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
         self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials)
+        table, plant = scenario.controller, scenario.driven
+        loop = None if table is None or plant is None else (plant.inputs, table.period)
+        measures = plant is not None and plant.output_matrix is not None
+        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
+        self._solve_times = SolveTimes()
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -135,6 +142,7 @@ class Observation:
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
         self._live: str | None = brief.part["live"]
+        self._showing: Showing | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = self._beaten = time.monotonic()
         self._suspects: list[str] = []
@@ -152,14 +160,15 @@ class Observation:
 
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
-        self._writer = ResultsWriter(self.folder, self._scenario.receivers, self._shape[0])
+        self._writer = ResultsWriter.of(self.folder, self._scenario)
         return self._writer
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
         with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
-            conductor = Conductor(session, self._scenario.receivers, stop, self._beat)
+            conductor = Conductor(session, self._scenario.digested, stop, self._beat, self._scenario.relayed)
             if self._brief.part["recording"]:
+                self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
                     self._scenario, self._brief.run, self.folder / "recording.rrd", self._live
                 )
@@ -174,17 +183,16 @@ class Observation:
                 self._control.write(self.folder)
                 conductor.start()
                 tell("started")
-                while self._joiner.done < self._scenario.slots:
+                while not self._joiner.complete(self._scenario.slots):
                     news = conductor.news()
                     if news is not None:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
             except EvedropError as error:
-                if isinstance(error, RunError):
-                    self._suspects = conductor.missing
-                if self._by_hand:
-                    conductor.abandon(str(error))
+                self._suspects = conductor.missing if isinstance(error, RunError) else []
+                if self._by_hand:  # a launcher ends them itself
+                    conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
             finally:
                 self._dismiss(conductor)
@@ -232,6 +240,8 @@ class Observation:
             return
         if order.request.do == "status":
             order.tell(self._status(conductor))
+        elif self._brief.part["shard"]:
+            order.refuse("this run is in shards, which are not steered; run it with --set shards=1 for that")
         else:
             self._steering.take(order, self._joiner.done)
 
@@ -268,6 +278,8 @@ class Observation:
         if source == ROUTER:
             for name, account in self._joiner.journal(message).items():
                 self._keeper.tallies[name].count(account)
+        elif source == CONTROLLER:
+            self._solve_times.add(self._joiner.decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
@@ -276,20 +288,24 @@ class Observation:
             self._steering.held(message.slot(self._joiner.sent))
         else:
             self._joiner.truth(message)
-        for name, stand_in in list(self._stand_ins.items()):
-            if self._joiner.reported(name) == stand_in.next:
-                stand_in.follow(self._joiner.sent)
-            if stand_in.over:
-                del self._stand_ins[name]
+        self._stand_in()
         slots = self._joiner.take()
         if slots is None:
             return
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         if self._recording is not None:
-            self._recording.add(shown(slots, scored))
+            self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
         conductor.report(self._joiner.done)
         self._progress(scored)
+
+    def _stand_in(self) -> None:
+        """Report for receivers that are away."""
+        for name, stand_in in list(self._stand_ins.items()):
+            if self._joiner.reported(name) == stand_in.next:
+                stand_in.follow(self._joiner.sent)
+            if stand_in.over:
+                del self._stand_ins[name]
 
     def _news(self, source: str, message: Reader) -> bool:
         """Whether a message is the one that is due, and no other one that came because some were lost."""
@@ -337,6 +353,9 @@ class Observation:
     def finish(self, status: int, how: str) -> tuple[int, str]:
         """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
         safe = self._recording.close() if self._recording is not None else True
+        if self._brief.part["shard"]:
+            with suppress(OSError):  # of a full disk, which the summary says
+                Score(self._keeper.tallies, self._keeper.detection).leave(self.folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         ending = Ending(self._ended - self._started, how, replay_of(self.folder, self._scenario))
         summary = summary_of(
@@ -347,6 +366,8 @@ class Observation:
             events=self._events,
             outages=self._outages,
             detection=self._keeper.detection,
+            filtered=self._keeper.filter,
+            loop=None if self._keeper.loop is None else (self._keeper.loop, self._solve_times),
         )
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
@@ -369,5 +390,6 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
     """All rows of some slots."""
     for name, one in scored.items():
         writer.slot_rows(slots.first, name, one.sums, one.expected)
+    writer.input_rows(slots, first_trial)
     writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
     writer.journal_rows(slots)

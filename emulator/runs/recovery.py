@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from emulator.brief import Flow
-from emulator.network.access import OBSERVER, ROUTER
+from emulator.network.access import OBSERVER, RELAY, ROUTER
 from emulator.runs.conductor import Conductor
 from emulator.runs.steering import Steering
 
@@ -35,7 +35,7 @@ class Outage:
     until: int | None
     """The same when the run went on; None if it did not."""
     seconds: float
-    """From when it was noticed to when the run went on."""
+    """From the last slot that was joined before to when the run went on: it may be noticed late."""
 
 
 class Recovery:
@@ -51,7 +51,7 @@ class Recovery:
         self._done = 0
         self._target = 0
         """Slots below were on the way when a connection was lost."""
-        self._moved = time.monotonic()
+        self._moved = self._joined = time.monotonic()
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
@@ -71,7 +71,7 @@ class Recovery:
         elif self._missing:
             self._all_back(now)
         elif self._steering.at is not None and done >= self._steering.at:
-            self._moved = now  # held, and nothing is expected
+            self._moved = self._joined = now  # held, and nothing is expected
             self._close(done, now)
         elif now - self._moved > self._limit:
             self._round(now)
@@ -89,7 +89,7 @@ class Recovery:
     def _go_on(self, done: int, now: float) -> None:
         if not self._missing and not self._wait:
             self._longest = max(self._longest, now - self._moved)
-        self._done, self._moved, self._wait = done, now, 0.0
+        self._done, self._moved, self._joined, self._wait = done, now, now, 0.0
         self._close(done, now)
 
     def _close(self, done: int, now: float) -> None:
@@ -102,7 +102,7 @@ class Recovery:
 
     def _miss(self, done: int, now: float) -> None:
         for name in self._conductor.missing:
-            self._missing.setdefault(name, (done, self._conductor.lost.get(name, now)))
+            self._missing.setdefault(name, (done, min(self._joined, self._conductor.lost.get(name, now))))
         gone = [
             name
             for name in self._conductor.missing
@@ -110,15 +110,19 @@ class Recovery:
         ]
         if gone:
             # Without the router nobody else can be seen either.
-            gone = [ROUTER] if ROUTER in gone else gone
+            gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
             self.give_up(done)
             self._conductor.despair(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
         found = self._missing
-        if ROUTER in found:
-            # All vanish with the router, and with our own connection to it.
-            found = {ROUTER if self._conductor.router_changed() else OBSERVER: found[ROUTER]}
+        # All vanish with the router that we are connected to, and with our own connection to it. Behind a relay, the sensor
+        # vanishes with the router, and both with the link between them.
+        own = RELAY if self._conductor.relayed else ROUTER
+        if own in found:
+            found = {own if self._conductor.router_changed() else OBSERVER: found[own]}
+        elif ROUTER in found:
+            found = {ROUTER: found[ROUTER]}
         for name, beginning in found.items():
             self._back.setdefault(name, beginning)
         self._missing = {}
@@ -145,8 +149,7 @@ class Recovery:
         now = time.monotonic()
         self._close(done, now)
         found = self._missing
-        if ROUTER in found:
-            found = {ROUTER: found[ROUTER]}
+        found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
         self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -128,17 +128,14 @@ def closing_table(summary: News, width: int) -> Table:
 
 def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
     """The closing report on standard output; replay: the command that shows one trial live, to complete."""
-    console = _console()
+    console = terminal()
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
     console.print(closing_table(summary, console.width))
-    for name, link in summary["links"].items():
-        if link.get("within_interval") is False:
-            low, high = link["interval"]
-            console.print(
-                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
-                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
-            )
+    for line in _link_lines(summary["links"]):
+        console.print(line)
+    if summary["controller"] is not None:
+        console.print(_loop_line(summary["controller"]))
     for verdict in summary["secrecy"].values():
         console.print(verdict["sentence"])
     for name, peer in summary["peers"].items():
@@ -148,6 +145,8 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"{name}: its error has infinite variance, so the mean over trials is no measure; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
+    for line in household_lines(summary["household"]):
+        console.print(line)
     for expectation in summary["expectations"]:
         console.print(told(expectation))
         if "replay" in expectation:
@@ -161,6 +160,56 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
+    """Which links let other shares through than their models say."""
+    for name, link in links.items():
+        if link.get("within_interval") is False:
+            low, high = link["interval"]
+            yield (
+                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
+                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
+            )
+
+
+def household_lines(house: Mapping[str, Any] | None) -> list[str]:
+    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it; or nothing."""
+    if house is None:
+        return []
+    seen = house["knowing_truth"]
+    lines = [
+        f"the house buys {_figure(house['bought_energy'], '.3f')} kWh and sells {_figure(house['sold_energy'], '.3f')} kWh; a "
+        f"controller that sees the truth, {_figure(seen['bought_energy'], '.3f')} and {_figure(seen['sold_energy'], '.3f')} kWh"
+    ]
+    shares = [house[f"{name}_difference"] for name in ("net", "total", "summed")]
+    if None not in shares:
+        net, total, summed = (f"{100 * share:.2g} %" for share in shares)
+        lines.append(
+            f"grid power differs from that one's by {net} in net energy, {total} in total, {summed} slot by slot"
+        )
+    areas = {name: one["activity_area"] for name, one in house["receivers"].items()}
+    if None not in areas.values():
+        told = ", ".join(f"{name} {area:.3f}" for name, area in areas.items())
+        windows = f"{house['active_windows']} active windows of {house['windows']}"
+        lines.append(f"who can tell the {windows} (1 is certainty, 0.5 a coin): {told}")
+    return lines
+
+
+def _loop_line(controller: News) -> str:
+    """What became of a closed loop."""
+    errors = ", ".join(
+        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller["mean_squared_errors"].items()
+    )
+    line = (
+        f"controller {controller['strategy']}, {controller['decisions']:,} decisions; the estimator's error is {errors}"
+    )
+    failed, clipped = controller["failed_fraction"], controller["clipped_fraction"]
+    if failed:
+        line += f"; {failed:.2%} of inputs were held because a decision failed"
+    if clipped:
+        line += f"; {clipped:.2%} were clipped by the plant"
+    return line
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
@@ -180,14 +229,14 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
             f"{row['mean_trace_covariance']:.4g}",
             row["relative_secrecy"] or "–",
         )
-    console = _console()
+    console = terminal()
     console.print(shown)
     console.print(f"results: {folder}/sweep.parquet, sweep.png")
 
 
 def print_design(design: Design) -> None:
     """Bounds, intervals, optima and the price of secrecy, for people."""
-    console = _console()
+    console = terminal()
     console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
     if design.remark is not None:
         console.print(design.remark)
@@ -248,7 +297,8 @@ class _Console(Console):
         raise  # noqa: PLE0704 - rich calls this where it has caught the error
 
 
-def _console() -> Console:
+def terminal() -> Console:
+    """Standard output; wide where it is no terminal."""
     return _Console(
         highlight=False,
         markup=False,

@@ -21,12 +21,17 @@ from numpy.typing import NDArray
 from emulator.errors import UsageError
 from emulator.model.digest import DIGEST_BYTES, Digests
 from emulator.model.links.link import REASONS
+from emulator.model.plant import Plant
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
+from emulator.network.access import CONTROLLER
 from emulator.network.wire import packed_flags
 from emulator.runs.histogram import LEVELS
+from emulator.runs.input_table import input_columns, inputs_schema, inputs_schema_in
 from emulator.runs.joined import Slots
 from emulator.runs.score import SlotSums
+from emulator.scenario import Scenario
+from emulator.scenario.disturbances import disturbances_of
 
 _ROWS = 65_536  # rows of a table held back until they are worth writing
 _BYTES = 16 * 2**20  # the same of wide rows, as a journal's of many trials are; and a row group has no more
@@ -64,7 +69,7 @@ SENT = ("state", "innovation", "nothing")
 """What a packet was."""
 
 
-_NULLABLE = {
+NULLABLE = {
     "mean_squared_error",
     "mean_actual_trace_covariance",
     "expected_trace_covariance",
@@ -143,7 +148,7 @@ class _Table:
             return pa.BinaryArray.from_buffers(
                 field.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)]
             )
-        return pa.array(values, field.type, from_pandas=field.name in _NULLABLE)
+        return pa.array(values, field.type, from_pandas=field.name in NULLABLE)
 
     def close(self) -> None:
         try:
@@ -155,14 +160,39 @@ class _Table:
 class ResultsWriter:
     """Writes a results folder. Final; use it as a context manager, so that whatever ends the run, the files are whole."""
 
-    def __init__(self, folder: Path, receivers: tuple[str, ...], n: int) -> None:
-        self._receivers = receivers
-        peers = {"peer": receivers}
+    def __init__(
+        self,
+        folder: Path,
+        receivers: tuple[str, ...],
+        n: int,
+        around: Sequence[float] | None = None,
+        loop: tuple[Plant, Floats] | None = None,
+    ) -> None:
+        """around: what is added to states and estimates, (n,); loop: of a closed one, plant and disturbances (slots, q)."""
+        self._digested = receivers if loop is None else (*receivers, CONTROLLER)
+        self._around = None if around is None or not any(around) else np.array(around)
+        peers = {"peer": self._digested}
         words = {**peers, "sent": SENT, "action": ACTIONS}
         self._slots = _Table(folder / "slots.parquet", SLOTS, peers)
         self._trials = _Table(folder / "trials.parquet", _trials_schema(n), words)
         self._journal = _Table(folder / "journal.parquet", JOURNAL, {"link": receivers})
         self._digests = _Table(folder / "digests.parquet", DIGESTS, peers)
+        self._tables = [self._slots, self._trials, self._journal, self._digests]
+        self._loop = loop
+        if loop is not None:
+            plant, disturbances = loop
+            self._inputs = _Table(folder / "inputs.parquet", inputs_schema(plant.inputs, disturbances.shape[1]), {})
+            self._tables.append(self._inputs)
+
+    @classmethod
+    def of(cls, folder: Path, scenario: Scenario) -> Self:
+        """Of the results of a scenario."""
+        loop = (
+            None
+            if scenario.driven is None or scenario.controller is None
+            else (scenario.driven, disturbances_of(scenario))
+        )
+        return cls(folder, scenario.receivers, len(scenario.process.A), scenario.process.around, loop)
 
     def __enter__(self) -> Self:
         return self
@@ -171,7 +201,7 @@ class ResultsWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         failures: list[Exception] = []
-        for table in (self._slots, self._trials, self._journal, self._digests):
+        for table in self._tables:
             try:
                 table.close()
             except (
@@ -225,7 +255,7 @@ class ResultsWriter:
         trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
         nu = slots.nu[:, :recorded]
         packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, len(SENT) - 1)
-        x = slots.x[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1)
+        x = self._levels(slots.x[:, :, :recorded])
         for name, receiver in slots.receivers.items():
             self._trials.add(
                 [
@@ -237,10 +267,21 @@ class ResultsWriter:
                     squared_errors[name][:, :recorded].reshape(-1),
                     np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
                     x,
-                    receiver.x_hat[:, :, :recorded].transpose(0, 2, 1).reshape(count, -1),
+                    self._levels(receiver.x_hat[:, :, :recorded]),
                     np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
                 ]
             )
+
+    def _levels(self, x: Floats) -> Floats:
+        """States (c, n, r) as rows, (c r, n), with the reference added from which they are deviations."""
+        rows = x.transpose(0, 2, 1).reshape(-1, x.shape[1])
+        return rows if self._around is None else rows + self._around
+
+    def input_rows(self, slots: Slots, first_trial: int) -> None:
+        """A row per slot and recorded trial, the first of which is first_trial: what moved the plant."""
+        if slots.inputs is None or self._loop is None:
+            return
+        self._inputs.add(input_columns(slots, *self._loop, first_trial))
 
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
@@ -264,7 +305,7 @@ class ResultsWriter:
             )
 
     def _names(self, name: str, count: int) -> NDArray[np.int8]:
-        return np.full(count, self._receivers.index(name), np.int8)
+        return np.full(count, self._digested.index(name), np.int8)
 
     def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
         """A row per receiver, trial and block: receiver → block → digests (R, 32) of the trials from first_trial on."""
@@ -284,15 +325,16 @@ def seen_actions(action: Codes, nu: Flags) -> Codes:
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json; infinite and undefined numbers as strings, which JSON lacks."""
     unfinished = folder / "summary.json.new"
-    unfinished.write_text(json.dumps(_plain(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    unfinished.write_text(json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     os.replace(unfinished, folder / "summary.json")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The same with infinite and undefined numbers as strings, which JSON lacks."""
     if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(inner) for inner in value]
+        return [plain(inner) for inner in value]
     if isinstance(value, float) and not np.isfinite(value):
         return str(value)
     return value
@@ -317,7 +359,7 @@ class Results:
             raise UsageError(
                 f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
             )
-        empty = [name for name in table.column_names if name not in _NULLABLE and table[name].null_count]
+        empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
         if empty:
             raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
         return table
@@ -336,6 +378,13 @@ class Results:
     def journal(self) -> pa.Table:
         """A row per slot and link."""
         return self._table("journal", JOURNAL)
+
+    @property
+    def inputs(self) -> pa.Table | None:
+        """A row per slot and recorded trial of a closed loop; None without a controller."""
+        if self.summary.get("controller") is None:
+            return None
+        return self._table("inputs", inputs_schema_in(self.folder / "inputs.parquet"))
 
     @property
     def digests(self) -> pa.Table:
@@ -359,6 +408,11 @@ def load_results(folder: str | Path) -> Results:
     try:
         summary = json.loads(path.read_text())
     except OSError as error:
+        if (Path(folder) / "shards").is_dir():
+            raise UsageError(
+                f"{folder} is of a run in shards that goes on or was killed; each of its shards is a results folder by "
+                f"itself when it has ended, such as {Path(folder) / 'shards' / '1'}"
+            ) from error
         raise UsageError(
             f"{folder} is no results folder ({path.name}: {error.strerror}); give the --out of a run"
         ) from error

@@ -16,19 +16,25 @@ import tomli_w
 
 from emulator.model.digest import Digests, RunDigest, block_starts
 from emulator.model.process import Floats
-from emulator.network.access import LEGITIMATE
+from emulator.modules import sources_of
+from emulator.network.access import CONTROLLER, LEGITIMATE
+from emulator.plant_data import disturbances_text
 from emulator.runs.acknowledging import Detection
 from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
+from emulator.runs.filtering import FilterTally, true_errors
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
+from emulator.runs.loop_tally import Acted, LoopTally, SolveTimes
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.verdict import Secrecy, secrecy
 from emulator.runs.watched import Watched, watches_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
+DISTURBANCES = "disturbances.csv"
+"""Of a results folder whose scenario has some."""
 
 
 class Scored(NamedTuple):
@@ -47,6 +53,8 @@ class Scorekeeper:
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self.detection = Detection(trials)
+        self.loop = LoopTally.of(scenario, trials)
+        self.filter = FilterTally.of(scenario)
         self.tallies = {
             name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches_of(scenario).items()
         }
@@ -56,6 +64,13 @@ class Scorekeeper:
         scored = {}
         if slots.alarms is not None:
             self.detection.add(slots.first, slots.alarms)
+        if slots.true is not None and self.filter is not None:
+            x_hats = {name: one.x_hat for name, one in slots.receivers.items()}
+            self.filter.add(true_errors(slots.true, slots.x, x_hats))
+        if slots.inputs is not None and self.loop is not None:
+            estimates = {name: one.x_hat for name, one in slots.receivers.items()}
+            true = slots.x if slots.true is None else slots.true
+            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(
@@ -101,6 +116,8 @@ def summary_of(
     mode: str = "live",
     events: Sequence[Mapping[str, Any]] = (),
     detection: Detection | None = None,
+    loop: tuple[LoopTally, SolveTimes] | None = None,
+    filtered: FilterTally | None = None,
     outages: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
@@ -117,10 +134,12 @@ def summary_of(
     if mode == "covariance-only":
         for peer in peers.values():
             peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
+    house = None if loop is None else loop[0].household
+    household = None if house is None else house.summary()
     user = tallies[LEGITIMATE]
     links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
-    evidence = Evidence(scenario, peers, links, tallies, expected, secret)
+    evidence = Evidence(scenario, peers, links, tallies, expected, secret, household)
     return {
         "scenario": scenario.title,
         "mode": mode,
@@ -137,6 +156,11 @@ def summary_of(
         "outages": list(outages),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
+        "controller": None
+        if loop is None
+        else loop[0].summary(scenario, peers[LEGITIMATE], loop[1], digests[CONTROLLER]),
+        "filter": None if filtered is None else filtered.summary(scenario),
+        "household": household,
         "surprising": _surprising(scenario, tallies),
         "expectations": evidence.judged(ending.replay),
     }
@@ -198,20 +222,31 @@ def event_line(event: Mapping[str, Any]) -> str:
 
 
 def write_resolved(folder: Path, scenario: Scenario) -> None:
-    """Write the scenario.toml of a results folder, whole at any moment."""
-    unfinished = folder / "scenario.toml.new"
-    unfinished.write_text(resolved(scenario), encoding="utf-8")
-    os.replace(unfinished, folder / "scenario.toml")
+    """Write the scenario.toml of a results folder, and the disturbances that it names, each whole at any moment."""
+    texts = {"scenario.toml": resolved(scenario)}
+    plant = scenario.plant
+    if plant is not None and plant.disturbance_values:
+        texts = {
+            DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values),
+            **texts,
+        }
+    for name, text in texts.items():
+        unfinished = folder / f"{name}.new"
+        unfinished.write_text(text, encoding="utf-8")
+        os.replace(unfinished, folder / name)
 
 
 def resolved(scenario: Scenario) -> str:
     """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
     tables = scenario.model_dump(mode="json", exclude_none=True)
+    if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
+        tables["plant"]["disturbance_file"] = DISTURBANCES
     if scenario.secret_file is not None:
         tables["secret_file"] = str(Path(scenario.secret_file).absolute())
     tables["made_with"] = {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
+        **sources_of(tables),
     }
     text: str = tomli_w.dumps(tables)
     return text

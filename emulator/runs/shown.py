@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,20 @@ from emulator.runs.scorekeeper import Scored
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
+    from emulator.runs.showing import Showing
     from emulator.view.recording import Recording
+
+
+def showing_of(scenario: Scenario) -> Showing | None:
+    """Who follows the shown trial of a closed loop."""
+    from emulator.runs.showing import Showing  # noqa: PLC0415 - only with a view
+
+    return Showing.of(scenario)
 
 
 def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -> Recording:
     """The run's recording, on disk and, with the address of a viewer, live."""
+    from emulator.runs.showing import driven_scene  # noqa: PLC0415 - only with a view
     from emulator.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
     from emulator.view.scene import Scene, Shown  # noqa: PLC0415 - the same
 
@@ -42,18 +51,22 @@ def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -
         pace=scenario.pace,
         receivers=tuple(receivers),
         noise=float(np.trace(scenario.process.process.Q)),
+        **driven_scene(scenario),
     )
     return Recording(path, scene, live)
 
 
-def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
-    """Some slots as the view takes them: the first recorded trial, and means over all."""
+def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
+    """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
+
+    around: the reference from which states are deviations, (n,); showing: of a closed loop, who follows the same trial.
+    """
     from emulator.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
     from emulator.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
 
     peers = {
         name: PeerSlots(
-            x_hat=receiver.x_hat[:, :, 0],
+            x_hat=receiver.x_hat[:, :, 0] + around,
             P=receiver.P[:, :, :, 0],
             action=receiver.action[:, 0],
             squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
@@ -62,4 +75,9 @@ def shown(slots: Slots, scored: Mapping[str, Scored]) -> Any:
         )
         for name, receiver in slots.receivers.items()
     }
-    return ShownSlots(first=slots.first, x=slots.x[:, :, 0], nu=slots.nu[:, 0], peers=peers)
+    moved = None
+    if showing is not None and slots.inputs is not None:
+        estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
+        moved = showing.take(slots.inputs.u[:, :, 0], estimates)
+    sent = None if slots.sent is None else slots.sent[:, 0]
+    return ShownSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)

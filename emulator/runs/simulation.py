@@ -27,11 +27,14 @@ from emulator.model.process import Floats, ProcessNoise, Trajectory
 from emulator.model.receiver import Codes, Flags, Receiver, trace_of
 from emulator.model.schemes import scheme_of
 from emulator.model.theory import misled_covariances
-from emulator.network.access import LEGITIMATE
+from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.runs.acknowledging import Acknowledging
 from emulator.runs.attendance import Attendance
 from emulator.runs.briefs import StreamKeys
+from emulator.runs.filtering import true_errors
 from emulator.runs.joined import ReceiverSlots, Slots
+from emulator.runs.loop import Loop, Source, informed
+from emulator.runs.loop_tally import Acted, SolveTimes
 from emulator.runs.score import squared_errors
 from emulator.scenario import Scenario
 from emulator.streams import Batch
@@ -73,6 +76,10 @@ class Chunk:
     """The recorded trials in full; exact mode only."""
     alarms: Flags | None = None
     """Where the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch."""
+    acted: Acted | None = None
+    """Of a closed loop, in exact mode."""
+    true_errors: Mapping[str, Floats] | None = None
+    """Of a sensor that filters: squared errors against the true state, of `sensor` and of receivers, (c, R)."""
 
 
 class Simulation:
@@ -89,14 +96,15 @@ class Simulation:
         secret = self._keys.secret(self._scheme.secret_streams)
         self._shared = self._scheme.shared(secret, self._batch)
         self._initial = self._scheme.initial_state(secret, self._batch)
-        self._receivers: dict[str, Receiver] = {LEGITIMATE: self._shared.estimator()}
+        self._receivers: dict[str, Receiver] = {LEGITIMATE: informed(scenario, self._shared.estimator())}
         self._receivers.update({name: self._eavesdropper(name) for name in scenario.eavesdroppers})
         self._betrayed = {
             name: STRATEGIES[table.strategy].betrayed(table.parameters)
             for name, table in scenario.eavesdroppers.items()
         }
-        self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.receivers}
-        """Receiver → block number → digests, (R, 32); filled by the exact mode alone."""
+        self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.digested}
+        """Receiver, or controller → block number → digests, (R, 32); filled by the exact mode alone."""
+        self.solve_times = SolveTimes()
 
     def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
@@ -125,7 +133,9 @@ class Simulation:
 
     def _exact(self) -> Callable[[range, Mapping[str, Fates]], Chunk]:
         n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
-        trajectory = Trajectory(self._process, self._keys.process, self._batch, self._initial)
+        estimator, of_loop = self._receivers[LEGITIMATE], self.digests.get(CONTROLLER, {})
+        source = Source(self._keys, self._initial, self._batch)
+        loop = Loop(self._scenario, source, estimator, of_loop, self.solve_times)
         encoder = self._shared.encoder()
         back = Acknowledging.of(self._scenario, self._keys.way_back, self._batch)
         windows = {name: self._scenario.window(name) for name in self._receivers}
@@ -137,6 +147,7 @@ class Simulation:
 
         def play(chunk: range, fates: Mapping[str, Fates]) -> Chunk:
             x = np.empty((len(chunk), n, trials))
+            true = np.empty_like(x) if loop.filters else x
             nu = np.empty((len(chunk), trials), np.bool_)
             late = {
                 name: np.zeros((2, len(chunk), trials), np.uint16) if window else None
@@ -146,9 +157,10 @@ class Simulation:
             if self._scheme.may_be_silent:
                 fates = {name: one.copied() for name, one in fates.items()}
             sent = np.ones((len(chunk), trials), np.bool_) if self._scheme.may_be_silent else None
+            loop.begin(len(chunk))
             for row, k in enumerate(chunk):
-                x[row] = trajectory.advance()
-                packet = encoder.encode(k, x[row], trajectory.predicted)
+                true[row], x[row], predicted = loop.advance(k)
+                packet = encoder.encode(k, x[row], predicted)
                 nu[row] = packet.nu
                 if packet.sent is not None and sent is not None:
                     sent[row] = packet.sent
@@ -167,6 +179,8 @@ class Simulation:
                     digests = logs[name].add(k, belief)
                     if digests is not None:
                         self.digests[name].update([digests])
+                    if name == LEGITIMATE:
+                        loop.act(k, row, true[row], belief.x_hat)
             rows = {name: log.rows(chunk.start, chunk.stop) for name, log in logs.items()}
             measured = {
                 name: Measured(
@@ -178,8 +192,12 @@ class Simulation:
                 )
                 for name, one in rows.items()
             }
+            beside = None if not loop.filters else true_errors(true, x, {name: one.x_hat for name, one in rows.items()})
+            inputs, user = loop.inputs, rows[LEGITIMATE]
+            estimates = {name: one.x_hat for name, one in rows.items()}
+            acted = None if inputs is None else Acted(inputs, x, estimates, user.action, true)
             if not self._recorded:
-                return Chunk(chunk.start, measured, None, alarms)
+                return Chunk(chunk.start, measured, None, alarms, acted, beside)
             some = slice(0, self._recorded)
             receivers = {
                 name: ReceiverSlots(
@@ -192,8 +210,15 @@ class Simulation:
                 )
                 for name, one in rows.items()
             }
-            shown = Slots(chunk.start, x[..., some], nu[:, some], receivers, None if sent is None else sent[:, some])
-            return Chunk(chunk.start, measured, shown, alarms)
+            shown = Slots(
+                chunk.start,
+                x[..., some],
+                nu[:, some],
+                receivers,
+                None if sent is None else sent[:, some],
+                inputs=None if acted is None else acted.part(some).inputs,
+            )
+            return Chunk(chunk.start, measured, shown, alarms, acted, beside)
 
         return play
 

@@ -25,6 +25,8 @@ from emulator.runs.signals import stop_on_signals
 from emulator.runs.trials import BatchResult, tasks_of
 from emulator.runs.workers import connected
 from emulator.scenario import FIGURES, Scenario, load, value_of
+from emulator.scenario.household import FIGURES as HOUSE_FIGURES
+from emulator.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
 
 Grid = Mapping[str, Sequence[Any]]
 Point = Mapping[str, Any]
@@ -119,6 +121,10 @@ def sweep_over(
         pq.write_table(table, folder / "sweep.parquet")
         (folder / "sweep.json").write_text(json.dumps(description, indent=1, ensure_ascii=False, default=str) + "\n")
         draw(folder / "sweep", table, tuple(grid))
+        if HOUSE_FIGURES[0] in table.column_names:
+            from emulator.view.household_sweep import draw as draw_household  # noqa: PLC0415 - as above
+
+            draw_household(folder / "household", table, next(iter(grid)))
     if failure is not None:
         raise failure
     if done < len(scenarios):
@@ -153,6 +159,14 @@ def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: P
     return found
 
 
+def _of_household(house: Mapping[str, Any] | None, name: str) -> dict[str, float | None]:
+    """The figures of a house and of what one receiver can tell of it, if the plant is one."""
+    if house is None:
+        return {}
+    told = house["receivers"][name]
+    return {**{figure: house[figure] for figure in HOUSE_FIGURES}, **{one: told[one] for one in HOUSE_RECEIVER_FIGURES}}
+
+
 def _rows(point: Point, scenario: Scenario, summary: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """A row for each peer: the point, the figures, the verdict."""
     for name, peer in summary["peers"].items():
@@ -166,6 +180,7 @@ def _rows(point: Point, scenario: Scenario, summary: Mapping[str, Any]) -> Itera
             "mean_actual_trace_covariance": peer.get("mean_actual_trace_covariance"),
             **{f"error_quantile_{level}": value for level, value in (peer["error_quantiles"] or {}).items()},
             "infinite_variance": peer["infinite_variance"],
+            **_of_household(summary["household"], name),
             "relative_secrecy": verdict.get("relative"),
             "perfect_secrecy": verdict.get("perfect"),
             "digest": peer["digest"],

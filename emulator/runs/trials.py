@@ -6,7 +6,7 @@ how the work was spread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -18,8 +18,10 @@ from emulator.model.digest import Digests
 from emulator.model.process import Floats
 from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
+from emulator.runs.filtering import FilterTally
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import Slots
+from emulator.runs.loop_tally import LoopTally, SolveTimes
 from emulator.runs.score import SlotSums, Tally, slot_sums
 from emulator.runs.simulation import Chunk, Measured, Mode, Simulation
 from emulator.runs.watched import Watched, watches_of
@@ -51,6 +53,8 @@ class Block:
     accountants: dict[str, Accountant]
     digests: dict[str, dict[int, Digests]]
     detection: Detection
+    loop: LoopTally | None = None
+    filter: FilterTally | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class BatchResult:
     traces: dict[str, SlotHistograms]
     recorded: list[Slots] = field(default_factory=list)
     """The recorded trials of the task, in parts."""
+    solve_times: SolveTimes = field(default_factory=SolveTimes)
 
 
 def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
@@ -86,10 +91,7 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     scale = float(np.trace(scenario.process.process.Q))
     result = BatchResult(
         task.start,
-        [
-            _empty_block({name: scenario.window(name) for name in names}, slots, start, task.stop)
-            for start in trials[::BLOCK_TRIALS]
-        ],
+        [_empty_block(scenario, start, task.stop) for start in trials[::BLOCK_TRIALS]],
         {name: SlotHistograms(slots, scale) for name in names},
         {name: SlotHistograms(slots, scale) for name in names},
     )
@@ -103,11 +105,13 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
             for block in result.blocks:
                 place = block.start - result.start
                 block.detection.add(chunk.first, chunk.alarms[:, place : place + block.trials])
+        _add_plant(result, chunk)
         if chunk.recorded is not None:
             result.recorded.append(chunk.recorded.copied())
         tell(len(trials) * _count(chunk))
         if stopped():
             break
+    result.solve_times.merge(simulation.solve_times)
     for block in result.blocks:
         rows = slice(block.start - task.start, block.start - task.start + block.trials)
         for name, digests in simulation.digests.items():
@@ -115,17 +119,19 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     return result
 
 
-def _empty_block(windows: Mapping[str, int], slots: int, start: int, stop: int) -> Block:
-    names = tuple(windows)
+def _empty_block(scenario: Scenario, start: int, stop: int) -> Block:
+    names, slots = scenario.receivers, scenario.slots
     trials = min(BLOCK_TRIALS, stop - start)
     return Block(
         start,
         trials,
         {name: SlotSums.zero(slots) for name in names},
         {name: Tally(slots, trials) for name in names},
-        {name: Accountant(window, trials) for name, window in windows.items()},
+        {name: Accountant(scenario.window(name), trials) for name in names},
         {},
         Detection(trials),
+        LoopTally.of(scenario, trials),
+        FilterTally.of(scenario),
     )
 
 
@@ -149,6 +155,16 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
                 block.tallies[name].account_late(account.late, *part.late)
         result.errors[name].add(chunk.first, measured.error)
         result.traces[name].add(chunk.first, measured.trace)
+
+
+def _add_plant(result: BatchResult, chunk: Chunk) -> None:
+    """Take what a chunk says of a plant's controller and filter."""
+    for block in result.blocks:
+        rows = slice(block.start - result.start, block.start - result.start + block.trials)
+        if block.loop is not None and chunk.acted is not None:
+            block.loop.add(chunk.acted.part(rows))
+        if block.filter is not None and chunk.true_errors is not None:
+            block.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
 
 
 def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tuple[Block, Measured]]:

@@ -17,8 +17,10 @@ from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
 from emulator.errors import RunError, UsageError
+from emulator.model.registry import place_of
 from emulator.runs.environment import own_environment
 from emulator.runs.trials import BatchResult, Task, carry_out
+from emulator.scenario.dry_run import foreign
 
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
@@ -33,7 +35,14 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
     for task in tasks:
         if stopped():
             return
-        yield carry_out(task, tell, stopped)
+        try:
+            result = carry_out(task, tell, stopped)
+        except Exception as error:
+            # An error of ours shows where it comes from; one of somebody's class says what that is.
+            if isinstance(error, OSError) or not foreign(task.scenario):
+                raise
+            raise RunError(f"a trial failed: {place_of(error)}; run `evedrop check` on the class it is in") from error
+        yield result
 
 
 def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
@@ -155,7 +164,7 @@ def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
     except OSError:
         raise
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        return place_of(error)
 
 
 @contextlib.contextmanager

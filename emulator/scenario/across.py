@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.events import EventTable
-from emulator.scenario.tables import LinkTable, changed_link
+from emulator.scenario.link_table import LinkTable, changed_link
 from emulator.scenario.timeline import Act, acts_of
 from emulator.scenario.words import as_toml, listed
 
@@ -52,12 +52,7 @@ def _correlation_mistakes(
 
 def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], sentences: Sentences) -> Iterator[str]:
     """What is wrong with events that are right by themselves, each with its number."""
-    events: list[tuple[int, EventTable]] = []
-    for i, found in enumerate(tables.get("event", []) if isinstance(tables.get("event"), list) else []):
-        try:
-            events.append((i, EventTable.model_validate(found)))
-        except ValidationError:
-            continue
+    events = _events(tables)
     receivers = [LEGITIMATE, *_table(tables.get("eavesdroppers"))]
     slots = tables.get("slots")
     for i, event in events:
@@ -75,6 +70,31 @@ def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], se
                     yield from _set_mistakes(f"event.{i}", event, links[name], tables, sentences)
     yield from _order_mistakes(events, receivers)
     yield from _jams_in_turn(events)
+
+
+def _events(tables: Mapping[str, Any]) -> list[tuple[int, EventTable]]:
+    """The events that are right by themselves, each with its number."""
+    events: list[tuple[int, EventTable]] = []
+    for i, found in enumerate(tables.get("event", []) if isinstance(tables.get("event"), list) else []):
+        try:
+            events.append((i, EventTable.model_validate(found)))
+        except ValidationError:
+            continue
+    return events
+
+
+def away_in(tables: Mapping[str, Any], name: str, slot: int) -> str | None:
+    """That a receiver is down or paused in a slot, by which event; None if it is there."""
+    acts = [(i, act) for i, event in _events(tables) for act in acts_of(event) if name in act.names]
+    away: tuple[int, Act] | None = None
+    for i, act in sorted(acts, key=lambda one: one[1].at):
+        if act.at > slot:
+            break
+        if act.kind in ("kill", "pause"):
+            away = i, act
+        elif act.kind in ("restart", "resume"):
+            away = None
+    return None if away is None else f"{name} is {_STATES[away[1].kind]} (event.{away[0]}, from slot {away[1].at} on)"
 
 
 def _entry(event: EventTable) -> str:

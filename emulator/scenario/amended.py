@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from emulator.errors import ScenarioError
+from emulator.modules import named_in
 from emulator.scenario.file import checked
 from emulator.scenario.tables import Scenario
 from emulator.scenario.words import listed
@@ -28,6 +29,11 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
     if strange:
         known = listed(["link with set", *ADDED[1:]])
         raise ScenarioError("event", [f"{name}: is nothing that can be done now; expected {known}" for name in strange])
+    if scenario.modules is None and any(named_in(event)):
+        name = next(iter(named_in(event)))
+        raise ScenarioError(
+            "event", [f"set: names {name}, and the run was started without modules; expected a built-in class"]
+        )
     tables["event"].append({**event, "at": at})
     try:
         # What float64 can follow depends on no event, and was asked when the run was started.

@@ -14,6 +14,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
+from emulator.scenario.household import FIGURES as HOUSE_FIGURES
+from emulator.scenario.household import HOUSEHOLD
+from emulator.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
 from emulator.scenario.table import Found, Number, Table, expected, one_of
 from emulator.scenario.words import as_toml, listed
 
@@ -160,6 +163,10 @@ def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
     return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
 
 
+def _of_house(figure: str) -> bool:
+    return figure.startswith(f"{HOUSEHOLD}.")
+
+
 def _nothing(table: Mapping[str, Any]) -> list[Found]:
     del table
     return []
@@ -188,11 +195,16 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
         return found
     link = link_figure(figure)
     for name in ("slots", "quantile"):
+        if _of_house(figure) and table.get(name) is not None:
+            found.append(
+                (name, "is set, but a house's figures are means over trials of the whole run; remove the line")
+            )
         if link is not None and table.get(name) is not None:
             instead = f"expected none, or the figure {link[0]}.received_fraction"
             found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
     if (
         link is None
+        and not _of_house(figure)
         and table.get("quantile") is not None
         and figure.rpartition(".")[2] in set(FIGURES) - set(TRIAL_FIGURES)
     ):
@@ -232,6 +244,8 @@ class Around:
     trials: int | None
     no_theory: Callable[[str], str | None]
     """Why there is no theory for a receiver; None if there is."""
+    house: bool = False
+    """Whether the plant is one."""
 
     def mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
         """Whom or what there is not, slots beyond the run, too few trials."""
@@ -253,8 +267,18 @@ class Around:
             return []
         own = [f"{receiver}.{name}" for receiver in self.receivers for name in FIGURES]
         links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
-        if figure in links:
+        of_house = [
+            *(f"{HOUSEHOLD}.{name}" for name in HOUSE_FIGURES),
+            *(f"{HOUSEHOLD}.{receiver}.{name}" for receiver in self.receivers for name in HOUSE_RECEIVER_FIGURES),
+        ]
+        if figure in links or (self.house and figure in of_house):
             return []
+        if _of_house(figure):
+            known = f"expected {HOUSEHOLD}.FIGURE ({', '.join(HOUSE_FIGURES)}) or {HOUSEHOLD}.RECEIVER.FIGURE"
+            what = f"{known} ({', '.join(HOUSE_RECEIVER_FIGURES)}){_near(figure, of_house)}"
+            if not self.house:
+                what = f"but there is no house; expected a table [{HOUSEHOLD}], or another figure"
+            return [("figure", f"is {as_toml(figure)}; {what}" if self.house else f"is {as_toml(figure)}, {what}")]
         if figure not in own:
             names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(FIGURES)})"
             of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"

@@ -18,6 +18,11 @@ from pydantic import (
 )
 
 from emulator.errors import ScenarioError, UsageError
+from emulator.model.registry import place_of
+from emulator.modules import named_in
+from emulator.scenario.disturbances import disturbances_beside, disturbances_read
+from emulator.scenario.dry_run import dry_run, foreign
+from emulator.scenario.filter_noise import filter_noise_read
 from emulator.scenario.mistakes import across_tables, sentences
 from emulator.scenario.recordings import beside, read_recordings
 from emulator.scenario.tables import Scenario
@@ -26,7 +31,7 @@ from emulator.scenario.tables import Scenario
 def shipped() -> dict[str, Path]:
     """The scenarios inside the package: name → file."""
     folder = Path(str(resources.files("scenarios")))
-    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"))}
+    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"), key=lambda path: path.stem)}
 
 
 def write_new(path: Path) -> None:
@@ -48,7 +53,8 @@ def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
     path = shipped().get(str(source), Path(source))
-    folder = path if path.is_dir() else path.parent
+    # A shipped scenario names nothing in its folder: what a change names is in the current one.
+    folder = Path() if str(source) in shipped() else path if path.is_dir() else path.parent
     return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
@@ -91,26 +97,50 @@ def parse(
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     beside(tables, folder)
-    if isinstance(tables.get("secret_file"), str):
-        tables["secret_file"] = str((folder / tables["secret_file"]).absolute())
-    return checked(tables, source, changes, beyond_horizon=beyond_horizon)
+    disturbances_beside(tables, folder)
+    for entry in ("secret_file", "modules"):
+        if isinstance(tables.get(entry), str):
+            tables[entry] = str((folder / tables[entry]).absolute())
+    return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def checked(
-    tables: dict[str, Any], source: str, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False
+    tables: dict[str, Any],
+    source: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    beyond_horizon: bool = False,
+    folder: Path = Path(),
 ) -> Scenario:
-    """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake."""
+    """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake.
+
+    folder: where modules of anybody's own are, if the tables name any and no folder of modules.
+    """
     for key, value in (changes or {}).items():
         _set(tables, key, value)
-    recordings = read_recordings(tables)
+    if any(named_in(tables)):
+        tables.setdefault("modules", str(folder))
+    if isinstance(tables.get("modules"), str):
+        tables["modules"] = str(Path(tables["modules"]).absolute())
+    recordings = [*read_recordings(tables), *disturbances_read(tables), *filter_noise_read(tables)]
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:
-        raise ScenarioError(source, [*sentences(error), *recordings, *across_tables(tables, beyond_horizon)]) from error
-    mistakes = recordings + across_tables(tables, beyond_horizon)
+        raise ScenarioError(source, [*sentences(error), *recordings, *_across(tables, beyond_horizon, None)]) from error
+    mistakes = recordings + (dry_run(scenario) or _across(tables, beyond_horizon, scenario))
     if mistakes:
         raise ScenarioError(source, mistakes)
     return scenario
+
+
+def _across(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None) -> list[str]:
+    """What only shows across tables; an error of somebody's class that is asked on the way is a mistake too."""
+    try:
+        return across_tables(tables, beyond_horizon, scenario)
+    except Exception as error:
+        if not foreign(tables):
+            raise
+        return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
 
 
 def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,23 +21,27 @@ from emulator.model.link_law import law_of
 from emulator.model.outcomes import closed_form, eavesdropper_outcomes, legitimate_outcomes
 from emulator.model.process import Process
 from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.model.schemes.scheme import Scheme
 from emulator.network.access import LEGITIMATE
-from emulator.scenario.across import acknowledgement_mistakes, event_mistakes, link_mistakes
+from emulator.scenario.across import acknowledgement_mistakes, away_in, event_mistakes, link_mistakes
+from emulator.scenario.closed_loop import loop_mistakes
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import Around, ExpectTable
+from emulator.scenario.filter_noise import filter_mistakes
+from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
+from emulator.scenario.link_table import CorrelationTable, LinkTable
+from emulator.scenario.plant import ControllerTable, PlantTable
+from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
     SECRET_BYTES,
     AcknowledgementsTable,
-    CorrelationTable,
     EavesdropperTable,
     EncodingTable,
     LegitimateTable,
-    LinkTable,
-    ProcessTable,
     Scenario,
 )
-from emulator.scenario.words import as_toml, listed
+from emulator.scenario.words import as_toml, listed, no_entry
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # whether there is a theory does not depend on it
 _EXPECTED: Mapping[str, str] = {
@@ -77,11 +80,10 @@ def _sentence(detail: ErrorDetails) -> str:
     if kind == "extra_forbidden":
         fields = table.model_fields if table is not None else {}
         known = [field.alias or known for known, field in fields.items() if known != "made_with"]
-        near = difflib.get_close_matches(name, known, 1)
-        hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
-        return f"is no entry of this table; {hint}"
+        return no_entry(name, known)
     if kind == "expected":
-        return f"is {as_toml(found)}; expected {context['expected']}{context['hint'] or example}"
+        said = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
+        return f"is {as_toml(found)}{said}"
     if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
@@ -108,6 +110,9 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "event": EventTable,
         "correlation": CorrelationTable,
         "acknowledgements": AcknowledgementsTable,
+        "plant": PlantTable,
+        "controller": ControllerTable,
+        "household": HouseholdTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -119,8 +124,11 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
     return table, field
 
 
-def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
-    """What only shows across tables, asked as far as a faulty file allows it: horizon, trials, figures."""
+def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None) -> list[str]:
+    """What only shows across tables, asked as far as a faulty file allows it: horizon, trials, figures.
+
+    scenario: what the tables are, if no table by itself has a mistake.
+    """
     found: list[str] = []
     slots, trials, recorded = (tables.get(name, 1) for name in ("slots", "trials", "record_trials"))
     try:
@@ -131,8 +139,21 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials > 0:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")
+    shards = tables.get("shards", 1)
+    if type(trials) is int and type(shards) is int and shards > trials > 0:
+        found.append(f"shards: is {shards}; expected at most trials, which is {trials}: a shard has one trial or more")
     if isinstance(tables.get("eavesdroppers", {}), dict):
-        found += _strategy_mistakes(tables.get("eavesdroppers", {}), tables.get("encoding"), slots)
+        found += _strategy_mistakes(tables, slots)
+    found += acknowledgement_mistakes(tables)
+    found += loop_mistakes(tables)
+    found += household_mistakes(tables)
+    found += filter_mistakes(tables)
+    links = _links(tables)
+    found += link_mistakes(tables, links)
+    found += event_mistakes(tables, links, sentences)
+    if isinstance(tables.get("secret_file"), str):
+        found += _secret_mistakes(tables["secret_file"])
+    sound = scenario if not found else None
     eavesdroppers, expectations = tables.get("eavesdroppers", {}), tables.get("expect", [])
     if isinstance(eavesdroppers, dict) and isinstance(expectations, list):
         encoding = tables.get("encoding")
@@ -141,18 +162,13 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool) -> list[str]:
             slots if type(slots) is int and slots > 0 else None,
             trials if type(trials) is int and trials > 0 else None,
             lambda name: _no_theory(
-                name, tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name], encoding
+                name, tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name], encoding, sound
             ),
+            isinstance(tables.get(HOUSEHOLD), dict),
         )
         for i, expectation in enumerate(expectations):
             if isinstance(expectation, dict):
                 found += [f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation)]
-    found += acknowledgement_mistakes(tables)
-    links = _links(tables)
-    found += link_mistakes(tables, links)
-    found += event_mistakes(tables, links, sentences)
-    if isinstance(tables.get("secret_file"), str):
-        found += _secret_mistakes(tables["secret_file"])
     return found
 
 
@@ -167,8 +183,11 @@ def _links(tables: Mapping[str, Any]) -> dict[str, LinkTable]:
     return found
 
 
-def _no_theory(name: str, receiver: Any, encoding: Any) -> str | None:
-    """Why there is no theory for a receiver, as far as it is one; None if there is."""
+def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) -> str | None:
+    """Why there is no theory for a receiver, as far as it is one; None if there is.
+
+    sound: the scenario, if it has no mistake otherwise: then its events count as well.
+    """
     try:
         scheme = scheme_of(_ANY_PROCESS, EncodingTable.model_validate(encoding).spec)
         if name == LEGITIMATE:
@@ -181,35 +200,52 @@ def _no_theory(name: str, receiver: Any, encoding: Any) -> str | None:
             closed = closed_form(encoding["scheme"], table.strategy) is not None
             if not closed and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
                 return f"no closed form is known for the strategy {table.strategy} of {name}"
-        known = law_of(Course(link.settings(1.0), int(receiver.get("window", 0)))) is not None
-        return None if known else f"there is no theory for {name}'s link"
+        if law_of(Course(link.settings(1.0), int(receiver.get("window", 0)))) is None:
+            return f"there is no theory for {name}'s link"
+        if sound is None:
+            return None
+        from emulator.runs.expectation import expectations_of  # noqa: PLC0415 - of scenarios that have been checked so far
+
+        known = expectations_of(sound)[name].known
+        return None if known else f"there is no theory for {name} with these links, attacks and events together"
     except (TypeError, KeyError, ValidationError):
         return None
 
 
-def _strategy_mistakes(eavesdroppers: Mapping[str, Any], encoding: Any, slots: Any) -> list[str]:
-    """Strategies that need what the scheme does not have, or what comes after the run."""
+def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
+    """Strategies that need what the scheme does not have, what comes after the run, or while they are away."""
     found = []
-    scheme = SCHEMES.get(str(encoding.get("scheme"))) if isinstance(encoding, dict) else None
+    eavesdroppers, encoding = tables.get("eavesdroppers", {}), tables.get("encoding")
+    chosen = encoding.get("scheme") if isinstance(encoding, dict) else None
+    scheme = SCHEMES.get(str(chosen))
     for name, entries in eavesdroppers.items():
         try:
             table = EavesdropperTable.model_validate(entries)
         except ValidationError:
             continue
         strategy = STRATEGIES[table.strategy]
-        needed = [stream for stream in strategy.streams(table.parameters) if stream != "coin"]
-        lacking = [stream for stream in needed if scheme is not None and stream not in scheme.secret_streams]
+        lacking = [] if scheme is None else lacking_streams(strategy.streams(table.parameters), scheme)
         if lacking:
             entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
             able = [one for one in READERS if not READERS[one].streams({})]
             found.append(
                 f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by what it knows of the "
-                f"{listed(lacking)}, and the scheme {encoding['scheme']} has none; expected {listed(sorted(able))}"
+                f"{listed(lacking)}, and the scheme {chosen} has none; expected {listed(sorted(able))}"
             )
         betrayed = strategy.betrayed(table.parameters)
         if betrayed is not None and type(slots) is int and betrayed >= slots > 0:
             found.append(f"eavesdroppers.{name}.learns_at: is {betrayed}; expected a slot of the run, 0 to {slots - 1}")
+        away = None if betrayed is None else away_in(tables, name, betrayed)
+        if away is not None:
+            found.append(
+                f"eavesdroppers.{name}.learns_at: is {betrayed}, when {away}; expected a slot in which it is there"
+            )
     return found
+
+
+def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
+    """Of the streams whose keys a strategy must be given, those that a scheme has not."""
+    return [stream for stream in streams if stream != "coin" and stream not in scheme.secret_streams]
 
 
 def _secret_mistakes(file: str) -> list[str]:

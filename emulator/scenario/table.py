@@ -17,6 +17,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from emulator.model.registry import NotRegistered, Registry, asked
 from emulator.network.access import RESERVED
 from emulator.scenario.words import as_toml, listed, near
 
@@ -43,6 +44,29 @@ def one_of(names: Iterable[str]) -> Callable[[str], str]:
         return value
 
     return check
+
+
+def registered(classes: Registry[Any]) -> Callable[[str], str]:
+    """A check that a value is the name of a class."""
+
+    def check(value: str) -> str:
+        why = _no_class(value, classes)
+        if why is None:
+            return value
+        if why:
+            raise PydanticCustomError("expected", "one value", {"said": why})
+        raise expected(listed(classes.names), near(value, classes.names))
+
+    return check
+
+
+def _no_class(name: Any, classes: Registry[Any]) -> str | None:
+    """Why a name stands for no class, in words that follow `is NAME`, or "" if it is just unknown; None if it stands for one."""
+    try:
+        classes[str(name)]
+    except NotRegistered as error:
+        return error.why
+    return None
 
 
 def _process_name(name: str) -> str:
@@ -107,17 +131,18 @@ def _number(value: Any) -> bool:
     return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)
 
 
-def model_mistakes(entry: str, found: Any, models: Mapping[str, Any]) -> list[Found]:
+def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]:
     """What is wrong with `{model = "…", …}`: an unknown model, parameters that are missing, unknown or wrong.
 
-    models: name → class with `parameters`, `optional` and `mistakes`.
+    models: of classes with `parameters`, `optional` and `mistakes`.
     """
     if not isinstance(found, Mapping):
         return []
     model = models.get(str(found.get("model")))
     if model is None:
         name = found.get("model", "")
-        return [(f"{entry}.model", f"is {as_toml(name)}; expected {listed(sorted(models))}{near(name, models)}")]
+        said = _no_class(name, models) or f"; expected {listed(models.names)}{near(name, models.names)}"
+        return [(f"{entry}.model", f"is {as_toml(name)}{said}")]
     given = {name: value for name, value in found.items() if name != "model"}
     mistakes = [
         (f"{entry}.{name}", f"is missing; expected {name} = {as_toml(example)}")
@@ -130,4 +155,4 @@ def model_mistakes(entry: str, found: Any, models: Mapping[str, Any]) -> list[Fo
         if name not in model.parameters
     ]
     known = {name: value for name, value in given.items() if name in model.parameters}
-    return mistakes + [(f"{entry}.{name}", what) for name, what in model.mistakes(known)]
+    return mistakes + [(f"{entry}.{name}", what) for name, what in asked(model, known)]

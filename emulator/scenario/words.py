@@ -11,6 +11,13 @@ from emulator.model.links.checks import as_toml
 __all__ = ["as_toml", "listed", "near"]
 
 
+def no_entry(name: str, known: Sequence[str]) -> str:
+    """What is said of an entry that a table does not have."""
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+    return f"is no entry of this table; {hint}"
+
+
 def near(found: Any, names: Iterable[str]) -> str:
     """A hint, `; did you mean NAME?`, where something found is almost one of the names; else nothing."""
     close = difflib.get_close_matches(str(found), list(names), 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
-from emulator.view import lanes, paths, plane
+from emulator.view import driven, lanes, paths, plane
 from emulator.view.palette import GROUND
 from emulator.view.scene import Scene
 
@@ -18,17 +18,46 @@ _TRUTH_TRAIL = 130
 
 def layout(scene: Scene) -> rrb.Blueprint:
     """The panels of a run."""
+    if scene.moving:
+        return _blueprint(_driven(scene))
     left = rrb.Vertical(
-        _curves("Squared error |x − x̂|²   log10, bottom: exact", scene, [paths.ERROR], legend=True),
+        _curves("Squared error |x − x̂|²   log10, bottom: exact", [paths.ERROR], _axis(scene), legend=True),
         _curves(
-            "tr P   log10, bright: believed · dim: theory · bottom: 0", scene, [paths.TRACE, paths.THEORY], legend=False
+            "tr P   log10, bright: believed · dim: theory · bottom: 0",
+            [paths.TRACE, paths.THEORY],
+            _axis(scene),
+            legend=False,
         ),
         rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=paths.PACKETS, time_view=_axis(scene)),
         row_shares=_left_shares(scene),
     )
     right = rrb.Vertical(_plane(scene), _events(), row_shares=[1.75, 1.0])
+    return _blueprint(rrb.Horizontal(left, right, column_shares=[1.35, 1.0]))
+
+
+def _driven(scene: Scene) -> rrb.Container:
+    """Of a closed loop: plant and levels on the left, over the whole run; network and events on the right."""
+    whole = rrb.TimeAxis(
+        view_range=rrb.TimeRange(
+            start=rrb.TimeRangeBoundary.absolute(seq=0), end=rrb.TimeRangeBoundary.absolute(seq=scene.slots)
+        ),
+        zoom_lock=True,
+    )
+    found, guessed = driven.panels(scene, whole), driven.guessed(scene, whole)
+    left = rrb.Vertical(*found, row_shares=[1.3, *[1.0] * (len(found) - 1)])
+    right = rrb.Vertical(
+        *guessed,
+        _curves("Squared error |x − x̂|²   log10", [paths.ERROR], whole, legend=not guessed),
+        rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=paths.PACKETS, time_view=_axis(scene)),
+        _events(),
+        row_shares=[*[1.2] * len(guessed), 1.0, 0.4 + 0.22 * len(scene.receivers), 0.7],
+    )
+    return rrb.Horizontal(left, right, column_shares=[1.2, 1.0])
+
+
+def _blueprint(root: rrb.Container) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[1.35, 1.0]),
+        root,
         rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -44,12 +73,12 @@ def _left_shares(scene: Scene) -> list[float]:
     return [0.5 - lanes_share / 2, 0.5 - lanes_share / 2, lanes_share]
 
 
-def _curves(title: str, scene: Scene, kinds: list[str], *, legend: bool) -> rrb.TimeSeriesView:
+def _curves(title: str, kinds: list[str], axis: rrb.TimeAxis, *, legend: bool) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         name=title,
         origin="/",
         contents=[f"/{kind}/**" for kind in kinds],
-        axis_x=_axis(scene),
+        axis_x=axis,
         # One legend serves all panels: a receiver has the same colour in each.
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
     )

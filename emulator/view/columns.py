@@ -11,24 +11,12 @@ from numpy.typing import NDArray
 
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
-from emulator.view import lanes, paths, plane
+from emulator.view import driven, lanes, paths, plane
+from emulator.view.column import Column, scalars
 from emulator.view.events import Event, Watcher
 from emulator.view.lanes import Lane
 from emulator.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
 from emulator.view.scene import PeerSlots, Scene, Slots
-
-
-@dataclass(frozen=True)
-class Column:
-    """Values of one entity over some slots: the arguments of Rerun's `send_columns`."""
-
-    path: str
-    slots: NDArray[np.int64]
-    values: rr.ComponentColumnList
-
-    def send(self, to: rr.RecordingStream) -> None:
-        """Put it into a recording."""
-        to.send_columns(self.path, indexes=[rr.TimeColumn(paths.TIMELINE, sequence=self.slots)], columns=self.values)
 
 
 @dataclass(frozen=True)
@@ -61,22 +49,25 @@ class Columns:
         columns: list[Column] = []
         opening: list[tuple[str, int, str]] = []
         if self._scene.n == 1:
-            columns.append(_scalars(f"{paths.PLANE}/{paths.TRUTH}", k, slots.x[:, 0]))
+            columns.append(scalars(f"{paths.PLANE}/{paths.TRUTH}", k, slots.x[:, 0]))
         else:
             columns.extend(self._truth(k, slots))
-        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu), columns, opening)
+        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu, slots.sent), columns, opening)
         for i, shown in enumerate(self._scene.receivers):
             peer = slots.peers[shown.name]
             columns.extend(self._curves(shown.name, k, peer))
             columns.extend(self._estimate(shown.name, k, peer))
-            codes = lanes.received(peer.action, slots.nu)
-            words = lanes.LEGITIMATE if shown.role == "legitimate" else lanes.EAVESDROPPER
-            if shown.role == "legitimate":
-                codes = peer.action
+            legitimate = shown.role == "legitimate"
+            words = lanes.LEGITIMATE if legitimate else lanes.EAVESDROPPER
+            # The legitimate estimator knows every type, and is never misled.
+            types = np.zeros_like(slots.nu) if legitimate else slots.nu
+            codes = lanes.received(peer.action, types, slots.sent)
             self._lane(paths.lane(self._scene, i), words, k, codes, columns, opening)
             events = self._watchers[shown.name].watch(slots.first, codes)
             if events:
                 columns.append(lines(shown.name, events))
+        if slots.moved is not None:
+            columns.extend(driven.columns(self._scene, k, slots, slots.moved))
         return Batch(columns, opening)
 
     def _curves(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
@@ -84,7 +75,7 @@ class Columns:
         for kind, values in curves:
             known = ~np.isnan(values)  # there is no theory for some links
             if known.any():
-                yield _scalars(paths.curve(kind, name), k[known], self._log10(values[known]))
+                yield scalars(paths.curve(kind, name), k[known], self._log10(values[known]))
 
     def _log10(self, values: Floats) -> Floats:
         """log10 with everything below the floor on it: a state that was received is known exactly."""
@@ -103,7 +94,7 @@ class Columns:
 
     def _estimate(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
         if self._scene.n == 1:
-            yield _scalars(f"{paths.PLANE}/{name}", k, peer.x_hat[:, 0])
+            yield scalars(f"{paths.PLANE}/{name}", k, peer.x_hat[:, 0])
             return
         at = plane.frames(self._scene, int(k[0]), len(k))
         yield from self._moving(name, k, plane.on_plane(peer.x_hat), at)
@@ -154,6 +145,7 @@ def lines(name: str, events: list[Event]) -> Column:
 
 def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
     """Names and colours of everything, once."""
+    driven.log_styles(to, scene)
     _log_lane_style(to, paths.lane(scene, -1), lanes.SENT)
     for i, shown in enumerate(scene.receivers):
         bright, label = colour(i), shown.name
@@ -214,10 +206,6 @@ def _log_lane_style(to: rr.RecordingStream, path: str, lane: Lane) -> None:
     # Blank labels: a slot is too narrow for a word, and the panel's title says what the colours mean.
     style = rr.StateConfiguration(values=lane.words, labels=[" "] * len(lane.words), colors=lane.colours)
     to.log(path, style, static=True)
-
-
-def _scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
-    return Column(path, k, rr.Scalars.columns(scalars=values))
 
 
 def _floor(scene: Scene) -> float:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.model.receiver import Action, Codes
-from emulator.view.lanes import MISLED
+from emulator.model.receiver import Action, Codes, Flags
+from emulator.view.lanes import MISLED, SILENT
 from emulator.view.scene import Scene, Shown
 
 _SHORTEST = 3  # packets in a row; fewer missed ones are everyday life
@@ -54,12 +54,13 @@ class Watcher:
         self._reported = 0
         self._bad = 0  # length so far of the stretch that the next chunk may continue
         self._misled = 0  # of these, how many slots misled
+        self._silent = 0  # and in how many nothing was sent
         self._told = False  # whether this stretch was reported
         self._ever_misled = False
 
     def watch(self, first: int, codes: Codes) -> list[Event]:
         """Events of the chunk that starts at slot `first`, in order of slot."""
-        misled = codes == MISLED
+        misled, silent = codes == MISLED, codes == SILENT
         good = (codes == Action.STATE) | (codes == Action.INNOVATION)
         events: list[Event] = []
         if not self._ever_misled and misled.any():
@@ -69,22 +70,24 @@ class Watcher:
         start = 0
         for end in (*np.flatnonzero(good).tolist(), len(codes)):
             if end > start:
-                self._extend(first, start, end, misled, events)
+                self._extend(first, slice(start, end), misled, silent, events)
             if end < len(codes):
                 self._recover(first + end, events)
             start = end + 1
         return sorted(events, key=lambda event: event.k)
 
-    def _extend(self, first: int, start: int, end: int, misled: Codes, events: list[Event]) -> None:
-        """Lengthen the current stretch by the slots start … end−1 of the chunk."""
-        length = self._bad + end - start
+    def _extend(self, first: int, some: slice, misled: Flags, silent: Flags, events: list[Event]) -> None:
+        """Lengthen the current stretch by some slots of the chunk."""
+        length = self._bad + some.stop - some.start
         if not self._told and length >= self._long:
-            turn = start + self._long - self._bad  # one past the slot that made it long
-            fooled = self._misled + int(np.count_nonzero(misled[start:turn]))
-            events.append(Event(first + turn - 1, "WARN", self._lost(fooled)))
+            turn = some.start + self._long - self._bad  # one past the slot that made it long
+            fooled = self._misled + int(np.count_nonzero(misled[some.start : turn]))
+            unsent = self._silent + int(np.count_nonzero(silent[some.start : turn]))
+            events.append(Event(first + turn - 1, "WARN", self._lost(fooled, unsent)))
             self._told = True
         self._bad = length
-        self._misled += int(np.count_nonzero(misled[start:end]))
+        self._misled += int(np.count_nonzero(misled[some]))
+        self._silent += int(np.count_nonzero(silent[some]))
 
     def _recover(self, k: int, events: list[Event]) -> None:
         if self._told:
@@ -94,10 +97,13 @@ class Watcher:
             self._reported += 1
             if self._reported > 3 + k // self._spacing:
                 self._long += 1
-        self._bad = self._misled = 0
+        self._bad = self._misled = self._silent = 0
 
-    def _lost(self, fooled: int) -> str:
-        if self._legitimate:
+    def _lost(self, fooled: int, unsent: int) -> str:
+        if self._legitimate and not unsent:
             return f"{self._name} lost {self._long} packets in a row"
         line = f"{self._name} lost track: {self._long} slots without a state"
+        if self._legitimate:
+            line = f"{self._name} had no packet for {self._long} slots"
+        line = f"{line}, {unsent} of them silent" if unsent else line
         return f"{line}, {fooled} misled" if fooled else line

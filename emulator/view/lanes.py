@@ -14,9 +14,11 @@ GREEN: Colour = (30, 128, 96)
 SLATE: Colour = (70, 76, 90)
 AMBER: Colour = (244, 178, 40)
 RED: Colour = (206, 60, 66)
+DARK: Colour = (34, 37, 44)
 
 LEGEND = (
-    "blue: state · green: innovation decoded · amber: misled by one · grey: innovation sent, discarded · red: dropped"
+    "blue: state · green: innovation decoded · amber: misled by one · grey: innovation sent, discarded · red: dropped · "
+    "dark: silence"
 )
 
 
@@ -28,26 +30,26 @@ class Lane:
     colours: tuple[Colour, ...]
 
 
-SENT = Lane(("state", "innovation"), (BLUE, SLATE))
-LEGITIMATE = Lane(("dropped", "state", "innovation", "discarded"), (RED, BLUE, GREEN, SLATE))
-EAVESDROPPER = Lane(
-    ("dropped", "state", "innovation", "discarded", "misled"),
-    (RED, BLUE, GREEN, SLATE, AMBER),
-)
-MISLED = 4
+SENT = Lane(("state", "innovation", "silent"), (BLUE, SLATE, DARK))
+LEGITIMATE = Lane(("dropped", "state", "innovation", "discarded", "silent"), (RED, BLUE, GREEN, SLATE, DARK))
+EAVESDROPPER = Lane((*LEGITIMATE.words, "misled"), (*LEGITIMATE.colours, AMBER))
+SILENT = 4
+"""Code of a slot in which nothing was sent, so that nothing could be lost."""
+MISLED = 5
 """Code of the one thing an eavesdropper does not know itself."""
 
 
-def sent(nu: Flags) -> Codes:
-    """Codes of the lane of what was sent, (c,), from ν (c,)."""
-    return nu.astype(np.uint8)
+def sent(nu: Flags, any_packet: Flags | None) -> Codes:
+    """Codes of the lane of what was sent, (c,), from ν (c,) and whether there was a packet, (c,); None: always."""
+    types = nu.astype(np.uint8)
+    return types if any_packet is None else np.where(any_packet, types, np.uint8(SENT.words.index("silent")))
 
 
-def received(action: Codes, nu: Flags) -> Codes:
-    """Codes of a receiver's lane, (c,), from its actions (c,) and ν (c,).
+def received(action: Codes, nu: Flags, any_packet: Flags | None) -> Codes:
+    """Codes of a receiver's lane, (c,), from its actions (c,), ν (c,) and whether there was a packet, (c,); None: always.
 
-    They are the actions, but for an innovation taken for the state: that one was misled.
+    They are the actions, but for silence, and for an innovation taken for the state: that one misled.
     """
     misled = nu & (action == Action.STATE)
     codes: Codes = np.where(misled, np.uint8(MISLED), action)
-    return codes
+    return codes if any_packet is None else np.where(any_packet, codes, np.uint8(SILENT))

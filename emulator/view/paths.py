@@ -15,6 +15,10 @@ EVENTS = "events"
 FRAME = f"{PLANE}/frame"
 TRUTH = "truth"
 NOTES = "run"
+MOVING = "moving"
+LEVELS = "levels"
+ENERGY = "energy"
+GUESSES = "guesses"
 
 
 def lane(scene: Scene, i: int) -> str:

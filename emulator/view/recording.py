@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
+from emulator.model.receiver import Flags
 from emulator.view.blueprint import layout
 from emulator.view.columns import Batch, Columns, lines, log_styles, opening
 from emulator.view.events import Event, introduction
 from emulator.view.paths import NOTES
-from emulator.view.scene import PeerSlots, Scene, Shown, Slots
+from emulator.view.scene import Moved, PeerSlots, Scene, Shown, Slots
 
 __all__ = ["PeerSlots", "Recording", "Scene", "Shown", "Slots"]
 
@@ -221,4 +222,23 @@ def _joined(chunks: list[Slots]) -> Slots:
         np.concatenate([chunk.x for chunk in chunks]),
         np.concatenate([chunk.nu for chunk in chunks]),
         peers,
+        _joined_moves([chunk.moved for chunk in chunks if chunk.moved is not None]),
+        _joined_packets(chunks),
+    )
+
+
+def _joined_packets(chunks: list[Slots]) -> Flags | None:
+    if all(chunk.sent is None for chunk in chunks):
+        return None
+    return np.concatenate([np.ones(chunk.count, np.bool_) if chunk.sent is None else chunk.sent for chunk in chunks])
+
+
+def _joined_moves(moves: list[Moved]) -> Moved | None:
+    if not moves:
+        return None
+    energies = [one.energies for one in moves if one.energies is not None]
+    return Moved(
+        np.concatenate([one.values for one in moves]),
+        np.concatenate(energies) if energies else None,
+        {name: np.concatenate([one.guesses[name] for one in moves], axis=1) for name in moves[0].guesses},
     )

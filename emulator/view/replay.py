@@ -11,10 +11,10 @@ import pyarrow.compute as pc
 
 from emulator.errors import UsageError
 from emulator.model.process import Floats
-from emulator.model.receiver import Action
+from emulator.model.receiver import Action, Flags
 from emulator.runs.results import Results, load_results
 from emulator.runs.scorekeeper import event_line
-from emulator.runs.shown import open_recording
+from emulator.runs.shown import open_recording, showing_of
 from emulator.scenario import load
 from emulator.view.scene import PeerSlots, Slots
 
@@ -37,14 +37,21 @@ def replay(folder: Path) -> Path:
     scenario = load(folder / "scenario.toml", beyond_horizon=True)
     path = folder / "recording.rrd"
     peers = {name: _peer(results, name) for name in scenario.receivers}
-    x, nu = _truth(results, scenario.receivers[0])
+    x, nu, sent = _truth(results, scenario.receivers[0])
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again without --covariance-only or the like")
     _check_shapes(folder, len(scenario.process.A), x, peers)
+    inputs, showing = _inputs(results), showing_of(scenario)
+    if showing is not None and len(inputs) != len(x):
+        raise UsageError(f"{folder}: inputs.parquet has not the slots of trials.parquet; run the scenario again")
+    around = np.array(scenario.process.around)
     recording = open_recording(scenario, folder.name, path, None)
     for first in range(0, len(x), _CHUNK):
         rows = slice(first, min(first + _CHUNK, len(x)))
-        recording.add(Slots(first, x[rows], nu[rows], {name: _cut(peer, rows) for name, peer in peers.items()}))
+        deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
+        moved = None if showing is None else showing.take(inputs[rows], deviations)
+        shown = {name: _cut(peer, rows) for name, peer in peers.items()}
+        recording.add(Slots(first, x[rows], nu[rows], shown, moved, sent[rows]))
     for event in results.summary.get("events", ()):
         recording.note(event["slot"], "INFO", event_line(event))
     recording.close()
@@ -73,10 +80,20 @@ def _first_trial(results: Results, name: str) -> pa.Table:
     return rows.sort_by("slot")
 
 
-def _truth(results: Results, name: str) -> tuple[Floats, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
+def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
+    """True states, ν and whether there was a packet."""
     rows = _first_trial(results, name)
-    sent = rows["sent"].cast(pa.string()).to_pylist()
-    return _matrix(rows["x"]), np.array([word == "innovation" for word in sent], np.bool_)
+    words = rows["sent"].cast(pa.string()).to_pylist()
+    nu = np.array([word == "innovation" for word in words], np.bool_)
+    return _matrix(rows["x"]), nu, np.array([word != "nothing" for word in words], np.bool_)
+
+
+def _inputs(results: Results) -> Floats:
+    """Inputs of the first recorded trial, (slots, m); none without a controller."""
+    rows = results.inputs
+    if rows is None or not rows.num_rows:
+        return np.empty((0, 0))
+    return _matrix(rows.filter(pc.field("trial") == pc.min(rows["trial"])).sort_by("slot")["u"])
 
 
 def _peer(results: Results, name: str) -> PeerSlots:

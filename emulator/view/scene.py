@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
@@ -24,6 +24,16 @@ class Shown:
 
 
 @dataclass(frozen=True)
+class House:
+    """A plant that is a house."""
+
+    load: str
+    """Label of its load, one of `Scene.moving`."""
+    most: float
+    """The most of it in a minute or what the period is, so that the panel is not as high as wrong guesses are."""
+
+
+@dataclass(frozen=True)
 class Scene:
     """What the view must know before the first slot."""
 
@@ -40,6 +50,12 @@ class Scene:
     """The legitimate one first."""
     noise: float
     """Trace of Q: the squared error of one step."""
+    states: tuple[str, ...] = ()
+    """Labels of the states, such as "SOC (%)"; none, or one for each."""
+    moving: tuple[str, ...] = ()
+    """Of a closed loop, labels of what moves the plant, such as "P_load (kW)": disturbances, then inputs."""
+    house: House | None = None
+    """Where the plant is one."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +77,18 @@ class PeerSlots:
 
 
 @dataclass(frozen=True)
+class Moved:
+    """What moves the plant of a closed loop over c consecutive slots, in the first recorded trial."""
+
+    values: Floats
+    """Of `Scene.moving`, (c, q + m)."""
+    energies: Floats | None = None
+    """Of a house, what it has bought and sold since slot 0, in kWh, (c, 2)."""
+    guesses: Mapping[str, Floats] = field(default_factory=dict)
+    """Receiver → slot, and the load it guesses from then on, of periods that ended in these slots, (2, g)."""
+
+
+@dataclass(frozen=True)
 class Slots:
     """c consecutive slots, complete. Its arrays are kept for a while: they must not be changed afterwards."""
 
@@ -72,6 +100,10 @@ class Slots:
     """ν of the first recorded trial, (c,): true for an innovation."""
     peers: Mapping[str, PeerSlots]
     """By name, one for each receiver of the scene."""
+    moved: Moved | None = None
+    """Of a closed loop."""
+    sent: Flags | None = None
+    """Whether the sensor sent a packet in the first recorded trial, (c,); None: in every slot."""
 
     @property
     def count(self) -> int:

@@ -204,3 +204,38 @@ def test_the_rate_of_the_tail_is_how_long_a_word_lasts() -> None:
     for _ in range(200):
         before, alive = alive.sum(), (alive @ chain.transitions) * kept
     assert alive.sum() / before == pytest.approx(tail_outcomes(chain, legitimate).kept, rel=1e-9)
+
+
+def recursion(process: Process, chain: Chain, outcomes_at: Callable[[float], Outcomes], slots: int) -> Floats:
+    """Trace of E P_k as the module's docstring has it, slot by slot and state by state, (slots,)."""
+    odds = [outcomes_at(float(quality)) for quality in chain.quality]
+    f = misled_covariances(process, slots)
+    states = [law * one.initial * process.initial_covariance for law, one in zip(chain.law, odds, strict=True)]
+    traces = [float(np.trace(sum(states)))]
+    for k in range(1, slots):
+        states = [
+            one.kept
+            * process.A
+            @ sum(T * E for T, E in zip(chain.transitions[:, s], states, strict=True))
+            @ process.A.T
+            + chain.law[s] * (one.predicted * process.Q + one.misled * f[k])
+            for s, one in enumerate(odds)
+        ]
+        traces.append(float(np.trace(sum(states))))
+    return np.array(traces)
+
+
+@every_receiver
+@every_process
+def test_blocks_of_slots_are_what_slot_by_slot_gives(
+    process: Process, outcomes_at: Callable[[float], Outcomes]
+) -> None:
+    """Over several blocks, to 1e-12; and to the bit the same however many slots are asked for at a time."""
+    chain, slots = bursts(0.05, 0.3, 0.02, 0.7), 450
+    law = LinkLaw.steady(chain)
+    expected = recursion(process, chain, outcomes_at, slots)
+    whole = ModulatedCovariance(process, law, outcomes_at).next_traces(slots)
+    np.testing.assert_allclose(whole, expected, rtol=1e-12)
+    stream = ModulatedCovariance(process, law, outcomes_at)
+    parts = [stream.next_traces(count) for count in (0, 1, 2, 130, 17, 300)]
+    assert np.array_equal(np.concatenate(parts), whole)

@@ -21,7 +21,7 @@ from emulator.brief import Brief, Flow
 from emulator.network.access import Keys
 from emulator.network.session import client_config
 from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port
+from emulator.runs.ports import free_port, loopback_places
 from emulator.scenario import Scenario
 
 LIMIT_SECONDS = 60.0
@@ -97,7 +97,9 @@ class Bench:
 
     def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
         observation = Observation(folder / "results", False, None)
-        made = briefs_of(scenario, f"{protocol}/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
+        listen = f"{protocol}/127.0.0.1:{free_port()}"
+        places = loopback_places(listen, None, scenario.relayed)
+        made = briefs_of(scenario, places, observation, ends_with_stdin=False)
         self.briefs: Mapping[str, Brief] = {
             name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
@@ -106,17 +108,9 @@ class Bench:
         self.log = folder / "router.log"
         self.private = folder / "private"
         self.private.mkdir()
-        with self.log.open("wb") as log:
-            self.router = stack.enter_context(
-                subprocess.Popen(
-                    [sys.executable, "-m", "emulator", "router", str(self.briefs["router"].write(folder))],
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    env={**os.environ, "TMPDIR": str(self.private)},
-                )
-            )
-        stack.callback(self.router.kill)
+        self.router = self._started("router", folder, stack)
+        if scenario.relayed:
+            self.relay = self._started("relay", folder, stack)
         names = ("sensor", *scenario.receivers, "observer")
         self.sessions = {name: stack.enter_context(connect(self.briefs[name])) for name in names}
         self.downlinks = {name: self.listen(name, self.keys.downlink(name)) for name in scenario.receivers}
@@ -133,6 +127,21 @@ class Bench:
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         for name in processes:
             self.settle(name)
+
+    def _started(self, name: str, folder: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
+        """The process of a router's brief; ended with the bench."""
+        with (folder / f"{name}.log").open("wb") as log:
+            process = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", "emulator", name, str(self.briefs[name].write(folder))],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    env={**os.environ, "TMPDIR": str(self.private)},
+                )
+            )
+        stack.callback(process.kill)
+        return process
 
     def listen(self, process: str, key: str) -> Ear:
         """Subscribe with a process's credentials."""

@@ -270,6 +270,47 @@ def test_no_session_without_credentials(who: str, mode: str, stage: Bench) -> No
     flow(stage)
 
 
+LOOP = {
+    "plant": {"inputs": ["u"], "input_matrix": [[1.0], [0.0]]},
+    "controller": {"strategy": "lqr", "state_weights": [1.0, 0.0], "input_weights": [1.0]},
+}
+
+
+@pytest.mark.parametrize("acts_on", ["estimate", "truth"])
+def test_eavesdropper_has_no_part_in_the_loop(acts_on: str, tmp_path: Path) -> None:
+    """It can read neither estimate nor state nor input, nor write any: what the others tell each other stays theirs."""
+    tables = {**LOOP, "controller": {**LOOP["controller"], "acts_on": acts_on}}
+    link = {"link": {"quality": 0.8}, "knows_input": acts_on == "estimate"}
+    with bench_of(scenario_of(**tables, legitimate=link), tmp_path) as bench, connect(bench.briefs[EVE]) as attacker:
+        bench.sessions["controller"] = stack = connect(bench.briefs["controller"])
+        keys, loop = bench.keys, (bench.keys.estimate, bench.keys.state, bench.keys.input)
+        ears = {key: Ear() for key in (*loop, *wildcards(bench))}
+        for key, ear in ears.items():
+            attacker.declare_subscriber(key, ear)
+        assert_heard(bench, attacker)
+        told = [("legitimate", keys.estimate)] if acts_on == "estimate" else [("sensor", keys.state)]
+        heard = {name: bench.listen("controller", key) for name, key in told}
+        inputs = {name: bench.listen(name, keys.input) for name in ("sensor", "legitimate")}
+        for name, key in told:
+            bench.put(name, key, b"known")
+            assert heard[name].hear() == (key, b"known")
+        bench.put("controller", keys.input, b"decided")
+        for name in ("sensor", "legitimate") if link["knows_input"] else ("sensor",):
+            assert inputs[name].hear() == (keys.input, b"decided")
+        for key in (*loop, f"evedrop/{keys.run}/*", "**"):
+            attacker.put(key, b"false", congestion_control=zenoh.CongestionControl.BLOCK)
+        assert_heard(bench, attacker)
+        bench.put("controller", keys.input, b"again")
+        assert inputs["sensor"].hear() == (keys.input, b"again")
+        for name in inputs:
+            bench.settle(name)
+        assert not any(ear.all() for ear in heard.values())
+        said = {payload for ear in ears.values() for _, payload in ear.all()}
+        assert said <= {b"mine", b"false"}, "a session hears what it puts itself, and this one nothing else"
+        assert {found for found, _ in inputs["legitimate"].all()} <= ({keys.input} if link["knows_input"] else set())
+        stack.close()
+
+
 def test_the_table_grants_nothing_twice_and_no_wildcard() -> None:
     """Every key has one writer, no rule covers more than exact keys, and no eavesdropper may read what is not its own."""
     table = grants("r", ("legitimate", "eve"))

@@ -28,7 +28,7 @@ from emulator.network.connecting import Door, connected
 from emulator.network.session import client_config, door_of
 from emulator.runs.authority import Authority
 from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port, meeting_at
+from emulator.runs.ports import free_port, places_at
 
 EVE, MALLORY = "eve", "mallory"
 NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)
@@ -196,7 +196,7 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
 def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
     """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
     made = briefs_of(
-        scenario_of(), meeting_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
+        scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
     )
     texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
     keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
@@ -220,7 +220,7 @@ def certificate_of(brief: Brief) -> x509.Certificate:
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
     made = briefs_of(
-        scenario_of(), meeting_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
+        scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
     )
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]

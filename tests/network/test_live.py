@@ -225,7 +225,8 @@ def test_those_who_may_hear_did(evidence: Evidence) -> None:
 
 def test_the_attacker_heard_nothing(evidence: Evidence) -> None:
     """No subscription, query, watch or question for tokens brought anything but what is its own."""
-    own = {f"evedrop/{evidence.briefs['eve'].run}/control/eve"}
+    run = evidence.briefs["eve"].run
+    own = {f"evedrop/{run}/control/eve", f"evedrop/{run}/alive/eve"}
     assert {how: keys - own for how, keys in evidence.overheard.items() if keys - own} == {}
     assert len(evidence.overheard) > 100
 

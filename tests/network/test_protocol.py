@@ -18,14 +18,16 @@ from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.elementary import normal_quantile
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
-from emulator.network import operator, wire
-from emulator.network.access import Keys, grants
+from emulator.network import loop_wire, operator, wire
+from emulator.network.access import Keys, Wiring, grants
 from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
 TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))
 MESSAGES = [name for name in GOLDEN if "\nbytes " in GOLDEN[name]]
 KEY = "evedrop/golden"
+Encode = Callable[[dict[str, Any], dict[str, Any]], bytes]
+Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
 
 
 def parts_of(block: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
@@ -68,14 +70,10 @@ def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
 
 def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As a receiver makes it."""
-    digests = {
-        int(block): np.array([list(bytes.fromhex(one)) for one in rows], np.uint8)
-        for block, rows in value["digests"].items()
-    }
     columns = (np.array(value[name], float) for name in ("P", "trace"))
     x_hat, action = np.array(value["x_hat"], float), np.array(value["action"], np.uint8)
     late = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
-    return wire.Report(value["k"], x_hat, action, *columns, next(late), digests, next(late)).pack()
+    return wire.Report(value["k"], x_hat, action, *columns, next(late), digests_of(value), next(late)).pack()
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -89,13 +87,52 @@ def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
 
 def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the sensor makes it."""
-    return wire.Truth(value["k"], np.array(value["x"], float), flags(value["nu"])).pack()
+    steered = (np.array(value["u"], float), flags(value["failed"])) if "u" in value else (None, None)
+    return wire.Truth(value["k"], np.array(value["x"], float), flags(value["nu"]), None, None, *steered).pack()
 
 
 def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    truth = wire.read_truth(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
-    return {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
+    inputs = shape.get("inputs", 0)
+    truth = wire.read_truth(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), inputs)
+    found = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
+    return {**found, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()} if inputs else found
+
+
+def decode_known(name: str) -> Decode:
+    """As the controller reads it."""
+
+    def decode(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+        x = loop_wire.read_known(wire.Reader(KEY, raw), name, value["k"], (shape["n"], shape["trials"]))
+        return {"k": value["k"], name: x.tolist()}
+
+    return decode
+
+
+def decode_decided(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the sensor reads it."""
+    u, failed = loop_wire.read_decided(wire.Reader(KEY, raw), value["k"], (shape["inputs"], shape["trials"]))
+    return {"k": value["k"], "u": u.tolist(), "failed": failed.astype(int).tolist()}
+
+
+def digests_of(value: dict[str, Any]) -> dict[int, np.ndarray]:
+    """Digests of values."""
+    return {
+        int(block): np.array([list(bytes.fromhex(one)) for one in rows], np.uint8)
+        for block, rows in value["digests"].items()
+    }
+
+
+def encode_decisions(_shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the controller makes it."""
+    return loop_wire.Decisions(value["k"], value["c"], np.array(value["seconds"], float), digests_of(value)).pack()
+
+
+def decode_decisions(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    found = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], shape["trials"], shape["period"])
+    digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in found.digests.items()}
+    return {"k": found.first, "c": found.count, "seconds": found.seconds.tolist(), "digests": digests}
 
 
 def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
@@ -171,6 +208,8 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
             found[name] = message.integer(name)
     if message.has("links"):
         found["links"] = dict(message.map("links"))
+    if message.has("why"):
+        found["why"] = message.text("why")
     if message.has("absent"):
         found["absent"] = list(message.names("absent"))
     if message.has("until"):
@@ -221,8 +260,6 @@ def rest_of(value: dict[str, Any]) -> dict[str, Any]:
     return {name: inner for name, inner in value.items() if name != "do"}
 
 
-Encode = Callable[[dict[str, Any], dict[str, Any]], bytes]
-Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
 CODECS: dict[str, tuple[Encode, Decode]] = {
     "packet": (lambda _shape, value: wire.uplink(value["k"], np.array(value["z"])), decode_packet),
     "delivery": (encode_delivery, decode_delivery),
@@ -244,6 +281,16 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
     "truth": (encode_truth, decode_truth),
     "report": (encode_report, decode_report),
     "journal": (encode_journal, decode_journal),
+    "estimate": (
+        lambda _shape, value: loop_wire.known("x_hat", value["k"], np.array(value["x_hat"])),
+        decode_known("x_hat"),
+    ),
+    "state": (lambda _shape, value: loop_wire.known("x", value["k"], np.array(value["x"])), decode_known("x")),
+    "input": (
+        lambda _shape, value: loop_wire.decided(value["k"], np.array(value["u"]), flags(value["failed"])),
+        decode_decided,
+    ),
+    "decisions": (encode_decisions, decode_decisions),
 }
 
 
@@ -354,12 +401,12 @@ def test_table_of_keys_is_the_access_table() -> None:
     prefix = f"evedrop/{'r'}/"
     documented: dict[tuple[str, str], set[str]] = {}
     everybody = {"sensor": ["sensor"], "router": ["router"], "observer": ["observer"], "receiver": list(receivers)}
-    everybody["legitimate"] = ["legitimate"]
+    everybody |= {"legitimate": ["legitimate"], "controller": ["controller"]}
     rows = re.findall(r"^\| (`[a-z]+(?:/.*?)?`.*?) \| (.*?) \| (.*?) \| (.*?) \|$", TEXT.split("## A run")[0], re.M)
-    assert len(rows) == 10
+    assert len(rows) == 14
     for paths, _, writers, readers in rows:
         for path in re.findall(r"`(.*?)`", paths):
-            names = [*receivers, "sensor", "router", "observer"] if "<process>" in path else receivers
+            names = [*receivers, "sensor", "router", "observer", "controller"] if "<process>" in path else receivers
             for name in names if "<" in path else [""]:
                 key = prefix + re.sub(r"<\w+>", name, path)
                 for what, who in (("writes", writers), ("reads", readers)):
@@ -367,7 +414,8 @@ def test_table_of_keys_is_the_access_table() -> None:
                     users = {name or path.split("/")[-1]} if own else {u for u in everybody if re.search(u, who)}
                     documented.setdefault((what, key), set()).update(users - {"router"})
     granted: dict[tuple[str, str], set[str]] = {}
-    for grant in grants("r", receivers):
+    loops = [Wiring("estimate", True), Wiring("truth", True)]
+    for grant in (grant for loop in loops for grant in grants("r", receivers, loop)):
         for what, keys in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
             for key in filter(None, keys):
                 granted.setdefault((what, key), set()).add(grant.process)
@@ -378,6 +426,9 @@ def test_table_of_keys_is_the_access_table() -> None:
         ("reads", keys.alive("observer")),
     }
     assert {entry: users for entry, users in documented.items() if users and entry not in no_row} == granted
+    for loop in (None, Wiring("estimate", False)):
+        legitimate = next(grant for grant in grants("r", receivers, loop) if grant.process == "legitimate")
+        assert keys.input not in legitimate.reads, "the inputs are for an estimator that is to know them"
     assert {grant.process: grant.asks for grant in grants("r", receivers) if grant.asks} == {
         "operator": (keys.control("observer"),)
     }

@@ -6,6 +6,7 @@ Addresses of loopback stand for hosts.
 from __future__ import annotations
 
 import json
+import signal
 import socket
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from emulator.runs.ports import Meeting, free_port, meeting_at
 from emulator.runs.results import load_results
 from tests.conftest import Done, Evedrop, Live, wait_until
 
-ROLES = ("router", "sensor", "legitimate", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "observer")
 SOON = 5.0
 """Seconds within which a mistake is to be said; how long the machine took for all else is not counted."""
 
@@ -39,16 +40,18 @@ def digests(path: Path) -> dict[str, str]:
     return {name: one["digest"] for name, one in load_results(path).summary["peers"].items()}
 
 
+TLS = ("--listen", "tls/0.0.0.0:{port}", "--connect", "tls/127.0.0.2:{port}")
+NAMED = ("--listen", "tls/localhost:{port}")
+CLEAR = ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/127.0.0.3:{port}", "--insecure")
+TWO = ("--set", "network.routers=2", "--listen", "tls/127.0.0.2:{port}", "--relay", "tls/127.0.0.3:{port}")
+TWO_CLEAR = ("--set", "network.routers=2", "--listen", "tcp/127.0.0.2:{port}", "--relay", "tcp/127.0.0.3:{port}")
+
+
 @pytest.mark.parametrize(
-    "options",
-    [
-        ("--listen", "tls/0.0.0.0:{port}", "--connect", "tls/127.0.0.2:{port}"),
-        ("--listen", "tls/localhost:{port}"),
-        ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/127.0.0.3:{port}", "--insecure"),
-    ],
-    ids=["tls", "tls by name", "in clear"],
+    ("options", "backwards"),
+    [(TLS, False), (TLS, True), (NAMED, False), (CLEAR, True), (TWO, True), (TWO_CLEAR, False)],
+    ids=["tls", "tls, router last", "tls by name", "in clear", "two routers", "two routers in clear"],
 )
-@pytest.mark.parametrize("backwards", [False, True], ids=["router first", "router last"])
 def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards: bool, evedrop: Evedrop) -> None:
     """In whatever order, from two folders that stand for hosts, in clear or not: the digests of the trials in memory."""
     port = str(free_port())
@@ -83,6 +86,9 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     assert control["router"] == endpoint
     assert "PRIVATE KEY" in control["identity"]["key"]
     assert evedrop("status", "run").status == 0
+    (evedrop.folder / "copy").mkdir()
+    (evedrop.folder / "copy" / "control.json").write_text(json.dumps({**control, "user": "observer"}))
+    told(evedrop("status", "copy"), 2, "copy/control.json: identity.certificate is that of operator, not of observer")
     assert evedrop("pause", "run").out.startswith("held before slot")
     live.process.terminate()
     assert live.end().status == 130
@@ -93,6 +99,29 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     )
     assert evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--out", "b").status == 0
     assert digests(evedrop.folder / "a") == digests(evedrop.folder / "b")
+
+
+@pytest.mark.parametrize("scenario", ["acknowledged", "restart"])
+def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> None:
+    """Acknowledgements that cross, processes that are started again: the digests of one router, and of memory."""
+    small = ("--trials", "1", "--record-trials", "1", "--pace", "0", "--set", "expect=[]")
+    two = evedrop("run", scenario, *small, "--view", "off", "--set", "network.routers=2", "--out", "two")
+    assert two.status == 0, two.err
+    assert evedrop("run", scenario, *small, "--view", "off", "--out", "one").status == 0
+    assert evedrop("montecarlo", scenario, *small, "--out", "memory").status == 0
+    assert digests(evedrop.folder / "two") == digests(evedrop.folder / "one") == digests(evedrop.folder / "memory")
+
+
+def test_a_run_of_two_routers_is_steered_and_ended_as_any(evedrop: Evedrop) -> None:
+    """The operator gets at the observer through the relay; a signal ends everybody, the relay too."""
+    live = evedrop.live("eavesdroppers", "--slots", "100000", "--pace", "0.002", "--set", "network.routers=2")
+    live.running()
+    assert evedrop("link", "run", "smart", "quality=0.2").out.startswith("from slot")
+    status = json.loads(evedrop("status", "run", "--json").out)
+    assert status["processes"]["relay"] is True
+    live.process.terminate()
+    assert live.end().status == 130
+    live.nothing_left()
 
 
 def told(done: Done, status: int, *words: str) -> None:
@@ -185,9 +214,26 @@ def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
     assert done.status == 3
     assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
     assert load_results(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
-    for live in lives.values():
-        live.process.kill()
-        live.process.communicate()
+    said = {name: live.end() for name, live in lives.items() if name != "observer"}
+    assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)
+    for name, one in said.items():
+        assert one.err.startswith(f"evedrop: {name}: the observer gave the run up: smart did not appear")
+
+
+def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
+    """Ctrl-C on its host: what was measured is on disk, and everybody else ends, saying why."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    briefs = written(evedrop, "--listen", endpoint, "--set", "pace=0.002", slots=100_000)
+    lives = {name: begun(evedrop, name, path) for name, path in briefs.items()}
+    wait_until((evedrop.folder / "results" / "control.json").exists, "a run under way")
+    lives["observer"].process.send_signal(signal.SIGINT)
+    ended = {name: live.end() for name, live in lives.items()}
+    assert ended["observer"].status == 130
+    assert load_results(evedrop.folder / "results").summary["ended"] == "interrupted"
+    others = {name: done for name, done in ended.items() if name != "observer"}
+    assert {name: (done.status, done.err) for name, done in others.items()} == {
+        name: (3, f"evedrop: {name}: the observer gave the run up: interrupted\n") for name in others
+    }
 
 
 def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
@@ -276,4 +322,6 @@ def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
     assert {name: done.status for name, done in ended.items()} == {**dict.fromkeys(briefs, 3), "smart": -9}
     why = "smart cut off from the network for 1 s; look at the logs"
     for name, done in ended.items():
-        assert name in {"smart", "observer"} or f"evedrop: the run has failed: {why}" in done.err, name
+        assert name in {"smart", "observer"} or f"evedrop: {name}: the observer gave the run up: {why}" in done.err, (
+            name
+        )

@@ -188,6 +188,20 @@ def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
     assert tables_whole(live) > 0
 
 
+def test_keys_of_a_killed_launcher_are_removed_by_the_next(evedrop: Evedrop) -> None:
+    """Killed before its processes have read their briefs it cannot remove them; those of a run that goes on are kept."""
+    live, other = evedrop.live("eavesdroppers", *ENDLESS), evedrop.live("eavesdroppers", *ENDLESS, out="other")
+    wait_until(lambda: len({path.parent for path in live.temporary.glob("evedrop-*/lock")}) == 2, "two folders")
+    live.process.kill()
+    live.process.communicate()
+    other.running()
+    assert evedrop("run", "eavesdroppers", "--slots", "10", "--view", "off", "--out", "next").status in {0, 1}
+    assert len(list(live.temporary.iterdir())) == 1
+    other.process.send_signal(signal.SIGINT)
+    assert other.end().status == 130
+    other.nothing_left()
+
+
 def test_a_stopped_process_only_slows_the_run(evedrop: Evedrop) -> None:
     """A receiver that stands still loses nothing: everybody waits."""
     live = evedrop.live("eavesdroppers", "--slots", "20000", "--json")

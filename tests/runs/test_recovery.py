@@ -30,6 +30,7 @@ initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
 {encoding}
 [legitimate]
 window = 3
+{more_of_legitimate}
 link = {{ quality = 0.8, delay = {{ model = "normal", mean = 1.0, deviation = 1.0 }}, duplicate = 0.1, corrupt = 0.02 }}
 [eavesdroppers.smart]
 strategy = "{strategy}"
@@ -42,6 +43,19 @@ ACKNOWLEDGED = """
 link = { quality = 0.8 }
 attack = "critical"
 jammer = "smart"
+"""
+LOOP = """
+[plant]
+inputs = ["heater"]
+input_matrix = [[0.1], [0.0]]
+input_lower = [-2.0]
+input_upper = [2.0]
+noise = [[1e-4, 0.0], [0.0, 1e-4]]
+[controller]
+strategy = "lqr"
+state_weights = [1.0, 1.0]
+input_weights = [0.1]
+{}
 """
 CHANGING = """
 [[event]]
@@ -60,7 +74,7 @@ def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
     """A scenario with losses in bursts, delays and second copies, and its file."""
     entries = {
         "slots": 1200, "trials": 3, "pace": 0.0, "longest_outage": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
-        **given,
+        "more_of_legitimate": "", **given,
     }  # fmt: skip
     path = folder / "disturbed.toml"
     path.write_text(SCENARIO.format(**entries))
@@ -75,6 +89,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "coded and acknowledged": {
         "slots": 1500, "trials": 20, "encoding": 'scheme = "acknowledged"', "strategy": "reference", "more": ACKNOWLEDGED,
     },
+    "in a loop that is told its inputs": {"slots": 3000, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true"},
+    "in a loop over the truth": {"slots": 3000, "more": LOOP.format('period = 7\nacts_on = "truth"')},
     "paced, with events": {"slots": 2000, "pace": 0.002, "more": CHANGING},
 }  # fmt: skip
 
@@ -97,6 +113,23 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
     outages = done.summary["outages"]
     assert [one["process"] for one in outages] == ["router"] * 2
     assert all(one["seconds"] > 0.0 and 0 < one["slot"] <= one["until"] for one in outages)
+
+
+@pytest.mark.parametrize("name", ["router", "relay"])
+def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
+    """With a closed loop over both of them: digests and links are those in memory, and the one that was killed is named."""
+    more = LOOP.format("period = 2") + "[network]\nrouters = 2"
+    path, scenario = scenario_in(tmp_path, slots=3000, more=more, more_of_legitimate="knows_input = true")
+    live = evedrop.live(str(path), "--json")
+    live.running(more_than=300)
+    before = live.child(name)
+    live.kill(name)
+    wait_until(lambda: live.children().get(name) not in {None, before}, f"another {name}")
+    done = live.end(120)
+    assert done.status == 0, done.err
+    live.nothing_left()
+    as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
+    assert [one["process"] for one in done.summary["outages"]] == [name]
 
 
 def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path: Path) -> None:
@@ -192,6 +225,27 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: 
         else:
             wire.silence()
             time.sleep(7.0)  # the same
+        wire.heal()
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert [one["process"] for one in run.summary["outages"]] == [name]
+
+
+@pytest.mark.parametrize("name", ["controller", "legitimate"])
+def test_a_loop_is_taken_up_where_it_was_cut(name: str, tmp_path: Path) -> None:
+    """Estimates and inputs that were lost on the way are said once more: nobody waits for ever, and no input changes."""
+    _, scenario = scenario_in(
+        tmp_path, slots=800, pace=0.002, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true"
+    )
+    port = free_port()
+    with ExitStack() as stack:
+        wire: Cable = stack.enter_context(cable(port))
+        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
+        run.write(**{name: wire.endpoint})
+        run.start()
+        run.running(more_than=100)
+        wire.cut()
+        time.sleep(1.0)  # how long it is cut off is what is tested
         wire.heal()
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")

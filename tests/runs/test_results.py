@@ -45,7 +45,15 @@ def test_every_example_of_the_scenario_reference_is_right() -> None:
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.__name__)
 def test_the_scenario_reference_has_every_entry(table: type[BaseModel]) -> None:
     """No field of a table is left out."""
-    tables = {"process", "encoding", "legitimate", "eavesdroppers", "expect"}  # they are headings
+    tables = {
+        "process",
+        "plant",
+        "controller",
+        "encoding",
+        "legitimate",
+        "eavesdroppers",
+        "expect",
+    }  # they are headings
     assert {name for name in table.model_fields if name not in tables} - words("scenario.md") - {"quality"} == set()
     assert "link.quality" in words("scenario.md")
 

@@ -29,7 +29,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "cipher": {"A": STABLE},
     "encrypted-schedule": {"A": STABLE, "threshold": 2, "attack": {"attack": "forge"}, "event": [PAUSE]},
     "scheduled": {"A": STABLE, "threshold": 3, "attack": {"attack": "all"}, "event": [JAM]},
-    "twin-track": {"A": UNSTABLE},
+    "twin-track": {"A": UNSTABLE, "reads_as": "tracker"},
     "withholding": {"A": STABLE, "state_probability": 0.5},
 }
 NEEDS = ("acknowledged", "encrypted-schedule", "scheduled")
@@ -40,6 +40,7 @@ def tables_of(scheme: str, **more: Any) -> dict[str, Any]:
     """A small scenario of a scheme, with eavesdroppers of all kinds, late packets, an attack or an outage."""
     spec = dict(RUNS[scheme])
     A, attack, event = spec.pop("A"), spec.pop("attack", {}), spec.pop("event", [])
+    spy = {"strategy": "replay-informed", "reads_as": spec.pop("reads_as", "reference"), "learns_at": 9}
     tables = {
         "title": scheme,
         "slots": 30,
@@ -51,7 +52,7 @@ def tables_of(scheme: str, **more: Any) -> dict[str, Any]:
             "naive": {"strategy": "naive", "link": {"quality": 0.7}},
             "ref": {"strategy": "reference", "link": {"quality": 0.7}},
             "sel": {"strategy": "selective", "window": 2, "link": dict(LATE)},
-            "spy": {"strategy": "replay-informed", "reads_as": "reference", "learns_at": 9, "link": {"quality": 0.6}},
+            "spy": {**spy, "link": {"quality": 0.6}},
         },
         "event": [dict(one) for one in event],
     }
@@ -228,3 +229,27 @@ def test_whose_reference_is_kept_and_whose_is_lost() -> None:
     jammed_later = scenario_of("acknowledged", eavesdroppers=eavesdroppers)
     assert not expectations_of(jammed_later)["listener"].known
     assert expectations_of(jammed_later)["legitimate"].known
+
+
+def test_a_betrayed_state_opens_twin_tracks(tmp_path: Path) -> None:
+    """Live as in memory: slots after it the spy errs by less than a millionth of who reads alike and is told nothing.
+
+    Before it the two err alike, each behind a link of its own.
+    """
+    link = {"link": {"quality": 0.9}}
+    tracker = {"strategy": "tracker", **link}
+    spy = {"strategy": "replay-informed", "reads_as": "tracker", "learns_at": 20, **link}
+    scenario = scenario_of("twin-track", slots=40, trials=30, eavesdroppers={"tracker": tracker, "spy": spy})
+    live = run(scenario, out=tmp_path / "live")
+    memory = montecarlo(scenario, trials=30, out=tmp_path / "memory")
+    assert all(digests(live).values())
+    assert digests(live) == digests(memory)
+    rows = live.slots.to_pydict()
+    error = {
+        name: np.array([e for e, peer in zip(rows["mean_squared_error"], rows["peer"], strict=True) if peer == name])
+        for name in ("tracker", "spy")
+    }
+    assert error["spy"][10:20] == pytest.approx(error["tracker"][10:20], rel=0.2)
+    assert error["spy"][20] == 0.0
+    assert np.all(error["spy"][21:] < 1e-6 * error["tracker"][21:])
+    assert error["spy"][21:].mean() < 0.01

@@ -15,3 +15,11 @@ def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
         columns = chunk.to_record_batch().to_pydict()
         found |= dict(zip(columns[paths.TIMELINE], columns[component], strict=True))
     return found
+
+
+def lane(rrd: Path, entity: str, slots: int) -> list[str]:
+    """A lane's word in every slot, from its changes."""
+    changes, words = rows(rrd, entity, "StateChange:state"), []
+    for k in range(slots):
+        words.append(changes[k][0] if k in changes else words[-1])
+    return words

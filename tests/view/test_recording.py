@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from read_back import rows
+from read_back import lane, rows
 from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
@@ -27,14 +27,6 @@ def record(run: Simulated, rrd: Path, chunk: int = 60) -> None:
     assert recording.close()
     assert recording.failure is None
     assert recording.dropped == 0
-
-
-def lane(rrd: Path, entity: str, slots: int) -> list[str]:
-    """The lane's word in every slot, from its changes."""
-    changes, words = rows(rrd, entity, "StateChange:state"), []
-    for k in range(slots):
-        words.append(changes[k][0] if k in changes else words[-1])
-    return words
 
 
 @pytest.fixture(scope="module")

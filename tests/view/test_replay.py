@@ -1,20 +1,22 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from read_back import rows
+from read_back import lane, rows
 
-from emulator import load_results, montecarlo
+from emulator import load_results, montecarlo, run
 from emulator.errors import UsageError
 from emulator.runs.montecarlo import Plan
 from emulator.runs.simulation import Mode
 from emulator.view.replay import replay
 
 SLOTS = 120
+EVE = {"eve": {"strategy": "naive", "link": {"quality": 0.7}}}
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,33 @@ def test_recording_of_a_study_holds_its_curves(study: Path) -> None:
     above = [k for k in range(SLOTS) if expected[k] > 1e-2]
     assert len(above) > SLOTS / 2
     np.testing.assert_allclose([shown[k][0] for k in above], [np.log10(expected[k]) for k in above], rtol=1e-12)
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["memory", "live"])
+@pytest.mark.parametrize("scheme", ["scheduled", "withholding"])
+def test_silence_is_shown_as_silence(scheme: str, live: bool, tmp_path: Path) -> None:
+    """In the lane of what was sent and in every receiver's, and nowhere else: as the tables have it."""
+    changes: dict[str, Any] = {"encoding": {"scheme": scheme, "threshold": 3}, "eavesdroppers": EVE, "slots": SLOTS}
+    if scheme == "withholding":
+        changes["encoding"] = {"scheme": scheme, "state_probability": 0.5}
+    else:
+        changes["acknowledgements"] = {"link": {"quality": 0.9}}
+    if live:
+        results = run("eavesdroppers", trials=2, out=tmp_path / "run", view="web", **changes)
+        recording = results.folder / "recording.rrd"
+    else:
+        results = montecarlo("eavesdroppers", trials=2, out=tmp_path / "run", **changes)
+        recording = replay(results.folder)
+    table = [row for row in results.trials.to_pylist() if row["trial"] == 0]
+    kinds = {"nothing": "silent"}
+    for peer, path in (("legitimate", "1_legitimate"), ("eve", "2_eve")):
+        its = sorted((row for row in table if row["peer"] == peer), key=lambda row: row["slot"])
+        sent = [kinds.get(row["sent"], row["sent"]) for row in its]
+        assert 10 < sent.count("silent") < SLOTS - 10
+        assert lane(recording, "packets/0_sent", SLOTS) == sent
+        done = ["silent" if word == "silent" else row["action"] for word, row in zip(sent, its, strict=True)]
+        assert lane(recording, f"packets/{path}", SLOTS) == done
+        assert {"silent", "dropped", "state"} <= set(done)
 
 
 def test_nothing_recorded_is_said(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Delay models of links by their name in a scenario: one file each."""
+"""Delay models of links by their name in a scenario: one file each, and those of other modules."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from emulator.model.delays.delay import DelayModel
 from emulator.model.delays.normal import Normal
 from emulator.model.delays.pareto import Pareto
 from emulator.model.delays.trace import Trace
+from emulator.model.registry import Registry
 
-DELAY_MODELS: Mapping[str, type[DelayModel]] = {
+_BUILT_IN: Mapping[str, type[DelayModel]] = {
     "constant": Constant,
     "normal": Normal,
     "pareto": Pareto,
     "trace": Trace,
 }
+DELAY_MODELS: Registry[DelayModel] = Registry("delay model", DelayModel, "evedrop.delays", _BUILT_IN, ("model", "unit"))  # type: ignore[type-abstract]
 
 
 def delay_of(spec: Mapping[str, Any]) -> DelayModel:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from emulator.model.process import Floats
@@ -19,7 +20,7 @@ class DelayModel(ABC):
     that the scenario gives it, each with an example; lengths of time are in slots.
     """
 
-    parameters: ClassVar[Mapping[str, Any]]
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[frozenset[str]] = frozenset()
     lengths: ClassVar[tuple[str, ...]] = ()
     """The parameters that are lengths of time, and so may be given in seconds."""
@@ -27,9 +28,10 @@ class DelayModel(ABC):
     """Whether it is given standard normal numbers; else uniform ones."""
 
     @classmethod
-    @abstractmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        del given
+        return []
 
     @abstractmethod
     def delays(self, first: int, numbers: Floats) -> Floats:

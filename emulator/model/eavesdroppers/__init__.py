@@ -1,4 +1,4 @@
-"""Strategies of eavesdroppers by their name in a scenario: one file each."""
+"""Strategies of eavesdroppers by their name in a scenario: one file each, and those of other modules."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from collections.abc import Mapping
 
 from emulator.model.eavesdroppers.colluding import Colluding
 from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
-from emulator.model.eavesdroppers.readers import READERS
+from emulator.model.eavesdroppers.readers import GROUP, READERS, RESERVED
 from emulator.model.eavesdroppers.replay_informed import ReplayInformed
+from emulator.model.registry import Registry
 
-STRATEGIES: Mapping[str, type[Eavesdropper]] = {
+_BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     **READERS,
     "colluding": Colluding,
     "replay-informed": ReplayInformed,
 }
+STRATEGIES: Registry[Eavesdropper] = Registry("eavesdropper", Eavesdropper, GROUP, _BUILT_IN, RESERVED)  # type: ignore[type-abstract]
 
 __all__ = ["READERS", "STRATEGIES"]

@@ -9,44 +9,27 @@ Source: docs/mathematics.md, bayesian eavesdropper.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from emulator.model.elementary import cholesky, exp
-from emulator.model.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from emulator.model.factored import Factor, Factors, covariance, grown, squared_length
 from emulator.model.leak import Leak, Leaks
+from emulator.model.mixture import NEGLIGIBLE, Mixture, merge, pruned, summed, with_a_place
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Belief, Flags, Heard
 from emulator.streams import Batch
 
+_Kind = TypeVar("_Kind", bound=np.generic)
+
 CAPACITY = 12
 """Components a trial may have; beyond it the two least probable ones become one of the same mean and covariance."""
-NEGLIGIBLE = 1e-12
-"""Probability up to which a component is dropped."""
 _CERTAIN = 300.0  # an exponent at which a packet is the state beyond all doubt, and still far from overflow
 _SURE = 1e300  # odds of any greater amount
 _IMPOSSIBLE = -700.0  # one at which it is not, and still far from underflow
-
-
-class Mixture(NamedTuple):
-    """Up to C components for every trial; what has the weight 0 is none. A component keeps its place."""
-
-    weight: Floats
-    """(C, R); sums to 1 in every trial."""
-    mean: Floats
-    """(n, C, R)."""
-    lower: Floats
-    """Of the covariances' factors, (n (n−1)/2, C, R)."""
-    diagonal: Floats
-    """(n, C, R)."""
-
-    @property
-    def spread(self) -> Factors:
-        """The covariances."""
-        return Factors(self.lower, self.diagonal)
 
 
 class Bayesian(PacketReader):
@@ -60,6 +43,7 @@ class Bayesian(PacketReader):
         self._mu_d = knowledge.state_probability
         self._capacity = capacity
         self._leaks = Leaks(knowledge.process)
+        self._trial_of = np.tile(np.arange(batch.trials), capacity)
         self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
 
     def prior(self, first: int = 0) -> Belief:
@@ -93,22 +77,30 @@ class Bayesian(PacketReader):
         return Belief(x_hat, P, action, mixture)
 
     def _weighed(self, of: Mixture, gamma: Flags, z: Floats, leak: Leak) -> tuple[Mixture, Floats]:
-        """The components a slot later, and the probability that the packet is the state, (R,)."""
-        A, white = self.process.A, leak.white(z)
-        mean = self.process.predict(of.mean.reshape(len(z), -1)).reshape(of.mean.shape)
-        predicted, informed = grown(A, of.spread, self._noise, leak.remaining_factor)
-        apart = [row - m for row, m in zip(z, mean, strict=True)]
-        squared = squared_length(predicted, apart)
-        ratio = summed(_weighed_ratios(gamma, of.weight, squared, predicted.diagonal, white, leak))
-        state, other = self._type_probabilities(ratio, gamma)
-        return (
-            Mixture(
-                of.weight * other,
-                mean + np.where(gamma, leak.innovation(white), 0.0)[:, None, :],
-                *(np.where(gamma, *pair) for pair in zip(informed, predicted, strict=True)),
-            ),
-            state,
-        )
+        """The components a slot later, and the probability that the packet is the state, (R,).
+
+        Places that are empty are left out of all that costs: half of them are, most of the time.
+        """
+        there = np.flatnonzero(of.weight)
+        trial = self._trial_of[there]
+        some = Mixture(*(_taken(part.reshape(*part.shape[:-2], of.weight.size), there) for part in of))
+        white, heard = leak.white(z), _taken(gamma, trial)
+        mean = self.process.predict(some.mean)
+        predicted, informed = grown(self.process.A, some.spread, self._noise, leak.remaining_factor)
+        apart = _taken(z, trial) - mean
+        squared = squared_length(predicted, list(apart))
+        ratios = np.zeros(of.weight.shape)
+        alone = _taken(_squared(white), trial)
+        ratios.reshape(-1)[there] = _weighed_ratios(heard, some.weight, squared, predicted.diagonal, alone, leak)
+        state, other = self._type_probabilities(summed(ratios), gamma)
+        mean += _taken(np.where(gamma, leak.innovation(white), 0.0), trial)
+        for after, known in zip(predicted, informed, strict=True):
+            np.copyto(after, known, where=heard)
+        spread = [np.zeros(part.shape) for part in of[1:]]
+        for whole, part in zip(spread, (mean, *predicted), strict=True):
+            for row, values in zip(whole.reshape(len(whole), of.weight.size), part, strict=True):
+                row[there] = values
+        return Mixture(of.weight * other, *spread), state
 
     def _type_probabilities(self, ratio: Floats, gamma: Flags) -> tuple[Floats, Floats]:
         """Probabilities that the packet is the state, and that it is not, (R,); 0 and 1 where nothing was received.
@@ -122,42 +114,36 @@ class Bayesian(PacketReader):
         return np.where(gamma, odds / (1.0 + odds), 0.0), np.where(gamma, 1.0 / (1.0 + odds), 1.0)
 
 
-def _weighed_ratios(
-    gamma: Flags, weight: Floats, squared: Floats, diagonal: Floats, white: Floats, leak: Leak
-) -> Floats:
-    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) where z was received, (C, R).
+def _taken(part: NDArray[_Kind], places: NDArray[np.intp]) -> NDArray[_Kind]:
+    """Some places of the last axis, all of them known to be there."""
+    return part.take(places, axis=-1, mode="clip")
 
-    weight: π, (C, R); squared: (z − m)ᵀ P⁻¹ (z − m), (C, R); diagonal: D of P's factors, (n, C, R); white: L_k⁻¹ z, (n, R).
-    """
-    alone = white[0] * white[0]
+
+def _squared(white: Floats) -> Floats:
+    """Squared lengths of (n, R), (R,)."""
+    total: Floats = white[0] * white[0]
     for row in white[1:]:
-        alone += row * row
-    exponent = 0.5 * (alone - squared)
-    # Most are told apart by far, and need no exponential.
-    some = np.flatnonzero((weight > 0.0) & (exponent > _IMPOSSIBLE) & gamma)
-    determinant = np.ones(len(some))
-    for D, state in zip(diagonal, leak.state_diagonal, strict=True):
-        determinant *= D.reshape(-1)[some] / state
-    likely = exp(np.minimum(exponent.reshape(-1)[some], _CERTAIN))
-    ratios = np.zeros(weight.shape)
-    ratios.reshape(-1)[some] = weight.reshape(-1)[some] * likely / np.sqrt(determinant)
-    return ratios
-
-
-def summed(values: Floats) -> Floats:
-    """Sum over components: (C, R) → (R,), one after the other, so that places that are empty in a trial change no bit."""
-    total = np.zeros(values.shape[1:])
-    for row in values:
-        total += row
+        total += row * row
     return total
 
 
-def pruned(of: Mixture) -> Mixture:
-    """Without what is negligible, and without places that no trial needs."""
-    weight = np.where(of.weight > NEGLIGIBLE, of.weight, 0.0)
-    used = np.flatnonzero(weight.any(axis=1))
-    count = int(used[-1]) + 1 if used.size else 0
-    return Mixture(weight[:count], *(part[:, :count] for part in of[1:]))
+def _weighed_ratios(
+    heard: Flags, weight: Floats, squared: Floats, diagonal: Floats, alone: Floats, leak: Leak
+) -> Floats:
+    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) of components whose trial received z, (N,); 0 of others.
+
+    weight: π, (N,); squared: (z − m)ᵀ P⁻¹ (z − m), (N,); diagonal: D of P's factors, (n, N); alone: zᵀ Σ_k⁻¹ z, (N,).
+    """
+    exponent = 0.5 * (alone - squared)
+    # Most are told apart by far, and need no exponential.
+    some = np.flatnonzero((exponent > _IMPOSSIBLE) & heard)
+    determinant = np.ones(len(some))
+    for D, state in zip(diagonal, leak.state_diagonal, strict=True):
+        determinant *= D[some] / state
+    likely = exp(np.minimum(exponent[some], _CERTAIN))
+    ratios = np.zeros(weight.shape)
+    ratios[some] = weight[some] * likely / np.sqrt(determinant)
+    return ratios
 
 
 def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
@@ -170,7 +156,7 @@ def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
     full = new[~free.any(axis=0)]
     if full.size:
         if len(of.weight) < capacity:
-            of = Mixture(*(_with_a_place(part, part.ndim - 2) for part in of))
+            of = Mixture(*(with_a_place(part, part.ndim - 2) for part in of))
         else:
             merge(of, full)
         free = of.weight[:, new] == 0.0
@@ -181,33 +167,6 @@ def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
         of.lower[:, place, new] = 0.0
         of.diagonal[:, place, new] = 0.0
     return of._replace(weight=of.weight / summed(of.weight))
-
-
-def _with_a_place(part: Floats, axis: int) -> Floats:
-    shape = list(part.shape)
-    shape[axis] = 1
-    return np.concatenate([part, np.zeros(shape)], axis=axis)
-
-
-def merge(of: Mixture, trials: NDArray[np.intp]) -> None:
-    """Make one of the two least probable components of some trials, in place; the other place is empty then."""
-    weight = of.weight[:, trials]
-    columns = np.arange(len(trials))
-    first = np.argmin(weight, axis=0)
-    without = weight.copy()
-    without[first, columns] = np.inf
-    second = np.argmin(without, axis=0)
-    one, two = ((place, trials) for place in (first, second))
-    total = of.weight[one] + of.weight[two]
-    a, b = of.weight[one] / total, of.weight[two] / total
-    apart = [m[two] - m[one] for m in of.mean]
-    U, V = ([[*row] for row in Factors(of.lower[:, p, t], of.diagonal[:, p, t]).unit()] for p, t in (one, two))
-    weights = [*(a * of.diagonal[(slice(None), *one)]), *(b * of.diagonal[(slice(None), *two)]), a * b]
-    lower, diagonal = orthogonalised([u + v + [d] for u, v, d in zip(U, V, apart, strict=True)], weights)
-    for m, d in zip(of.mean, apart, strict=True):
-        m[one] += b * d
-    of.lower[(slice(None), *one)], of.diagonal[(slice(None), *one)] = lower, diagonal
-    of.weight[one], of.weight[two] = total, 0.0
 
 
 def moments(of: Mixture) -> tuple[Floats, Floats]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
@@ -15,7 +16,7 @@ from emulator.streams import Batch
 class Delegate(Eavesdropper):
     """Reads as `reads_as` does, and is given what that strategy must be given."""
 
-    parameters: ClassVar[tuple[str, ...]] = ("reads_as",)
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({"reads_as": "smart"})
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)

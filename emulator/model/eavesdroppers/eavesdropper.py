@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,14 +30,24 @@ class Knowledge:
 
 
 class Eavesdropper(Receiver):
-    """A strategy: how an eavesdropper reads packets. `parameters` are the entries that a scenario must give it."""
+    """A strategy: how an eavesdropper reads packets.
 
-    parameters: ClassVar[tuple[str, ...]] = ()
+    A file of this folder holds one strategy. `parameters` are the entries that a scenario must give it, each with an
+    example; `Knowledge.parameters` has what it gives.
+    """
+
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     pools_links: ClassVar[bool] = False
     """Whether it has several links in place of one: what any of them delivers, it hears."""
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge.process, batch.trials)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        del given
+        return []
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:

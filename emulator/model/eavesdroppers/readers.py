@@ -1,4 +1,4 @@
-"""Strategies that read packets by themselves, by their name in a scenario."""
+"""Strategies that read packets by themselves, by their name in a scenario: one file each, and those of other modules."""
 
 from __future__ import annotations
 
@@ -14,8 +14,14 @@ from emulator.model.eavesdroppers.reference import Reference
 from emulator.model.eavesdroppers.selective import Selective
 from emulator.model.eavesdroppers.smart import Smart
 from emulator.model.eavesdroppers.suspicious import Suspicious
+from emulator.model.eavesdroppers.tracker import Tracker
+from emulator.model.registry import Registry
 
-READERS: Mapping[str, type[Eavesdropper]] = {
+GROUP = "evedrop.eavesdroppers"
+RESERVED = ("strategy", "link", "links", "window")
+"""Entries that the table of every eavesdropper has."""
+
+_BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "naive": Naive,
     "suspicious": Suspicious,
     "smart": Smart,
@@ -25,4 +31,6 @@ READERS: Mapping[str, type[Eavesdropper]] = {
     "genie": Genie,
     "reference": Reference,
     "selective": Selective,
+    "tracker": Tracker,
 }
+READERS: Registry[Eavesdropper] = Registry("eavesdropper", Eavesdropper, GROUP, _BUILT_IN, (*RESERVED, "reads_as"))  # type: ignore[type-abstract]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from emulator.model.eavesdroppers.delegate import Delegate
@@ -18,7 +19,7 @@ class ReplayInformed(Delegate):
     Source: docs/mathematics.md, further eavesdroppers.
     """
 
-    parameters = ("learns_at", "reads_as")
+    parameters = MappingProxyType({"learns_at": 40, "reads_as": "smart"})
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ class Suspicious(PacketTaker):
     Source: the paper, suspicious eavesdropper.
     """
 
-    parameters = ("use_state", "use_innovation")
+    parameters = MappingProxyType({"use_state": 0.8, "use_innovation": 0.2})
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)

@@ -1,4 +1,4 @@
-"""Loss models of links by their name in a scenario: one file each."""
+"""Loss models of links by their name in a scenario: one file each, and those of other modules."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from emulator.model.links.markov import Markov
 from emulator.model.links.pattern import Pattern
 from emulator.model.links.pooled import Pooled
 from emulator.model.links.trace import Trace
+from emulator.model.registry import Registry
 
-LOSS_MODELS: Mapping[str, type[LossModel]] = {
+_BUILT_IN: Mapping[str, type[LossModel]] = {
     "bernoulli": Bernoulli,
     "distance": Distance,
     "gilbert-elliott": GilbertElliott,
@@ -22,6 +23,7 @@ LOSS_MODELS: Mapping[str, type[LossModel]] = {
     "pattern": Pattern,
     "trace": Trace,
 }
+LOSS_MODELS: Registry[LossModel] = Registry("loss model", LossModel, "evedrop.links", _BUILT_IN, ("model",))  # type: ignore[type-abstract]
 
 
 def loss_of(spec: Mapping[str, Any]) -> LossModel:

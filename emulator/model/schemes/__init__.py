@@ -1,4 +1,4 @@
-"""Schemes by their name in a scenario: one file each."""
+"""Schemes by their name in a scenario: one file each, and those of other modules."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from emulator.model.process import Process
+from emulator.model.registry import Registry
 from emulator.model.schemes.acknowledged import Acknowledged
 from emulator.model.schemes.cipher import Cipher
 from emulator.model.schemes.encrypted_schedule import EncryptedSchedule
@@ -16,7 +17,7 @@ from emulator.model.schemes.scheme import Scheme
 from emulator.model.schemes.twin_track import TwinTrack
 from emulator.model.schemes.withholding import Withholding
 
-SCHEMES: Mapping[str, type[Scheme]] = {
+_BUILT_IN: Mapping[str, type[Scheme]] = {
     "acknowledged": Acknowledged,
     "cipher": Cipher,
     "encrypted-schedule": EncryptedSchedule,
@@ -26,6 +27,7 @@ SCHEMES: Mapping[str, type[Scheme]] = {
     "twin-track": TwinTrack,
     "withholding": Withholding,
 }
+SCHEMES: Registry[Scheme] = Registry("scheme", Scheme, "evedrop.schemes", _BUILT_IN, ("scheme",))  # type: ignore[type-abstract]
 
 
 def scheme_of(process: Process, spec: Mapping[str, Any]) -> Scheme:

@@ -115,6 +115,8 @@ class Scheme(ABC):
     """What each number of the header means."""
     secret_words: ClassVar[tuple[int, int]] = (0, 0)
     """64-bit words of shared secret that a slot uses: so many, and so many more for each state."""
+    initial_secret_words: ClassVar[tuple[int, int]] = (0, 0)
+    """The same, of what a trial uses once."""
 
     def __init__(self, process: Process, state_probability: float = 1.0) -> None:
         self.process = process
@@ -152,7 +154,15 @@ class Scheme(ABC):
     @property
     def secret_bits(self) -> int:
         """Shared secret that a slot uses up: bits of the streams' words, all of them expanded from 256-bit keys."""
-        fixed, per_state = self.secret_words
+        return self._bits(self.secret_words)
+
+    @property
+    def initial_secret_bits(self) -> int:
+        """The same, of what a trial uses up once."""
+        return self._bits(self.initial_secret_words)
+
+    def _bits(self, words: tuple[int, int]) -> int:
+        fixed, per_state = words
         return _WORD_BITS * (fixed + per_state * self.process.n)
 
     @abstractmethod

@@ -105,6 +105,7 @@ class TwinTrack(Scheme):
     secret_streams = ("start", "track")
     estimator_streams = ("start", "track")
     secret_words = (1, 0)
+    initial_secret_words = (0, 2)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The two starts and the coins."""

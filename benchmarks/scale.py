@@ -1,0 +1,296 @@
+"""How live runs grow: deliveries a second and memory, against trials, receivers and shards. A table and a picture.
+
+    python benchmarks/scale.py [--quick] [PICTURE]
+
+About seven minutes, `--quick` one. A delivery is one packet's fate at one receiver in one trial, counted once its slot is in the
+results. Rates are those of the steady part of a run: start, end and the making one of shards left out. Memory is the largest
+sum of all processes' resident memory, in which what they share counts in each. Compare within one table, not between tables:
+what else runs on the machine is in all of its numbers, and the load is printed at its head and its foot.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator import run
+from emulator.view.figures_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+
+_TICK = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+_LOOK_SECONDS = 0.1
+_STEADY = 0.2  # from this part of the slots on
+_STRATEGIES = ("naive", "suspicious", "smart")
+COLOURS = (BLUE, ORANGE, GREEN, RED, GREY)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What is measured."""
+
+    trials: tuple[int, ...]
+    receivers: tuple[int, ...]
+    shards: tuple[int, ...]
+    """Of runs over the second number of receivers; the others are not split."""
+    seconds: float
+    """Each run's, about."""
+
+    @property
+    def points(self) -> Iterator[tuple[int, int, int]]:
+        """Trials, receivers and shards of each run."""
+        for trials, receivers, shards in product(self.trials, self.receivers, self.shards):
+            if shards == 1 or (shards <= trials and receivers == self.receivers[1]):
+                yield trials, receivers, shards
+
+
+FULL = Grid((1, 10, 100, 1000, 4000), (1, 4, 16), (1, 2, 4), 8.0)
+QUICK = Grid((10, 1000), (1, 4), (1, 2), 2.0)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One run."""
+
+    trials: int
+    receivers: int
+    shards: int
+    slots: int
+    slots_per_second: float
+    megabytes: float
+    cores: float
+    """Processor seconds of all processes, a second."""
+    busiest: str
+    """The kind of process that used most of it."""
+    share: float
+    """The part of a core that one such process used."""
+
+    @property
+    def rate(self) -> float:
+        """Deliveries a second."""
+        return self.slots_per_second * self.trials * self.receivers
+
+    @property
+    def cost(self) -> float:
+        """Microseconds of processor a delivery, of all processes together."""
+        return self.cores / self.rate * 1e6
+
+
+def changes_of(slots: int, trials: int, receivers: int, shards: int) -> dict[str, Any]:
+    """The shipped scenario `eavesdroppers` with as many receivers, of its three strategies in turn."""
+    eavesdroppers: dict[str, Any] = {}
+    for i in range(receivers - 1):
+        strategy = _STRATEGIES[i % len(_STRATEGIES)]
+        eavesdroppers[f"{strategy}-{i}"] = {"strategy": strategy, "link": {"quality": 0.9}}
+        if strategy == "suspicious":
+            eavesdroppers[f"{strategy}-{i}"] |= {"use_state": 0.8, "use_innovation": 0.3}
+    return {
+        "slots": slots,
+        "trials": trials,
+        "shards": shards,
+        "pace": 0.0,
+        "eavesdroppers": eavesdroppers,
+        "event": [],
+        "expect": [],
+    }
+
+
+def one_run(folder: str, changes: str) -> None:
+    """A run whose progress is printed, with the time."""
+
+    def tell(news: Mapping[str, Any]) -> None:
+        if news["event"] == "progress":
+            print(json.dumps([time.monotonic(), news["done"]]), flush=True)
+
+    run("eavesdroppers", out=folder, tell=tell, **json.loads(changes))
+
+
+def measure(trials: int, receivers: int, shards: int, seconds: float) -> Measured:
+    """Run one point of the grid and watch it."""
+    expected = 60e-6 + 11e-6 * receivers + trials * (0.3e-6 + 0.075e-6 * receivers)  # a slot, on two cores of 2024
+    slots = max(40, int(seconds / expected))
+    looks: list[tuple[float, float, dict[str, list[float]]]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        changes = json.dumps(changes_of(slots, trials, receivers, shards))
+        command = [sys.executable, __file__, "one-run", f"{folder}/run", changes]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        while process.poll() is None:
+            looks.append((time.monotonic(), *look(process.pid)))
+            time.sleep(_LOOK_SECONDS)
+        assert process.stdout is not None
+        told = [json.loads(line) for line in process.stdout]
+    assert process.returncode == 0, command
+    steady = [(at, done) for at, done in told if done >= _STEADY * slots]
+    (begin, done), (end, last) = steady[0], steady[-1]
+    used = processor_seconds(looks, begin, end)
+    busiest = max(used, key=lambda kind: max(used[kind]))
+    return Measured(
+        *(trials, receivers, shards, slots),
+        slots_per_second=(last - done) / (end - begin),
+        megabytes=max(resident for _, resident, _ in looks),
+        cores=sum(map(sum, used.values())) / (end - begin),
+        busiest=busiest,
+        share=max(used[busiest]) / (end - begin),
+    )
+
+
+def look(launcher: int) -> tuple[float, dict[str, list[float]]]:
+    """Resident megabytes of a command and its children together; kind of process → processor seconds so far, by process id."""
+    resident, seconds = 0.0, dict[str, list[float]]()
+    for folder in sorted(Path("/proc").glob("[0-9]*"), key=lambda path: int(path.name)):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(folder.name) != launcher and int(fields[1]) != launcher:
+                continue
+            words = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        resident += int(fields[21]) * _PAGE / 1e6
+        kind = "launcher" if int(folder.name) == launcher else words[3].decode() if len(words) > 4 else "new"
+        seconds.setdefault(kind, []).append((int(fields[11]) + int(fields[12])) / _TICK)
+    return resident, seconds
+
+
+def processor_seconds(
+    looks: list[tuple[float, float, dict[str, list[float]]]], begin: float, end: float
+) -> dict[str, list[float]]:
+    """Kind of process → what each of them used between two times."""
+    inside = [seconds for at, _, seconds in looks if begin <= at <= end]
+    first, last = inside[0], inside[-1]
+    return {
+        kind: [after - before for before, after in zip(first[kind], last[kind], strict=False)]
+        for kind in last
+        if kind in first
+    }
+
+
+def exponent(points: list[tuple[float, float]]) -> float:
+    """Of the power law that fits points best, by least squares of logarithms."""
+    x, y = np.log(np.array(points).T)
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def named(power: float) -> str:
+    """Growth in a word."""
+    words = ("falling", "constant", "slower than linear", "linear", "faster than linear")
+    return words[int(np.searchsorted((-0.1, 0.1, 0.9, 1.1), power))]
+
+
+def laws(found: list[Measured]) -> None:
+    """Growth along each axis, and what a slot costs."""
+    alone = [one for one in found if one.shards == 1]
+    axes = {"trials": sorted({one.trials for one in alone}), "receivers": sorted({one.receivers for one in alone})}
+    print("\ngrowth without shards, exponents of a power law between two sizes:")
+    for axis, sizes in axes.items():
+        other = "receivers" if axis == "trials" else "trials"
+        for fixed in axes[other]:
+            line = [one for one in alone if getattr(one, other) == fixed]
+            for low, high in pairwise(sizes):
+                ends = [one for one in line if getattr(one, axis) in (low, high)]
+                rate = exponent([(getattr(one, axis), one.rate) for one in ends])
+                memory = exponent([(getattr(one, axis), one.megabytes) for one in ends])
+                print(
+                    f"    {axis} {low:>4} to {high:>4}, {fixed:>4} {other}: deliveries/s {rate:5.2f} ({named(rate)}), "
+                    f"memory {memory:5.2f} ({named(memory)})"
+                )
+    if len(alone) > 4:
+        terms = np.array([[1.0, one.receivers, one.trials, one.trials * one.receivers] for one in alone])
+        for what, values, unit in (
+            ("a slot costs", [1e6 * one.cores / one.slots_per_second for one in alone], "µs of processor"),
+            ("memory is", [one.megabytes for one in alone], "MB"),
+        ):
+            weights = 1.0 / np.array(values)  # relative errors
+            law, *_ = np.linalg.lstsq(terms * weights[:, None], np.ones(len(alone)), rcond=None)
+            off = float(np.max(np.abs(terms @ law * weights - 1.0)))
+            print(
+                f"{what} about {law[0]:.3g} + {law[1]:.3g} · receivers + {law[2]:.3g} · trials + {law[3]:.3g} · trials · "
+                f"receivers {unit}, within {100 * off:.0f} %"
+            )
+
+
+def draw(found: list[Measured], picture: Path) -> None:
+    """Three panels: deliveries a second and memory against trials, and what shards change."""
+    receivers = sorted({one.receivers for one in found})
+    with panels(picture, 3, 13.0, 4.2) as (speed, memory, gain):
+        for colour, count in zip(COLOURS, receivers, strict=False):
+            line = [one for one in found if one.shards == 1 and one.receivers == count]
+            word = f"{count} receiver" + ("s" if count > 1 else "")
+            for axes, values in ((speed, [one.rate for one in line]), (memory, [one.megabytes for one in line])):
+                axes.loglog([one.trials for one in line], values, "o-", color=colour, markersize=4, label=word)
+        low, first = min(one.trials for one in found), min(one.rate for one in found if one.shards == 1)
+        high = max(one.trials for one in found)
+        speed.loglog([low, high], [first, first * high / low], ":", color=GREY, linewidth=1.0, label="linear")
+        speed.set_ylim(top=2.5 * max(one.rate for one in found))
+        many = [one for one in found if one.receivers == receivers[1]]
+        for colour, trials in zip(COLOURS, sorted({one.trials for one in many if one.trials > 1}), strict=False):
+            line = [one for one in many if one.trials == trials]
+            base = _alone(many, trials)
+            gain.plot(
+                [one.shards for one in line],
+                [one.rate / base for one in line],
+                "o-",
+                color=colour,
+                markersize=4,
+                label=f"{trials:,} trials",
+            )
+        gain.axhline(1.0, color=GREY, linewidth=1.0)
+        gain.set_ylim(0.0, 1.25 * max(one.rate / _alone(many, one.trials) for one in many))
+        gain.set_xticks(sorted({one.shards for one in found}))
+        for axes, title, x in (
+            (speed, "Deliveries a second, 1 shard", "trials"),
+            (memory, "Memory of all processes, MB, 1 shard", "trials"),
+            (gain, f"Rate over that of 1 shard, {many[0].receivers} receivers", "shards"),
+        ):
+            axes.set_title(title)
+            axes.set_xlabel(x)
+            axes.legend()
+        for which in (memory.yaxis.set_major_formatter, memory.yaxis.set_minor_formatter):
+            which(lambda value, _: f"{value:,.0f}" if f"{value:g}"[0] in "1257" else "")
+
+
+def _alone(found: list[Measured], trials: int) -> float:
+    """The rate of so many trials in one shard."""
+    return next(one.rate for one in found if one.shards == 1 and one.trials == trials)
+
+
+def load_now() -> str:
+    """How busy the machine is."""
+    return " ".join(f"{one:.1f}" for one in os.getloadavg())
+
+
+def main(quick: bool, picture: Path | None) -> None:
+    """All of it."""
+    grid = QUICK if quick else FULL
+    print(f"{os.cpu_count()} cores, load before: {load_now()}")
+    print("trials  receivers  shards    slots   slots/s  deliveries/s   µs each  cores used  busiest process      MB")
+    found = []
+    for point in grid.points:
+        one = measure(*point, grid.seconds)
+        found.append(one)
+        print(
+            f"{one.trials:>6} {one.receivers:>10} {one.shards:>7} {one.slots:>8,} {one.slots_per_second:>9,.0f} "
+            f"{one.rate:>13,.0f} {one.cost:>9.3f} {one.cores:>11.2f}  {one.busiest:<11} {one.share:.2f} {one.megabytes:>9,.0f}",
+            flush=True,
+        )
+    laws(found)
+    print(f"load after: {load_now()}")
+    if picture is not None:
+        draw(found, picture)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["one-run"]:
+        one_run(*sys.argv[2:])
+    else:
+        pictures = [Path(word) for word in sys.argv[1:] if not word.startswith("--")]
+        main("--quick" in sys.argv, pictures[0] if pictures else None)

@@ -1,0 +1,156 @@
+"""What an eavesdropper must keep to.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from emulator.conformance.packets import SchemeOf, Slot, expect_belief, frozen_belief, made, played, row_of
+from emulator.conformance.problems import Problem, large, small
+from emulator.conformance.receivers import Step, expect_actions, expect_expected, expect_pure
+from emulator.conformance.rules import Broken, Keys, Row, Verdict, calling, expect_same, frozen, judged
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from emulator.model.outcomes import eavesdropper_outcomes
+from emulator.model.schemes.scheme import Scheme
+
+_COLUMN = (
+    "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "
+    "batch's trials"
+)
+_STATE = "keep no state outside of Belief, and take random numbers from the streams alone"
+
+
+@dataclass(frozen=True)
+class Listening:
+    """An eavesdropper of one class with its parameters, beside a scheme."""
+
+    name: str
+    """Of its class."""
+    kind: type[Eavesdropper]
+    parameters: Mapping[str, Any]
+    scheme_of: SchemeOf
+    scheme: type[Scheme]
+
+    def made(self, problem: Problem) -> Eavesdropper:
+        """One for a problem."""
+        with calling("streams()", self.kind):
+            streams = self.kind.streams(self.parameters)
+        mu_d = made(self.scheme_of, problem, self.scheme).state_probability
+        knowledge = Knowledge(problem.process, mu_d, self.parameters, Keys.of(streams))
+        with calling(f"{self.kind.__name__}(knowledge, batch)", self.kind):
+            return self.kind(knowledge, problem.batch)
+
+    @cached_property
+    def betrayed(self) -> int | None:
+        """The slot whose state it is told."""
+        with calling("betrayed()", self.kind):
+            slot = self.kind.betrayed(self.parameters)
+        if slot is not None and (type(slot) is not int or slot < 0):
+            raise Broken(f"betrayed() is {slot!r}; expected a slot, from 0 on, or None")
+        return slot
+
+    def steps(self, problem: Problem, rubbish: float = 0.0) -> Iterator[tuple[Slot, Step]]:
+        """Every slot of the scheme, and what it makes of it."""
+        receiver = self.made(problem)
+        with calling("prior()", self.kind):
+            belief = receiver.prior()
+        expect_belief("prior(): Belief", belief, problem)
+        for slot in played(self.scheme_of, problem, self.scheme, rubbish=rubbish):
+            heard = slot.heard._replace(truth=frozen(slot.x) if slot.k == self.betrayed else None)
+            with calling(f"slot {slot.k}: step()", self.kind):
+                after = receiver.step(slot.k, belief, heard)
+            expect_belief(f"slot {slot.k}: Belief", after, problem)
+            after = frozen_belief(after)
+            yield slot, (belief, heard, after)
+            belief = after
+
+
+def eavesdropper_verdicts(listening: Listening) -> list[Verdict]:
+    """Every rule for eavesdroppers, on small problems."""
+    checks = EavesdropperChecks(listening)
+    at = listening.betrayed
+    slots = 0 if at is None else min(at + 3, 200)
+    exact = [
+        ("shapes and types", checks.shapes),
+        ("the same eavesdropper made twice", checks.twice),
+        ("a trial by itself", checks.alone),
+        ("a slot asked for again", checks.again),
+        ("packets that were lost", checks.lost),
+        ("actions that γ tells", checks.actions),
+    ]
+    return judged((exact, small(slots)), ([("what it says to theory", checks.theory)], large()))
+
+
+class EavesdropperChecks:
+    """The rules, each of one problem. Final."""
+
+    def __init__(self, listening: Listening) -> None:
+        self._listening = listening
+
+    def _rows(self, problem: Problem, rubbish: float = 0.0) -> list[Row]:
+        return [row_of(step[2]) for _, step in self._listening.steps(problem, rubbish)]
+
+    def _steps(self, problem: Problem) -> list[Step]:
+        return [step for _, step in self._listening.steps(problem)]
+
+    def shapes(self, problem: Problem) -> None:
+        """Everything has the shape and type that it must have, and no input is changed."""
+        self._rows(problem)
+        kind, parameters = self._listening.kind, self._listening.parameters
+        with calling("outcomes() and follows_gamma()", kind):
+            kind.outcomes(parameters, 0.5)
+            follows = kind.follows_gamma(parameters)
+        if not isinstance(follows, bool):
+            raise Broken(f"follows_gamma() is {follows!r}; expected True or False")
+
+    def twice(self, problem: Problem) -> None:
+        """Two that work in turns do what one does by itself."""
+        once = self._rows(problem)
+        both = list(zip(*(self._listening.steps(problem) for _ in range(2)), strict=True))
+        for which in (0, 1):
+            rows = [row_of(pair[which][1][2]) for pair in both]
+            said = "{0!r} by itself and {1!r} beside another one of its kind"
+            expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone is the same trial, to the bit."""
+        among = self._rows(problem)
+        for trial in (0, problem.batch.trials - 1):
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            number = problem.batch.first_trial + trial
+            expect_same(among, self._rows(problem.part(trial, 1)), slice(trial, trial + 1), number, said, _COLUMN)
+
+    def again(self, problem: Problem) -> None:
+        """It answers for a slot as it did, whatever came after."""
+        expect_pure(self._listening.made(problem), self._steps(problem), problem, self._listening.kind)
+
+    def lost(self, problem: Problem) -> None:
+        """What stands in place of a packet that was lost changes nothing."""
+        said = "{0!r} or {1!r}, by what stands in z where nothing was received"
+        remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
+        rubbish = self._rows(problem, rubbish=1e30)
+        expect_same(self._rows(problem), rubbish, slice(None), problem.batch.first_trial, said, remedy)
+
+    def actions(self, problem: Problem) -> None:
+        """If it follows γ, γ alone tells what it does, and so what it believes."""
+        kind = self._listening.kind
+        if kind.follows_gamma(self._listening.parameters):
+            remedy = "let follows_gamma() return False"
+            expect_actions(self._listening.made(problem), self._steps(problem), problem, kind, remedy)
+
+    def theory(self, problem: Problem) -> None:
+        """What `outcomes` says is what happens, if it says anything of this scheme."""
+        listening = self._listening
+        scheme = made(listening.scheme_of, problem, listening.scheme)
+        with calling("outcomes()", listening.kind):
+            outcomes_at = eavesdropper_outcomes(scheme, listening.name, listening.parameters)
+        if outcomes_at is not None:
+            errors = [((slot.x - step[2].x_hat) ** 2).sum(axis=0) for slot, step in listening.steps(problem)]
+            expect_expected(problem, outcomes_at, [np.asarray(one) for one in errors])

@@ -1,0 +1,134 @@
+"""Classes by their names, and every rule for them: what `evedrop check --scheme NAME` and the like ask for.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emulator.conformance.eavesdroppers import Listening, eavesdropper_verdicts
+from emulator.conformance.links import DelayChecks, LossChecks
+from emulator.conformance.rules import Broken, Verdict, calling
+from emulator.conformance.schemes import scheme_verdicts
+from emulator.errors import UsageError
+from emulator.model.delays import DELAY_MODELS
+from emulator.model.eavesdroppers import READERS, STRATEGIES
+from emulator.model.links import LOSS_MODELS
+from emulator.model.registry import NotRegistered, Registry, asked
+from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.modules import look_in
+
+_REGISTRIES: Mapping[str, Registry[Any]] = {
+    "scheme": SCHEMES,
+    "eavesdropper": STRATEGIES,
+    "link": LOSS_MODELS,
+    "delay": DELAY_MODELS,
+}
+_OWN_COIN = "coin"
+
+
+@dataclass(frozen=True)
+class Examined:
+    """One class, and what became of each rule."""
+
+    title: str
+    verdicts: list[Verdict]
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A class, its name, and the parameters that it is checked with."""
+
+    name: str
+    kind: Any
+    parameters: Mapping[str, Any]
+
+
+def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterator[Examined]:
+    """Every class, one by one.
+
+    names: `scheme`, `eavesdropper`, `link` or `delay` → its name; modules are looked for in the current folder.
+    parameters: in place of the classes' own examples.
+
+    Raises UsageError for names that are none, and for parameters that are none or wrong.
+    """
+    look_in(str(Path.cwd()))
+    classes = {option: _named(option, name, parameters) for option, name in names.items()}
+    known = [entry for one in classes.values() for entry in (*one.kind.parameters, *one.parameters)]
+    for entry in parameters:
+        if entry not in known:
+            said = f"expected {', '.join(dict.fromkeys(known))}" if known else "they have no parameters; remove it"
+            raise UsageError(f"--set {entry}: is no parameter of {', '.join(names.values())}; {said}")
+    for option, one in classes.items():
+        title = f"{one.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
+        if option == "eavesdropper":
+            beside = classes.get("scheme") or _beside(one)
+            yield Examined(f"{title}, beside the scheme {beside.name}", _listened(one, beside))
+        else:
+            yield Examined(title, _verdicts(option, one))
+
+
+def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
+    registry = _REGISTRIES[option]
+    try:
+        kind = registry[name]
+        given = _given(kind, parameters)
+        if "reads_as" in given:
+            given = {**_given(READERS[str(given["reads_as"])], parameters), **given}
+    except NotRegistered as error:
+        why = error.why or f" is none; expected MODULE:CLASS, or {', '.join(registry.names)}"
+        raise UsageError(f"--{option} {error.name}{why}") from error
+    wrong = [f"{entry}: {what}" for entry, what in asked(kind, given)]
+    if wrong:
+        raise UsageError(f"--{option} {name}: {'; '.join(wrong)}; give others by --set")
+    return _Named(name, kind, given)
+
+
+def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The examples of a class's parameters, without those it can do without, and those given."""
+    optional = getattr(kind, "optional", ())
+    examples = {entry: example for entry, example in kind.parameters.items() if entry not in optional}
+    return examples | {entry: value for entry, value in parameters.items() if entry in kind.parameters}
+
+
+def _verdicts(option: str, one: _Named) -> list[Verdict]:
+    if option == "scheme":
+        return scheme_verdicts(lambda process: scheme_of(process, {"scheme": one.name, **one.parameters}), one.kind)
+    checks = LossChecks if option == "link" else DelayChecks
+    return checks(lambda: one.kind(**one.parameters), one.kind).verdicts()
+
+
+def _listened(one: _Named, beside: _Named) -> list[Verdict]:
+    lacking = sorted({*_streams(one)} - {*beside.kind.secret_streams})
+    if lacking:
+        raise UsageError(
+            f"--eavesdropper {one.name}: asks for the key of {' and '.join(lacking)}, and the scheme {beside.name} has "
+            f"{', '.join(beside.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
+        )
+    spec = {"scheme": beside.name, **beside.parameters}
+    listening = Listening(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), beside.kind)
+    try:
+        return eavesdropper_verdicts(listening)
+    except Broken as error:
+        return [Verdict("what it says of itself", str(error))]
+
+
+def _streams(one: _Named) -> list[str]:
+    try:
+        with calling("streams()", one.kind):
+            return [stream for stream in one.kind.streams(one.parameters) if stream != _OWN_COIN]
+    except Broken as error:
+        raise UsageError(f"--eavesdropper {one.name}: {error}") from error
+
+
+def _beside(one: _Named) -> _Named:
+    """The paper's scheme, or the first that has the keys which an eavesdropper asks for."""
+    needed = {*_streams(one)}
+    for name in ("innovation", *SCHEMES):
+        if needed <= {*SCHEMES[name].secret_streams}:
+            return _Named(name, SCHEMES[name], dict(SCHEMES[name].parameters))
+    return _Named("innovation", SCHEMES["innovation"], dict(SCHEMES["innovation"].parameters))

@@ -1,0 +1,236 @@
+"""What loss models and delay models must keep to.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from emulator.conformance.problems import Problem, large, small
+from emulator.conformance.receivers import SIGMAS
+from emulator.conformance.rules import (
+    Broken,
+    Verdict,
+    calling,
+    expect_array,
+    expect_finite,
+    expect_same,
+    frozen,
+    judged,
+    key,
+)
+from emulator.model.delays.delay import DelayModel
+from emulator.model.links.link import Fate, LossModel
+from emulator.model.process import Floats
+from emulator.model.receiver import Codes
+from emulator.streams import BlockReader
+
+_COLUMN = "compute each trial from its own column of numbers alone"
+_PIECES = (
+    "let what comes of a slot depend on what was remembered and its numbers alone, not on how many slots are asked for"
+)
+
+
+class LossChecks:
+    """The rules for loss models, each of one problem. Final. model: makes one, fresh."""
+
+    def __init__(self, model: Callable[[], LossModel], kind: type[LossModel]) -> None:
+        self._model, self._kind = model, kind
+
+    def verdicts(self) -> list[Verdict]:
+        """Every rule, on small problems."""
+        exact = [
+            ("shapes and types", self.shapes),
+            ("the same link made twice", self.twice),
+            ("a trial by itself", self.alone),
+            ("slots in pieces", self.pieces),
+            ("a copy that goes on", self.copied),
+        ]
+        return judged((exact, small()), ([("the quality it says", self.rate)], [_long(one) for one in large()]))
+
+    def _made(self) -> LossModel:
+        with calling(f"{self._kind.__name__}(…)", self._kind):
+            return self._model()
+
+    def _uniforms(self, model: LossModel, problem: Problem) -> Floats:
+        words = model.uniforms_per_slot
+        if type(words) is not int or words < 1:
+            raise Broken(f"uniforms_per_slot is {words!r}; expected a whole number from 1 on")
+        reader = BlockReader(key("link"), problem.batch, words)
+        return frozen(reader.uniforms(range(problem.slots)))
+
+    def _fates(self, model: LossModel, first: int, uniforms: Floats) -> Codes:
+        with calling(f"fates() of slot {first} and on", self._kind):
+            found = model.fates(first, uniforms)
+        slots, _, trials = uniforms.shape
+        expect_array(f"fates() of slot {first} and on", found, np.uint8, (slots, trials), "slots, R trials")
+        other = ~np.isin(found, (Fate.DELIVERED, Fate.LOST))
+        if other.any():
+            row, trial = np.argwhere(other)[0]
+            raise Broken(
+                f"slot {first + row}, trial {trial}: the fate is {found[row, trial]}; expected Fate.DELIVERED or Fate.LOST, "
+                "such as by fates_of(lost)"
+            )
+        return found
+
+    def _whole(self, problem: Problem) -> Codes:
+        model = self._made()
+        return self._fates(model, 0, self._uniforms(model, problem))
+
+    def shapes(self, problem: Problem) -> None:
+        """Fates, and the numbers that it says of itself."""
+        self._whole(problem)
+        model, slots = self._made(), range(problem.slots)
+        with calling("quality, quality_at(), rate_variance()", self._kind):
+            quality, each, variance = model.quality, model.quality_at(slots), model.rate_variance(slots)
+            settles, memoryless, chain = model.settles, model.memoryless, model.chain
+        expect_array("quality_at()", each, np.float64, (len(slots),), "one for each of the slots")
+        if not 0.0 <= quality <= 1.0 or not ((each >= 0.0) & (each <= 1.0)).all():
+            raise Broken(
+                f"quality is {quality}, quality_at() from {each.min()} to {each.max()}; expected probabilities"
+            )
+        if not 0.0 <= variance <= 0.25 + 1e-12:
+            raise Broken(f"rate_variance() is {variance}; expected a variance of a fraction, 0 to 0.25")
+        if type(settles) is not bool or type(memoryless) is not bool:
+            raise Broken("settles or memoryless is neither True nor False")
+        if chain is not None and not np.allclose(chain.law @ chain.transitions, chain.law):
+            raise Broken("chain.law is not the stationary law of chain.transitions; correct them, or return None")
+
+    def twice(self, problem: Problem) -> None:
+        """Two that work in turns do what one does by itself."""
+        once = self._whole(problem)
+        pair = [self._made() for _ in range(2)]
+        uniforms = self._uniforms(pair[0], problem)
+        each: list[list[Codes]] = [[], []]
+        for k in range(problem.slots):
+            for model, found in zip(pair, each, strict=True):
+                found.append(self._fates(model, k, uniforms[k : k + 1]))
+        said = "{0!r} by itself and {1!r} beside another one of its kind, slot by slot"
+        for found in each:
+            self._same(once, np.concatenate(found), problem, said, "keep no state outside of the model")
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone is the same trial."""
+        among = self._whole(problem)
+        for trial in (0, problem.batch.trials - 1):
+            one = self._whole(problem.part(trial, 1))
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
+
+    def pieces(self, problem: Problem) -> None:
+        """Slots in one call or in several come to the same."""
+        once, model = self._whole(problem), self._made()
+        uniforms = self._uniforms(model, problem)
+        bounds = [0, 1, 4, 5, problem.slots]
+        parts = [self._fates(model, first, uniforms[first:stop]) for first, stop in pairwise(bounds)]
+        self._same(once, np.concatenate(parts), problem, "{0!r} in one call and {1!r} in several", _PIECES)
+
+    def copied(self, problem: Problem) -> None:
+        """A shallow copy goes on from where it was, whatever the original does meanwhile."""
+        once, model = self._whole(problem), self._made()
+        uniforms = self._uniforms(model, problem)
+        self._fates(model, 0, uniforms[:5])
+        other = copy.copy(model)
+        self._fates(model, 5, uniforms[5:])
+        found = np.concatenate([once[:5], self._fates(other, 5, uniforms[5:])])
+        remedy = "replace what the model remembers, and never change an array of it in place"
+        self._same(once, found, problem, "{0!r}, and {1!r} of a copy made before slot 5", remedy)
+
+    def rate(self, problem: Problem) -> None:
+        """The fraction delivered is what it says, in the mean and in its scatter over trials."""
+        delivered = (self._whole(problem) == Fate.DELIVERED).mean(axis=0)
+        model, slots = self._made(), range(problem.slots)
+        expected, variance = float(model.quality_at(slots).mean()), model.rate_variance(slots)
+        scatter = max(variance, float(delivered.var()))
+        if abs(delivered.mean() - expected) > SIGMAS * np.sqrt(scatter / len(delivered)) + 1e-9:
+            raise Broken(
+                f"delivers {delivered.mean():.4f} of the packets, and quality_at() says {expected:.4f}; correct it"
+            )
+        if delivered.var() > 1.6 * variance + 1e-9:
+            raise Broken(
+                f"the fraction delivered has the variance {delivered.var():.3g} over trials, and rate_variance() says "
+                f"{variance:.3g}; give `chain`, or a rate_variance() of its own"
+            )
+
+    def _same(self, one: Codes, other: Codes, problem: Problem, said: str, remedy: str) -> None:
+        rows = [[{"the fate": row} for row in codes] for codes in (one, other)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
+
+
+class DelayChecks:
+    """The rules for delay models, each of one problem. Final. model: makes one, fresh."""
+
+    def __init__(self, model: Callable[[], DelayModel], kind: type[DelayModel]) -> None:
+        self._model, self._kind = model, kind
+
+    def verdicts(self) -> list[Verdict]:
+        """Every rule, on small problems."""
+        exact = [
+            ("shapes and types", self.shapes),
+            ("a trial by itself", self.alone),
+            ("slots in pieces", self.pieces),
+        ]
+        return judged((exact, small()), ([("the delays it says", self.law)], large()))
+
+    def _delays(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
+        reader, parts = BlockReader(key("delay"), problem.batch, 1), []
+        for first, stop in pairwise((0, *bounds, problem.slots)):
+            slots = range(first, stop)
+            with calling(f"{self._kind.__name__}(…)", self._kind):
+                model = self._model()
+            numbers = frozen((reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0])
+            where = f"delays() of slot {first} and on"
+            with calling(where, self._kind):
+                found = model.delays(first, numbers)
+            expect_array(where, found, np.float64, numbers.shape, "slots, R trials")
+            expect_finite(where, found)
+            if (found < 0.0).any():
+                raise Broken(f"{where}: one is {found.min()}; expected slots, 0 or more")
+            parts.append(found)
+        return np.concatenate(parts)
+
+    def shapes(self, problem: Problem) -> None:
+        """Delays, and what it says of them."""
+        self._delays(problem)
+        with calling("arrived()", self._kind):
+            said = [self._model().arrived(lag) for lag in range(4)]
+        known = [one for one in said if one is not None]
+        if known and (len(known) < len(said) or known != sorted(known) or not 0.0 <= known[0] <= known[-1] <= 1.0):
+            raise Broken(f"arrived() of 0 to 3 is {said}; expected probabilities that do not fall, or None always")
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone is the same trial."""
+        among = self._delays(problem)
+        for trial in (0, problem.batch.trials - 1):
+            one = self._delays(problem.part(trial, 1))
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
+
+    def pieces(self, problem: Problem) -> None:
+        """Slots in one call, or in several to models made afresh, come to the same."""
+        once = self._delays(problem)
+        self._same(once, self._delays(problem, (1, 4)), problem, "{0!r} in one call and {1!r} in several", _PIECES)
+
+    def law(self, problem: Problem) -> None:
+        """As many packets are there in time as it says."""
+        delays = self._delays(problem)
+        for lag in range(4):
+            said = self._model().arrived(lag)
+            found = float((delays < lag + 1).mean())
+            if said is not None and abs(found - said) > SIGMAS * np.sqrt(max(said * (1.0 - said), 1e-3) / delays.size):
+                raise Broken(f"{found:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {said:.4f}")
+
+    def _same(self, one: Floats, other: Floats, problem: Problem, said: str, remedy: str) -> None:
+        rows = [[{"the delay": row} for row in delays] for delays in (one, other)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
+
+
+def _long(problem: Problem) -> Problem:
+    """With more slots, for what has a memory."""
+    return replace(problem, batch=replace(problem.batch, slots=60))

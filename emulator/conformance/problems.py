@@ -1,0 +1,73 @@
+"""Small problems on which classes are checked: a process, some slots, some trials, and who hears what in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from emulator.conformance.rules import key
+from emulator.model.process import Process
+from emulator.model.receiver import Flags
+from emulator.streams import Batch, BlockReader
+
+QUALITY = 0.7
+"""Of the link of every problem."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One small problem."""
+
+    process: Process
+    batch: Batch
+
+    def __str__(self) -> str:
+        states = "1 state" if self.process.n == 1 else f"{self.process.n} states"
+        return f"{states}, spectral radius {self.process.spectral_radius:.2g}, {self.batch.trials} trials"
+
+    def part(self, first: int, trials: int) -> Problem:
+        """The same with some of the trials alone; first: counted from the problem's own first one."""
+        return replace(self, batch=Batch(self.batch.slots, trials, self.batch.first_trial + first))
+
+    @property
+    def slots(self) -> int:
+        """How many."""
+        return self.batch.slots
+
+    def coins(self, name: str, quality: float = QUALITY) -> Flags:
+        """Heads with this probability in every slot and trial, (slots, R): the same for a trial in any company."""
+        reader = BlockReader(key(f"coins/{name}"), self.batch, 1)
+        return np.asarray(reader.uniforms(range(self.slots))[:, 0, :] < quality)
+
+    @cached_property
+    def gamma(self) -> Flags:
+        """Whether the receiver hears the packet of each slot, (slots, R)."""
+        return self.coins("gamma")
+
+
+def _process(number: int, n: int, radius: float) -> Process:
+    """A random process of n states whose A has this spectral radius."""
+    random = np.random.default_rng(number)
+    A = random.normal(size=(n, n))
+    A *= radius / np.max(np.abs(np.linalg.eigvals(A)))
+    root, start = random.normal(size=(2, n, n))
+    return Process(A, 0.1 * (root @ root.T) + 0.05 * np.eye(n), start @ start.T + 0.2 * np.eye(n))
+
+
+def small(slots: int = 0) -> list[Problem]:
+    """Problems of 1 to 3 states that fade, stay and grow, of at least so many slots.
+
+    The last one crosses the ends of blocks in which streams are read ahead, and its trials have large numbers.
+    """
+    shapes = ((1, 0.8, 9, 4, 0), (2, 1.0, 12, 5, 3), (3, 1.1, 10, 3, 1000), (1, 0.95, 300, 2, 2**40))
+    return [
+        Problem(_process(number, n, radius), Batch(max(least, slots), trials, first))
+        for number, (n, radius, least, trials, first) in enumerate(shapes)
+    ]
+
+
+def large() -> list[Problem]:
+    """Problems of many trials, for what is true in the mean."""
+    return [Problem(_process(number, n, 0.9), Batch(10, 600)) for number, n in ((10, 1), (11, 2))]

@@ -1,0 +1,151 @@
+"""Rules that a class keeps or breaks, and how what it does is written down, guarded and compared."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.registry import place_of
+from emulator.streams import root_of_seed, stream_key
+
+Array = NDArray[Any]
+_ROOT = root_of_seed(0)
+
+
+class Broken(Exception):
+    """A rule is broken; the message says where, what was found, what was expected, and what to do."""
+
+
+class _NotAskedFor(Exception):
+    """A class reached for a key that it has not named."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one rule."""
+
+    rule: str
+    broken: str | None
+    """How; None if it is kept on all problems."""
+
+
+class Keys(dict[str, bytes]):
+    """Keys of the streams that a class has named; reaching for any other is an error. Final."""
+
+    @classmethod
+    def of(cls, streams: Sequence[str]) -> Keys:
+        """Of these streams."""
+        return cls({name: stream_key(_ROOT, f"secret/{name}") for name in streams})
+
+    def __missing__(self, name: str) -> bytes:
+        raise _NotAskedFor(f"reaches for the key of {name!r}, and has asked for {sorted(self) or 'none'}")
+
+
+def key(name: str) -> bytes:
+    """The key of a stream of the problem itself."""
+    return stream_key(_ROOT, name)
+
+
+@contextlib.contextmanager
+def calling(what: str, kind: type) -> Iterator[None]:
+    """Make any error of somebody's code one that says what was called, and where in that code it happened."""
+    try:
+        yield
+    except Broken:
+        raise
+    except _NotAskedFor as error:
+        named = "in streams()" if hasattr(kind, "streams") else "in secret_streams, and in estimator_streams"
+        raise Broken(f"{what} {error}; name every stream {named}, or leave it alone") from error
+    except Exception as error:
+        file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+        said = place_of(error, file)
+        if "read-only" in str(error):
+            raise Broken(f"{what} changes in place what it is given ({said}); make a new array instead") from error
+        raise Broken(f"{what} raised {said}; expected no error") from error
+
+
+def frozen(array: Array) -> Array:
+    """A copy that cannot be changed."""
+    made = np.array(array)
+    made.flags.writeable = False
+    return made
+
+
+def expect_array(where: str, found: Any, dtype: Any, shape: tuple[int, ...], means: str) -> None:
+    """Raise Broken unless something is an array of this type and shape. where: such as `slot 3: Packet.z`."""
+    if not isinstance(found, np.ndarray):
+        raise Broken(
+            f"{where} is {type(found).__name__}; expected an array of {np.dtype(dtype)}, shape {shape}: {means}"
+        )
+    if found.shape != shape:
+        raise Broken(f"{where} has shape {found.shape}; expected {shape}: {means}")
+    if found.dtype != np.dtype(dtype):
+        raise Broken(
+            f"{where} has type {found.dtype}; expected {np.dtype(dtype)}, such as by .astype(np.{np.dtype(dtype)})"
+        )
+
+
+def expect_finite(where: str, found: Array) -> None:
+    """Raise Broken where a number is not finite; the last axis is the trials."""
+    bad = ~np.isfinite(found)
+    if bad.any():
+        trial = int(np.argwhere(bad)[0][-1])
+        raise Broken(f"{where}, trial {trial}, is {found[bad].flat[0]}; expected finite numbers")
+
+
+Row = Mapping[str, Array]
+"""What was done in one slot: name → array whose last axis is the trials."""
+
+
+def expect_same(one: Sequence[Row], other: Sequence[Row], trials: slice, first: int, said: str, remedy: str) -> None:
+    """Raise Broken at the first slot, array and trial in which two records differ by a bit.
+
+    trials: those of `one` that `other` has; first: the number of its first; said: with places for both values.
+    """
+    for k, (row, again) in enumerate(zip(one, other, strict=True)):
+        for name, found in row.items():
+            mine, theirs = found[..., trials], again[name]
+            differ = mine.view(np.uint8) != theirs.view(np.uint8) if mine.dtype == np.bool_ else _differ(mine, theirs)
+            if differ.any():
+                place = tuple(np.argwhere(differ)[0])
+                values = said.format(mine[place].item(), theirs[place].item())
+                raise Broken(f"slot {k}, trial {first + int(place[-1])}: {name} is {values}; {remedy}")
+
+
+def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Where bits differ: a NaN is itself, and 0 is not −0."""
+    width = f"u{one.dtype.itemsize}"
+    return np.asarray(np.ascontiguousarray(one).view(width) != np.ascontiguousarray(other).view(width))
+
+
+Rule = tuple[str, Callable[[Any], None]]
+"""A title, and a check of one problem that raises Broken."""
+
+
+def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[Verdict]:
+    """Every rule on every problem of its group, until one breaks it; once the very first is broken, no other is asked."""
+    verdicts: list[Verdict] = []
+    for rules, problems in groups:
+        for title, check in rules:
+            broken = next((how for problem in problems if (how := _how_broken(check, problem)) is not None), None)
+            verdicts.append(Verdict(title, broken))
+            if verdicts[0].broken is not None:
+                return verdicts
+    return verdicts
+
+
+def _how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
+    try:
+        check(problem)
+    except Broken as error:
+        return f"{problem}: {error}"
+    except Exception as error:
+        # What it gave us may break at any place, ours included.
+        return f"{problem}: what it returned led to {place_of(error)}; expected what the base class describes"
+    return None

@@ -1,0 +1,143 @@
+"""What a scheme must keep to.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.conformance.packets import SchemeOf, Slot, made, played, row_of
+from emulator.conformance.problems import Problem, large, small
+from emulator.conformance.receivers import SIGMAS, expect_actions, expect_expected, expect_pure
+from emulator.conformance.rules import Broken, Keys, Verdict, calling, expect_same, judged
+from emulator.model.outcomes import legitimate_outcomes
+from emulator.model.schemes.scheme import Scheme
+
+_COLUMN = (
+    "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "
+    "batch's trials"
+)
+_STATE = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
+
+
+def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[Verdict]:
+    """Every rule for schemes, on small problems; scheme_of makes the scheme of a process."""
+    checks = SchemeChecks(scheme_of, kind)
+    exact = [
+        ("shapes and types", checks.shapes),
+        ("the same scheme made twice", checks.twice),
+        ("a trial by itself", checks.alone),
+        ("sensor and estimator apart", checks.apart),
+        ("a slot asked for again", checks.again),
+        ("packets that were lost", checks.lost),
+        ("slot 0", checks.first),
+        ("actions that γ tells", checks.actions),
+    ]
+    in_the_mean = [("no worse than prediction", checks.prediction), ("what it says to theory", checks.theory)]
+    return judged((exact, small()), (in_the_mean, large()))
+
+
+class SchemeChecks:
+    """The rules, each of one problem. Final."""
+
+    def __init__(self, scheme_of: SchemeOf, kind: type[Scheme]) -> None:
+        self._scheme_of, self._kind = scheme_of, kind
+
+    def _slots(self, problem: Problem, apart: bool = False, rubbish: float = 0.0) -> list[Slot]:
+        return list(played(self._scheme_of, problem, self._kind, apart=apart, rubbish=rubbish))
+
+    def shapes(self, problem: Problem) -> None:
+        """Everything has the shape and type that it must have, made together and apart, and no input is changed."""
+        scheme = made(self._scheme_of, problem, self._kind)
+        more = sorted(set(scheme.estimator_streams) - set(scheme.secret_streams))
+        if more:
+            raise Broken(f"estimator_streams has {more}, which secret_streams has not; expected some of those")
+        if not 0.0 <= scheme.state_probability <= 1.0:
+            raise Broken(f"state_probability is {scheme.state_probability}; expected a probability")
+        for apart in (False, True):
+            for _ in played(self._scheme_of, problem, self._kind, apart=apart):
+                pass
+        with calling("outcomes()", self._kind):
+            scheme.outcomes(0.5)
+
+    def twice(self, problem: Problem) -> None:
+        """Two that work in turns do what one does by itself."""
+        once = [slot.row for slot in self._slots(problem)]
+        pair = (played(self._scheme_of, problem, self._kind) for _ in range(2))
+        both = list(zip(*pair, strict=True))
+        for which in (0, 1):
+            rows = [slots[which].row for slots in both]
+            said = "{0!r} by itself and {1!r} beside another one of its kind"
+            expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone is the same trial, to the bit."""
+        among = [slot.row for slot in self._slots(problem)]
+        for trial in (0, problem.batch.trials - 1):
+            one = [slot.row for slot in self._slots(problem.part(trial, 1))]
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            number = problem.batch.first_trial + trial
+            expect_same(among, one, slice(trial, trial + 1), number, said, _COLUMN)
+
+    def apart(self, problem: Problem) -> None:
+        """Sensor and estimator that were made by themselves, as in a live run, do what they do in memory."""
+        together = [slot.row for slot in self._slots(problem)]
+        said = "{0!r} made from shared() and {1!r} made from encoder() and estimator()"
+        remedy = "make both sides from the keys alone, so that processes of their own agree"
+        rows = [slot.row for slot in self._slots(problem, apart=True)]
+        expect_same(together, rows, slice(None), problem.batch.first_trial, said, remedy)
+
+    def again(self, problem: Problem) -> None:
+        """The estimator answers for a slot as it did, whatever came after."""
+        slots = self._slots(problem)
+        scheme = made(self._scheme_of, problem, self._kind)
+        with calling("estimator()", self._kind):
+            estimator = scheme.estimator(Keys.of(scheme.estimator_streams), problem.batch)
+        expect_pure(estimator, [(one.before, one.heard, one.after) for one in slots], problem, self._kind)
+
+    def lost(self, problem: Problem) -> None:
+        """What stands in place of a packet that was lost changes nothing."""
+        zeros = [row_of(slot.after) for slot in self._slots(problem)]
+        rubbish = [row_of(slot.after) for slot in self._slots(problem, rubbish=1e30)]
+        said = "{0!r} or {1!r}, by what stands in z where nothing was received"
+        remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
+        expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, said, remedy)
+
+    def first(self, problem: Problem) -> None:
+        """The packet of slot 0 is no innovation: there is no state before it."""
+        slot = next(iter(played(self._scheme_of, problem, self._kind)))
+        if slot.packet.nu.any():
+            trial = problem.batch.first_trial + int(np.argmax(slot.packet.nu))
+            raise Broken(f"slot 0, trial {trial}: nu is true; expected false, for there is no state before the first")
+
+    def actions(self, problem: Problem) -> None:
+        """Unless it reads packets, γ alone tells what the estimator does, and so what it believes."""
+        scheme = made(self._scheme_of, problem, self._kind)
+        if scheme.reads_packets:
+            return
+        with calling("estimator()", self._kind):
+            estimator = scheme.estimator(Keys.of(scheme.estimator_streams), problem.batch)
+        steps = [(one.before, one.heard, one.after) for one in self._slots(problem)]
+        expect_actions(estimator, steps, problem, self._kind, "set reads_packets = True if it depends on more than γ")
+
+    def prediction(self, problem: Problem) -> None:
+        """The estimator is never farther from the state, in the mean, than who hears nothing."""
+        for slot in self._slots(problem):
+            own = ((slot.x - slot.after.x_hat) ** 2).sum(axis=0)
+            gain = (slot.x**2).sum(axis=0) - own
+            error = float(gain.std()) / float(np.sqrt(len(gain)))
+            if gain.mean() < -SIGMAS * error - 1e-12:
+                raise Broken(
+                    f"slot {slot.k}: the mean squared error is {own.mean():.4g}, and {own.mean() + gain.mean():.4g} for who "
+                    "hears nothing; decode what encode() has made, with the same slot's numbers"
+                )
+
+    def theory(self, problem: Problem) -> None:
+        """What `outcomes` says is what happens, if it says anything."""
+        scheme = made(self._scheme_of, problem, self._kind)
+        outcomes_at = legitimate_outcomes(scheme)
+        if outcomes_at is None:
+            return
+        errors = [((slot.x - slot.after.x_hat) ** 2).sum(axis=0) for slot in self._slots(problem)]
+        expect_expected(problem, outcomes_at, errors)

@@ -1,0 +1,13 @@
+"""Strategies of control by their name in a scenario: one file each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulator.model.controllers.controller import Assignment, Controller
+from emulator.model.controllers.lqr import Lqr
+from emulator.model.controllers.mpc import Mpc
+
+CONTROLLERS: Mapping[str, type[Controller]] = {"lqr": Lqr, "mpc": Mpc}
+
+__all__ = ["CONTROLLERS", "Assignment", "Controller"]

@@ -1,0 +1,169 @@
+"""Model predictive control: at every decision the best inputs of a horizon of decisions, of which the first is applied.
+
+It minimises Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) + soft·‖s‖² over `horizon` decisions of a period each, the
+disturbances staying what they are now, within the limits of inputs and of their change; s is by how much states are beyond
+theirs, which no input may be able to prevent.
+
+Solved by OSQP, of the extra `microgrid`. A solver goes through LAPACK's kind of arithmetic, so its last bits, unlike those of
+everything else that enters a digest, may differ from processor to processor: a live run and the same in memory agree on
+one machine.
+Source: docs/microgrid.md, controllers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from emulator.model.controllers.controller import Assignment, Controller
+from emulator.model.controllers.lqr import held
+from emulator.model.process import Floats
+
+_UNBOUNDED = 1e30
+_SETTINGS: Mapping[str, Any] = MappingProxyType(
+    {
+        "verbose": False,
+        "warm_starting": True,
+        "polishing": False,
+        "eps_abs": 1e-4,
+        "eps_rel": 1e-4,
+        "max_iter": 4000,
+        # By iterations, not by the clock: the same decision twice from the same numbers.
+        "adaptive_rho": True,
+        "adaptive_rho_interval": 50,
+        "check_termination": 10,
+        "rho": 10.0,  # found by trial: the fewest iterations on the microgrid's day
+    }
+)
+
+
+class Mpc(Controller):
+    """A solver for every trial, each started from where it was at the decision before. Final.
+
+    Where a solver finds no solution the inputs before are held, and `failed` says so.
+    """
+
+    parameters = MappingProxyType({"horizon": 60, "soft": 1000.0})
+    optional: ClassVar[Mapping[str, Any]] = parameters
+
+    def __init__(self, assignment: Assignment, trials: int) -> None:
+        super().__init__(assignment, trials)
+        import osqp  # noqa: PLC0415 - of an extra, and a tenth of a second that nobody else should wait for
+
+        self._programme = programme = _Programme(assignment)
+        self._solvers = []
+        for _ in range(trials):
+            solver = osqp.OSQP()
+            solver.setup(
+                programme.weights, programme.linear, programme.rows, programme.lower, programme.upper, **_SETTINGS
+            )
+            self._solvers.append(solver)
+        self._solved = int(osqp.SolverStatus.OSQP_SOLVED)
+        self._u = np.zeros((assignment.plant.inputs, trials))
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A horizon that is no number of decisions, a weight that is none."""
+        found = []
+        horizon, soft = given.get("horizon", 1), given.get("soft", 1.0)
+        if type(horizon) is not int or not 1 <= horizon <= 1000:
+            found.append(("horizon", f"is {horizon!r}; expected a whole number from 1 to 1000, such as horizon = 60"))
+        if type(soft) not in (int, float) or not 0.0 < soft < 1e12:
+            found.append(("soft", f"is {soft!r}; expected a number above 0, such as soft = 1000.0"))
+        return found
+
+    @classmethod
+    def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
+        """Without the solver there is no such controller, and without weights no best inputs."""
+        if find_spec("osqp") is None:
+            return [
+                ("strategy", "is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first")
+            ]
+        if not np.all(assignment.input_weights + assignment.rate_weights > 0.0):
+            return [
+                ("input_weights", "leave an input without weight; expected input_weights, or rate_weights, above 0")
+            ]
+        return []
+
+    def decide(self, k: int, x_hat: Floats, d: Floats) -> Floats:  # noqa: ARG002 - every decision alike
+        """The first of the best inputs of the horizon, for each trial by its own solver."""
+        programme = self._programme
+        decided = self._u.copy()
+        for r, solver in enumerate(self._solvers):
+            linear, lower, upper = programme.at(x_hat[:, r], d if d.ndim == 1 else d[:, r], self._u[:, r])
+            solver.update(q=linear, l=lower, u=upper)
+            found = solver.solve(raise_error=False)
+            self.failed[r] = found.info.status_val != self._solved
+            if not self.failed[r]:
+                decided[:, r] = programme.first(found.x, self._u[:, r])
+        self._u = decided
+        return decided
+
+
+class _Programme:
+    """The quadratic programme: variables are the states x_1 … x_N, the inputs u_0 … u_{N−1}, and the excesses s_1 … s_N.
+
+    Rows: the plant, the states' limits, the inputs' limits, the limits of their change.
+    """
+
+    def __init__(self, assignment: Assignment) -> None:
+        sparse: Any = import_module("scipy.sparse")  # late: where there is no such controller nobody waits for it
+
+        plant, N = assignment.plant, int(assignment.parameters["horizon"])
+        A, B = held(assignment)
+        n, m = B.shape
+        self._A, self._n, self._m, self._N = A, n, m, N
+        self._disturbed = held(assignment, plant.disturbance_matrix)[1]
+        self._rate = assignment.rate_limits
+        self._rate_weights = assignment.rate_weights
+        self._input_lower, self._input_upper = plant.input_lower, plant.input_upper
+        states, inputs = n * N, m * N
+        one, before = sparse.eye(N), sparse.eye(N, k=-1)
+        change = one - before
+        weight_u = sparse.kron(one, sparse.diags(assignment.input_weights))
+        weight_r = sparse.kron(change.T @ change, sparse.diags(assignment.rate_weights))
+        weights = sparse.block_diag(
+            [
+                sparse.kron(one, sparse.diags(assignment.state_weights)),
+                weight_u + weight_r,
+                float(assignment.parameters["soft"]) * sparse.eye(states),
+            ]
+        )
+        self.weights = sparse.triu(2.0 * weights, format="csc")
+        self.linear = np.zeros(2 * states + inputs)
+        no = sparse.csc_matrix
+        dynamics = [sparse.eye(states) - sparse.kron(before, A), -sparse.kron(one, B), no((states, states))]
+        limits = [sparse.eye(states), no((states, inputs)), sparse.eye(states)]
+        own = [no((inputs, states)), sparse.eye(inputs), no((inputs, states))]
+        changes = [no((inputs, states)), sparse.kron(change, sparse.eye(m)), no((inputs, states))]
+        self.rows = sparse.bmat([dynamics, limits, own, changes], format="csc")
+        nothing = np.zeros(states)
+        self.lower = np.concatenate(
+            [nothing, np.tile(plant.state_lower, N), np.tile(plant.input_lower, N), np.tile(-self._rate, N)]
+        ).clip(-_UNBOUNDED, _UNBOUNDED)
+        self.upper = np.concatenate(
+            [nothing, np.tile(plant.state_upper, N), np.tile(plant.input_upper, N), np.tile(self._rate, N)]
+        ).clip(-_UNBOUNDED, _UNBOUNDED)
+
+    def at(self, x: Floats, d: Floats, before: Floats) -> tuple[Floats, Floats, Floats]:
+        """Linear term and limits of the rows for a state x (n,), disturbances d (q,) and the inputs before (m,)."""
+        n, m, N = self._n, self._m, self._N
+        moved = np.tile(self._disturbed @ d, N)
+        moved[:n] += self._A @ x
+        self.lower[: n * N] = self.upper[: n * N] = moved
+        first = slice(2 * n * N + m * N, 2 * n * N + m * N + m)
+        self.lower[first] = np.clip(before - self._rate, -_UNBOUNDED, _UNBOUNDED)
+        self.upper[first] = np.clip(before + self._rate, -_UNBOUNDED, _UNBOUNDED)
+        self.linear[n * N : n * N + m] = -2.0 * self._rate_weights * before
+        return self.linear, self.lower, self.upper
+
+    def first(self, solution: Floats, before: Floats) -> Floats:
+        """The first inputs of a solution, (m,): within their limits exactly, which a solver keeps to its tolerance only."""
+        u = solution[self._n * self._N : self._n * self._N + self._m]
+        u = np.clip(u, before - self._rate, before + self._rate)
+        return np.clip(u, self._input_lower, self._input_upper)

@@ -1,0 +1,227 @@
+"""The tracker: follows both tracks of `twin-track`, and goes half-way between them as long as it cannot know which is real.
+
+A packet fixes one track and says nothing of the coin. So after it there are two uncertainties: the noise since then, which
+is common to all histories, and where the other track is, o = other − last, which no noise moves. The next packet is on
+the track of the last one, or on the other; then o changes its sign, and is known as well as that noise allows.
+
+Source: docs/mathematics.md, twin track.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from emulator.model.elementary import cholesky, exp, log
+from emulator.model.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from emulator.model.mixture import Mixture, merge, pruned, summed, with_a_place
+from emulator.model.process import Floats
+from emulator.model.receiver import Action, Belief, Flags, Heard
+from emulator.model.twins import Twins
+from emulator.streams import Batch
+
+CAPACITY = 8
+"""Histories that a trial may have of either kind; beyond it the two least probable ones become one."""
+
+
+class Tracks(NamedTuple):
+    """What it knows of R trials' tracks. Of 2R columns the first R have the last track as x, the others its twin."""
+
+    weight: Floats
+    """Of each history, (C, 2R); a trial's sum to 1, or are 0 as long as it has heard no packet."""
+    mean: Floats
+    """Of o, other − last track, (n, C, 2R)."""
+    lower: Floats
+    """Of its covariances' factors, (n (n−1)/2, C, 2R)."""
+    diagonal: Floats
+    """(n, C, 2R)."""
+    last: Floats
+    """The last packet, carried to this slot, (n, R); before the first 0, the mean of x."""
+    noise_lower: Floats
+    """Of the factors of the noise since the last packet, (n (n−1)/2, R); before the first, of the covariance of x."""
+    noise_diagonal: Floats
+    """(n, R)."""
+
+    @property
+    def histories(self) -> Mixture:
+        """All that a packet tells apart."""
+        return Mixture(*self[:4])
+
+    @property
+    def noise(self) -> Factors:
+        """Common to all histories."""
+        return Factors(self.noise_lower, self.noise_diagonal)
+
+
+class Tracker(PacketReader):
+    """Minimum mean square error, but for what is lost where too many histories must be told apart; it is given nothing.
+
+    Meant for the scheme `twin-track` alone. Told a true state, it knows which track is real, and keeps to it as far as
+    the two are further apart than the noise between two packets. `Belief.memory` is its `Tracks`, 2R columns as (2, R).
+    """
+
+    def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
+        super().__init__(knowledge, batch)
+        self._capacity = capacity
+        self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
+        self._any_noise = Factors.alike(self._noise, (self.trials,))
+        self._initial = Factor.of_triangular(cholesky(knowledge.process.initial_covariance).tolist())
+        self._twins = Twins(knowledge.process)
+
+    def prior(self, first: int = 0) -> Belief:
+        """Nothing was received."""
+        belief, n = super().prior(first), self.process.n
+        sigma = Factors.alike(self._initial, (self.trials,))
+        for _ in range(first - 1):
+            (sigma,) = grown(self.process.A, sigma, self._noise)
+        none = Mixture(*(np.zeros((*rows, 0, 2 * self.trials)) for rows in ((), (n,), (n * (n - 1) // 2,), (n,))))
+        return belief._replace(memory=_stored(Tracks(*none, belief.x_hat, *sigma)))
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """Carry both tracks on, and weigh on which of them the packet is: the mean and covariance of all histories."""
+        tracks = _read(belief.memory)
+        if k:
+            tracks = self._carried(tracks)
+        if heard.gamma.any():
+            tracks = self._heard(k, tracks, heard.gamma, heard.z)
+        total = summed(tracks.weight)
+        # Until a state is betrayed every history is there twice, to the bit, with the last track as x and as its twin.
+        told_apart = total[: self.trials] != total[self.trials :]
+        read = np.where(told_apart, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
+        action = np.where(heard.gamma, read, np.uint8(Action.LOST))
+        return Belief(*_moments(tracks, total), action, _stored(tracks))
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """As of a packet that is known to be on the track of x, which makes that track the real one."""
+        tracks, R = _read(belief.memory), self.trials
+        # Beside a packet of this very slot there is nothing to weigh: it is x, or it is not and shows where the twin is.
+        beside: Flags = ~np.any(tracks.noise_diagonal > 0.0, axis=0)
+        distance = np.where(beside, tracks.last - x, 0.0)
+        tracks = self._heard(k, tracks, ~beside, x)
+        histories = self._afresh(tracks.histories, (distance != 0.0).any(axis=0), distance, _nothing(self.process.n))
+        histories.weight[:, R:] = 0.0
+        after = self._few(histories, np.ones(R, np.bool_))
+        return super().knowing(k, x, belief)._replace(memory=_stored(Tracks(*after, x, *tracks.noise)))
+
+    def _carried(self, of: Tracks) -> Tracks:
+        """A slot later."""
+        A = self.process.A
+        mean = self.process.predict(of.mean.reshape(len(A), -1)).reshape(of.mean.shape)
+        (spread,) = grown(A, of.histories.spread, _nothing(len(A)))
+        (noise,) = grown(A, of.noise, self._noise)
+        return Tracks(of.weight, mean, *spread, self.process.predict(of.last), *noise)
+
+    def _heard(self, k: int, of: Tracks, gamma: Flags, z: Floats) -> Tracks:
+        """With z (n, R) on one of the tracks where gamma (R,): that becomes the last one."""
+        z = np.where(gamma, z, of.last)
+        heard_of: Flags = np.any(of.weight > 0.0, axis=0)
+        begun = gamma & ~(heard_of[: self.trials] | heard_of[self.trials :])
+        # Where nothing was received the noise may be 0, and is not asked for.
+        noise = Factors(*(np.where(gamma, *pair) for pair in zip(of.noise, self._any_noise, strict=True)))
+        histories = _split(of.histories, gamma, z - of.last, noise) if len(of.weight) else of.histories
+        if begun.any():
+            apart = self._twins.at(k)
+            histories = self._afresh(histories, begun, apart.mean(np.where(begun, z, 0.0)), apart.factor)
+        return Tracks(*self._few(histories, gamma), z, *(np.where(gamma, 0.0, part) for part in of.noise))
+
+    def _afresh(self, of: Mixture, where: Flags, mean: Floats, spread: Factor) -> Mixture:
+        """One history of either kind in some trials (R,): o has this mean (n, R) and covariance."""
+        if not len(of.weight):
+            of = Mixture(*(with_a_place(part, part.ndim - 2) for part in of))
+        first = np.arange(len(of.weight))[:, None] == 0
+        one = Mixture(
+            np.where(first, 0.5, np.zeros((1, 2 * self.trials))),
+            _twice(mean)[:, None, :],
+            *Factors.alike(spread, (1, 2 * self.trials)),
+        )
+        return Mixture(*(np.where(_twice(where), *pair) for pair in zip(one, of, strict=True)))
+
+    def _few(self, of: Mixture, changed: Flags) -> Mixture:
+        """Weights that sum to 1 where they have changed (R,), no more histories than there is room for, and no gaps."""
+        total = summed(of.weight)
+        total = _twice(np.where(changed, total[: self.trials] + total[self.trials :], 1.0))
+        of = pruned(of._replace(weight=of.weight / total))
+        while (full := np.flatnonzero((of.weight > 0.0).sum(axis=0) > self._capacity)).size:
+            merge(of, full)
+        order = np.argsort(of.weight == 0.0, axis=0, kind="stable")
+        count = int((of.weight > 0.0).sum(axis=0).max(initial=0))
+        return Mixture(*(np.take_along_axis(part, _upon(order, part), axis=-2)[..., :count, :] for part in of))
+
+
+def _split(of: Mixture, gamma: Flags, distance: Floats, noise: Factors) -> Mixture:
+    """Every history twice where gamma (R,): the new place is on the last track, or on the other one, which is the last then.
+
+    distance: of the new place from the last track, (n, R); noise: covariance of the last track, positive definite.
+    """
+    n, R = distance.shape
+    gamma, distance, noise = _twice(gamma), _twice(distance), Factors(*(_twice(part) for part in noise))
+    # Given the place, o by one triangularisation, as of the leak: of (o + noise, o).
+    U, V = of.spread.unit(), noise.unit()
+    rows = [[*u, *v] for u, v in zip(U, V, strict=True)] + [[*u, *[0.0] * n] for u in U]
+    joint = orthogonalised(rows, [*of.diagonal, *noise.diagonal])
+    unit, white = joint.unit(), np.empty_like(of.mean)
+    evidence = squared_length(noise, list(distance)) + np.zeros_like(of.weight)
+    for i in range(n):
+        rest = distance[i] - of.mean[i]
+        for j in range(i):
+            rest = rest - unit[i][j] * white[j]
+        white[i] = rest
+        evidence = evidence - rest * rest / joint.diagonal[i] - log(joint.diagonal[i] / noise.diagonal[i])
+    evidence = np.where(gamma & (of.weight > 0.0), 0.5 * evidence, 0.0)
+    most = evidence.max(axis=0)
+    most = _twice(np.maximum(np.maximum(most[:R], most[R:]), 0.0))
+    mean = np.empty_like(of.mean)
+    for i in range(n):
+        moved = of.mean[i]
+        for j in range(n):
+            moved = moved + unit[n + i][j] * white[j]
+        mean[i] = -moved
+    starts = [(n + i) * (n + i - 1) // 2 + n for i in range(n)]
+    below = [joint.lower[start : start + i] for i, start in enumerate(starts)]
+    other = Mixture(
+        np.where(gamma, of.weight * exp(evidence - most), 0.0), mean, np.concatenate(below), joint.diagonal[n:]
+    )
+    same = of._replace(weight=of.weight * exp(-most))
+    # What was the last track's history is the other one's now.
+    return Mixture(*(np.concatenate([a, np.roll(b, R, axis=-1)], axis=-2) for a, b in zip(same, other, strict=True)))
+
+
+def _moments(of: Tracks, total: Floats) -> tuple[Floats, Floats]:
+    """Mean and covariance of x in every trial, (n, R) and (n, n, R); total: of the weights, (2R,)."""
+    n, R = of.last.shape
+    weight, mean, lower, diagonal = (part[..., R:] for part in of.histories)
+    middle = np.array([summed(weight * row) for row in mean])
+    away, within, P = mean - middle[:, None, :], covariance(Factors(lower, diagonal)), covariance(of.noise)
+    for i in range(n):
+        for j in range(i + 1):
+            spread = summed(weight * (within[i, j] + away[i] * away[j])) + total[:R] * (middle[i] * middle[j])
+            P[i, j] = P[j, i] = P[i, j] + spread
+    return of.last + middle, P
+
+
+def _nothing(n: int) -> Factor:
+    """The covariance 0."""
+    return Factor([[1.0 if j == i else 0.0 for j in range(n)] for i in range(n)], [0.0] * n)
+
+
+def _twice(part: NDArray[Any]) -> NDArray[Any]:
+    """(…, R) → (…, 2R)."""
+    return np.concatenate([part, part], axis=-1)
+
+
+def _upon(order: NDArray[np.intp], part: Floats) -> NDArray[np.intp]:
+    """An order of histories (C, 2R) for a part of theirs, (C, 2R) or (…, C, 2R)."""
+    return np.broadcast_to(order, part.shape)
+
+
+def _stored(tracks: Tracks) -> tuple[Floats, ...]:
+    """With the trials as last axis."""
+    return (*(part.reshape(*part.shape[:-1], 2, part.shape[-1] // 2) for part in tracks.histories), *tracks[4:])
+
+
+def _read(memory: tuple[NDArray[Any], ...]) -> Tracks:
+    """The same as columns."""
+    return Tracks(*(part.reshape(*part.shape[:-2], 2 * part.shape[-1]) for part in memory[:4]), *memory[4:])

@@ -1,0 +1,85 @@
+"""What a house buys and sells over a run, and by how much two runs of it differ: the price of a link, and of secrecy.
+
+Powers are in kW, positive where the house takes from the grid, slot by slot along the first axis; trials may follow.
+Source: docs/microgrid.md, energy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from emulator.model.process import Floats
+
+_HOUR = 3600.0
+
+
+@dataclass(frozen=True)
+class Difference:
+    """By how much a run's grid power differs from another's, as shares of the other's, per trial (…)."""
+
+    net: Floats
+    """Of the net energy: |Σ P − Σ P′| / |Σ P′|."""
+    total: Floats
+    """Of the energy that crosses the meter, either way: |Σ |P| − Σ |P′|| / Σ |P′|."""
+    summed: Floats
+    """Slot by slot: Σ |P − P′| / Σ |P′|. Never below the two others, as shares of the same Σ |P′|."""
+
+
+@dataclass(frozen=True)
+class Meter:
+    """Sums over slots of a run's grid power P, and of another's P′ beside it, (…) each, in kW. Final."""
+
+    bought: Floats
+    sold: Floats
+    other_bought: Floats
+    other_sold: Floats
+    apart: Floats
+    """Σ |P − P′|."""
+
+    @classmethod
+    def over(cls, grid_power: Floats, other: Floats) -> Meter:
+        """Of some slots; both (slots, …)."""
+        return cls(
+            np.maximum(grid_power, 0.0).sum(axis=0),
+            np.maximum(-grid_power, 0.0).sum(axis=0),
+            np.maximum(other, 0.0).sum(axis=0),
+            np.maximum(-other, 0.0).sum(axis=0),
+            np.abs(grid_power - other).sum(axis=0),
+        )
+
+    @classmethod
+    def zero(cls, trials: int) -> Meter:
+        """Of no slots."""
+        return cls(*(np.zeros(trials) for _ in range(5)))
+
+    def with_more(self, more: Meter) -> Meter:
+        """Of these slots and others."""
+        return Meter(*(mine + theirs for mine, theirs in zip(self._sums, more._sums, strict=True)))
+
+    @classmethod
+    def of_all(cls, parts: list[Meter]) -> Meter:
+        """Of the trials of several, in order."""
+        return cls(*(np.concatenate(sums) for sums in zip(*(part._sums for part in parts), strict=True)))
+
+    @property
+    def _sums(self) -> tuple[Floats, ...]:
+        return self.bought, self.sold, self.other_bought, self.other_sold, self.apart
+
+    @property
+    def difference(self) -> Difference:
+        """The three measures. Where the other's sum is 0 a share of it is infinite, or NaN if both are 0."""
+        net, other_net = self.bought - self.sold, self.other_bought - self.other_sold
+        total, other_total = self.bought + self.sold, self.other_bought + self.other_sold
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return Difference(
+                np.abs(net - other_net) / np.abs(other_net),
+                np.abs(total - other_total) / other_total,
+                self.apart / other_total,
+            )
+
+
+def energy(summed_power: Floats, slot_seconds: float) -> Floats:
+    """Energy in kWh of a sum over slots of a power in kW."""
+    return summed_power * (slot_seconds / _HOUR)

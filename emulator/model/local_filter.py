@@ -1,0 +1,114 @@
+"""The filter at the sensor: of noisy measurements y = C x + v it makes the estimate x̂ˢ that is transmitted in place of x.
+
+It knows the plant, its inputs and its disturbances, so its innovations are white, of covariance S_k, and what is transmitted
+follows x̂ˢ_{k+1} = A x̂ˢ_k + B u_k + B_d d_k + K_{k+1} ν_{k+1}: to the network, process noise of covariance K S Kᵀ.
+
+Source: docs/mathematics.md, a filter at the sensor.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from emulator.model.elementary import inverse, semidefinite_factor
+from emulator.model.plant import Plant
+from emulator.model.process import Floats, Process, product
+from emulator.streams import Batch, BlockReader
+
+_SETTLED = 1e-14
+_LONGEST = 200_000  # slots after which a filter counts as never settled
+
+
+class Step(NamedTuple):
+    """The filter in one slot."""
+
+    gain: Floats
+    """K, (n, p)."""
+    covariance: Floats
+    """Of x − x̂ˢ, (n, n)."""
+    innovation: Floats
+    """K S Kᵀ, (n, n): of what the measurement adds to x̂ˢ."""
+
+
+class Steps:
+    """The filter slot by slot from 0 on, until it has settled. Final; arithmetic that is the same everywhere."""
+
+    def __init__(self, process: Process, plant: Plant) -> None:
+        if plant.output_matrix is None or plant.measurement_noise is None:
+            raise ValueError("the plant's states are not measured")
+        self._A, self._W = process.A, plant.noise
+        self._C, self._V = plant.output_matrix, plant.measurement_noise
+        self._predicted = process.initial_covariance
+        self._last: Step | None = None
+        self.settled = False
+
+    def next(self) -> Step:
+        """The next slot's. Raises ValueError where measurements have no noise and tell nothing new."""
+        if self.settled and self._last is not None:
+            return self._last
+        C, P = self._C, self._predicted
+        PCt = product(P, _transposed(C))
+        S = product(C, PCt) + self._V
+        K = product(PCt, inverse(S))
+        rest = np.eye(len(P)) - product(K, C)
+        # Joseph's form stays a covariance however small it gets.
+        after = product(product(rest, P), _transposed(rest)) + product(product(K, self._V), _transposed(K))
+        after = 0.5 * (after + after.T)
+        predicted = product(product(self._A, after), _transposed(self._A)) + self._W
+        innovation = product(product(K, S), _transposed(K))
+        step = Step(K, after, 0.5 * (innovation + innovation.T))
+        self.settled = bool(np.abs(predicted - P).max() <= _SETTLED * np.abs(predicted).max())
+        self._predicted, self._last = predicted, step
+        return step
+
+
+def settled(process: Process, plant: Plant) -> Step:
+    """The filter in the end. Raises ValueError if it never settles, or is of no use: it trusts no measurement any more."""
+    steps = Steps(process, plant)
+    for _ in range(_LONGEST):
+        step = steps.next()
+        if not np.isfinite(step.covariance).all():
+            break
+        if steps.settled:
+            if not step.innovation.any():
+                break
+            return step
+    raise ValueError("the filter does not settle")
+
+
+class LocalFilter:
+    """The estimates of a batch, slot by slot. Final.
+
+    key: of the stream `measurement`.
+    """
+
+    def __init__(self, process: Process, plant: Plant, key: bytes, batch: Batch) -> None:
+        self._process = process
+        self._steps = Steps(process, plant)
+        if plant.output_matrix is None or plant.measurement_noise is None:
+            raise ValueError("the plant's states are not measured")
+        self._C, self._factor = plant.output_matrix, semidefinite_factor(plant.measurement_noise)
+        self._reader = BlockReader(key, batch, len(self._C))
+        self._slots = range(0)
+        self._noise: Floats
+        self.x: Floats = np.zeros((process.n, batch.trials))
+        """x̂ˢ of the last slot, (n, R)."""
+        self.predicted: Floats = self.x
+        """A x̂ˢ of the slot before, (n, R): what the innovation that is transmitted is measured against."""
+
+    def take(self, k: int, x: Floats, pushed: Floats) -> Floats:
+        """x̂ˢ of slot k, (n, R), from its state x (n, R) and what has pushed it there, (n, R) or (n, 1)."""
+        if k not in self._slots:
+            self._slots = self._reader.block(k)
+            self._noise = product(self._factor, self._reader.normals(self._slots))
+        self.predicted = self._process.predict(self.x) if k else self.x
+        before = self.predicted + pushed
+        y = product(self._C, x) + self._noise[k - self._slots.start]
+        self.x = before + product(self._steps.next().gain, y - product(self._C, before))
+        return self.x
+
+
+def _transposed(M: Floats) -> Floats:
+    return np.ascontiguousarray(M.T)

@@ -1,0 +1,122 @@
+"""The plant behind a process: x_{k+1} = A x_k + B u_k + B_d d_k + w_k, moved by inputs and disturbances.
+
+States here are deviations from the public reference, as they are transmitted. The process's Q is what network, estimators
+and eavesdroppers believe of everything that moves the state; the plant's own noise w has a covariance of its own.
+
+Source: docs/mathematics.md, closed loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from emulator.model.process import Floats, product
+from emulator.model.receiver import Flags
+
+
+@dataclass(frozen=True)
+class Plant:
+    """All of a plant but its A, which is the process's, and its disturbances; n states, m inputs, q disturbances."""
+
+    input_matrix: Floats
+    """B, (n, m)."""
+    disturbance_matrix: Floats
+    """B_d, (n, q)."""
+    noise: Floats
+    """Covariance of w, (n, n); it may be singular, or 0."""
+    start: Floats
+    """Mean of x_0, (n,)."""
+    input_lower: Floats
+    """(m,); −inf where there is no limit, and so below."""
+    input_upper: Floats
+    state_lower: Floats
+    """(n,)."""
+    state_upper: Floats
+    output_matrix: Floats | None = None
+    """C, (p, n), of a sensor that measures y = C x + v and filters; None of one that knows x."""
+    measurement_noise: Floats | None = None
+    """Covariance of v, (p, p)."""
+
+    @property
+    def inputs(self) -> int:
+        """How many inputs there are."""
+        return int(self.input_matrix.shape[1])
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """As plain numbers, None for a limit that is none."""
+        limits = {
+            name: [value if np.isfinite(value) else None for value in getattr(self, name).tolist()]
+            for name in ("input_lower", "input_upper", "state_lower", "state_upper")
+        }
+        matrices = ("input_matrix", "disturbance_matrix", "noise", "start")
+        measured = ("output_matrix", "measurement_noise") if self.output_matrix is not None else ()
+        return {**{name: getattr(self, name).tolist() for name in (*matrices, *measured)}, **limits}
+
+    @classmethod
+    def of(cls, spec: Mapping[str, Any]) -> Plant:
+        """From its `spec`."""
+        n = len(spec["start"])
+        limits = {
+            name: np.array([without if value is None else value for value in spec[name]], np.float64)
+            for name, without in (
+                ("input_lower", -np.inf), ("input_upper", np.inf), ("state_lower", -np.inf), ("state_upper", np.inf)
+            )
+        }  # fmt: skip
+        matrices = {
+            name: np.array(spec[name], np.float64).reshape(n, -1) for name in ("input_matrix", "disturbance_matrix")
+        }
+        measured = {name: np.array(spec[name]) for name in ("output_matrix", "measurement_noise") if name in spec}
+        return cls(**matrices, noise=np.array(spec["noise"]), start=np.array(spec["start"]), **limits, **measured)
+
+    def limited(self, u: Floats) -> Floats:
+        """What the plant makes of inputs u (m, R): within its limits."""
+        return np.minimum(np.maximum(u, self._lower), self._upper)
+
+    def clips(self, u: Floats) -> Flags:
+        """Whether some input of u (…, m, R) is beyond its limits, (…, R)."""
+        return np.asarray(((u < self._lower) | (u > self._upper)).any(axis=-2))
+
+    def moved(self, u: Floats) -> Floats:
+        """B u, (n, R), of inputs u (m, R) within their limits."""
+        return product(self.input_matrix, self.limited(u))
+
+    @cached_property
+    def _lower(self) -> Floats:
+        return self.input_lower[:, None]
+
+    @cached_property
+    def _upper(self) -> Floats:
+        return self.input_upper[:, None]
+
+
+class Drive:
+    """What moves the state of a plant from slot to slot besides A and w. Final.
+
+    disturbances: d (slots, q).
+    """
+
+    def __init__(self, plant: Plant, disturbances: Floats) -> None:
+        self._plant = plant
+        drift = np.zeros((len(disturbances), len(plant.start)))
+        for j in range(disturbances.shape[1]):
+            drift += disturbances[:, j, None] * plant.disturbance_matrix[:, j]
+        self._drift = drift
+        self._start = plant.start[:, None]
+        self._u: Floats | None = None
+
+    def hold(self, u: Floats) -> None:
+        """Have the inputs u (m, R) from now on, until others come."""
+        self._u = self._plant.moved(u)
+
+    def pushed(self, k: int) -> Floats:
+        """What moves the state into slot k, (n, R) or (n, 1): B u_{k−1} + B_d d_{k−1}; the start, where k = 0."""
+        if k == 0:
+            return self._start
+        drift: Floats = self._drift[k - 1, :, None]
+        return drift if self._u is None else self._u + drift

@@ -1,0 +1,186 @@
+"""Classes by their name in a scenario: built in, of an installed package, or anybody's own, named PACKAGE.MODULE:CLASS.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import re
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+_OWN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+_NOT_IN_CHILDREN = "__main__"
+
+
+class NotRegistered(KeyError):
+    """A name that stands for no class. `why` goes on after `is "NAME"`; empty if it is no name of anybody's own."""
+
+    def __init__(self, name: str, why: str = "") -> None:
+        super().__init__(name)
+        self.name = name
+        self.why = why
+
+    def __str__(self) -> str:
+        return f"{self.name}{self.why or ' is no name of a class; look at docs/your-own.md'}"
+
+
+def is_own(name: object) -> bool:
+    """Whether this names a module and a class in it, rather than something by a name of its own."""
+    return isinstance(name, str) and ":" in name
+
+
+def place_of(error: BaseException, file: str | None = None) -> str:
+    """An error in somebody's module in some words: what, and the last line of that file, or of any, that led to it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if frame.filename == file] or [
+        frame for frame in frames if "importlib" not in frame.filename and frame.filename != __file__
+    ]
+    if isinstance(error, SyntaxError) and error.filename:
+        where = f", {Path(error.filename).name} line {error.lineno}"
+        return f"{type(error).__name__}: {error.msg}{where}"
+    where = f", {Path(own[-1].filename).name} line {own[-1].lineno}" if own else ""
+    return f"{type(error).__name__}: {error}{where}" if str(error) else f"{type(error).__name__}{where}"
+
+
+def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a class says is wrong with parameters that it has, (entry, what), be the class anybody's."""
+    entry = next(iter(given), "parameters")
+    wanted = "expected it to return a list of (entry, what is wrong)"
+    try:
+        found = model.mistakes(given)
+    except Exception as error:
+        file = getattr(sys.modules.get(model.__module__), "__file__", None)
+        return [(entry, f"cannot be checked: {model.__name__}.mistakes raised {place_of(error, file)}; {wanted}")]
+    if not isinstance(found, list) or not all(isinstance(one, tuple) and len(one) == 2 for one in found):
+        return [(entry, f"cannot be checked: {model.__name__}.mistakes returned {found!r}; {wanted}")]
+    return [(str(name), str(what)) for name, what in found]
+
+
+class Registry(Mapping[str, type[T]], Generic[T]):
+    """Name → class, of one kind. Final. To be gone through are the built-in ones alone; any other can be asked for.
+
+    kind: as a message calls it; base: what every class inherits from; group: of the entry points of installed packages;
+    reserved: entries that a scenario's table has beside the class's parameters.
+
+    `[name]` raises NotRegistered, which is a KeyError.
+    """
+
+    def __init__(
+        self, kind: str, base: type[T], group: str, built_in: Mapping[str, type[T]], reserved: tuple[str, ...] = ()
+    ) -> None:
+        self.kind, self.base, self.group = kind, base, group
+        self._built_in = built_in
+        self._reserved = reserved
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._built_in)
+
+    def __len__(self) -> int:
+        return len(self._built_in)
+
+    def __getitem__(self, name: str) -> type[T]:
+        if name in self._built_in:
+            return self._built_in[name]
+        return self._checked(name, *self._found(name))
+
+    def foreign(self, name: str) -> bool:
+        """Whether a class of this name is not built in, be there one or not."""
+        return name not in self._built_in
+
+    @property
+    def names(self) -> list[str]:
+        """All that can be given short: built in, and of installed packages."""
+        return sorted({*self._built_in, *_entry_points(self.group, tuple(sys.path))})
+
+    def _found(self, name: str) -> tuple[Any, str]:
+        """What a name stands for, and how messages begin."""
+        if is_own(name):
+            return _imported(name, name, "")
+        targets = _entry_points(self.group, tuple(sys.path)).get(name, ())
+        if not targets:
+            raise NotRegistered(name)
+        if len(targets) > 1:
+            both = " and ".join(targets)
+            raise NotRegistered(name, f", which two installed packages call so; expected one of {both} itself")
+        said = f", which an installed package says is {targets[0]}"
+        return _imported(name, targets[0], said)
+
+    def _checked(self, name: str, found: Any, said: str) -> type[T]:
+        wanted = f"a class that inherits from {self.base.__module__}.{self.base.__name__}"
+        if not isinstance(found, type) or not issubclass(found, self.base):
+            raise NotRegistered(name, f"{said}, which is no {self.base.__name__}; expected {wanted}")
+        lacking = sorted(getattr(found, "__abstractmethods__", ()))
+        if lacking:
+            raise NotRegistered(
+                name,
+                f"{said}, which lacks {', '.join(lacking)}; expected a class with "
+                f"{'these methods' if len(lacking) > 1 else 'this method'}, as {self.base.__name__} describes them",
+            )
+        parameters = getattr(found, "parameters", None)
+        if not isinstance(parameters, Mapping) or not all(isinstance(one, str) for one in parameters):
+            raise NotRegistered(
+                name,
+                f"{said}, whose parameters are no table; expected the entries it takes, each with an example, "
+                'such as parameters = {"threshold": 3}',
+            )
+        taken = sorted(set(parameters) & set(self._reserved))
+        if taken:
+            raise NotRegistered(
+                name, f"{said}, one of whose parameters is called {taken[0]}, as an entry of every {self.kind} is"
+            )
+        return found
+
+
+def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
+    if not _OWN.fullmatch(target):
+        raise NotRegistered(name, f"{said}; expected PACKAGE.MODULE:CLASS, such as mine:Masked")
+    module_name, _, class_name = target.partition(":")
+    if module_name == _NOT_IN_CHILDREN:
+        raise NotRegistered(
+            name, f"{said}, which other processes cannot import; expected a class in a module, a file of its own"
+        )
+    try:
+        module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:
+        missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(str(error.name))
+        wanted = (
+            "a module beside the scenario (or in its `modules`), or an installed one"
+            if missing
+            else "one that can be imported"
+        )
+        what = str(error) if missing else place_of(error)
+        raise NotRegistered(
+            name, f"{said}, and the module {module_name} cannot be imported ({what}); expected {wanted}"
+        ) from error
+    found = getattr(module, class_name, None)
+    if found is None:
+        there = [
+            one for one, value in vars(module).items() if isinstance(value, type) and value.__module__ == module_name
+        ]
+        near = difflib.get_close_matches(class_name, there, 1)
+        choice = f"did you mean {module_name}:{near[0]}?" if near else f"expected one of {', '.join(there) or 'none'}"
+        file = getattr(module, "__file__", None)
+        where = f" ({file})" if file else ""
+        raise NotRegistered(name, f"{said}, and the module {module_name}{where} has no {class_name}; {choice}")
+    return found, said
+
+
+@lru_cache(maxsize=32)
+def _entry_points(group: str, path: tuple[str, ...]) -> Mapping[str, tuple[str, ...]]:
+    """Name → what the entry points of this name stand for; path: `sys.path`, by which a later one is asked again."""
+    del path
+    from importlib import metadata  # noqa: PLC0415 - who needs none starts sooner
+
+    found: dict[str, set[str]] = {}
+    for point in metadata.entry_points(group=group):
+        found.setdefault(point.name, set()).add(point.value)
+    return {name: tuple(sorted(values)) for name, values in found.items()}

@@ -1,0 +1,35 @@
+"""What router and relay both do: know the passwords of those whom they let in, and leave after them."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+_FAREWELL_SECONDS = 10.0
+
+
+@contextmanager
+def users_file(users: Mapping[str, str]) -> Iterator[Path]:
+    """The dictionary of users and passwords that Zenoh reads once, when the session opens; then it must not stay."""
+    handle, name = tempfile.mkstemp(prefix="evedrop-users-")
+    path = Path(name)
+    try:
+        with os.fdopen(handle, "w") as file:
+            file.writelines(f"{user}:{password}\n" for user, password in users.items())
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def until_all_left(present: Mapping[str, bool], linked: Callable[[], bool] = lambda: False) -> None:
+    """Wait until nobody is present any more and no other router is linked, or some seconds at most.
+
+    Two routers that close their link at the same time trip over each other in Zenoh 1.10, so one must leave first.
+    """
+    deadline = time.monotonic() + _FAREWELL_SECONDS
+    while (any(present.values()) or linked()) and time.monotonic() < deadline:
+        time.sleep(0.005)

@@ -1,0 +1,118 @@
+"""The results folders of a run's shards made one: what the run would have left without shards.
+
+Trials are put side by side and counts added up. Means over all trials are made of the shards' means, so they agree with an
+unsharded run's within rounding; digests, fates, recorded trials and all that is kept by trial are the same to the bit.
+
+Source: docs/results.md, shards.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from emulator.errors import UsageError
+from emulator.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
+from emulator.runs.gathered_tables import Journals, Recorded, Statistics
+from emulator.runs.judge import replay_of
+from emulator.runs.results import Results, ResultsWriter, load_results, write_summary
+from emulator.runs.scorekeeper import Ending, summary_of, write_resolved
+from emulator.runs.shard_score import Score
+from emulator.scenario import Scenario
+
+if TYPE_CHECKING:
+    from emulator.runs.shards import Shard
+
+_RECORDING = "recording.rrd"
+
+
+def gather(
+    scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str
+) -> Mapping[str, Any]:
+    """Fill a run's folder from those of its shards, which are removed then; the run's summary.
+
+    started: when the first shard began, by the monotonic clock, if one did; how: as in `Ending`. Raises OSError if the folder
+    cannot be written, with the shards' own as they are.
+    """
+    write_resolved(folder, scenario)
+    n, receivers = len(scenario.process.A), scenario.receivers
+    with ResultsWriter(folder, receivers, n) as writer:
+        digests = {name: _digest(scenario, name, shards, writer) for name in receivers}
+    first = scenario.first_trial
+    tables = {
+        "slots": Statistics(receivers),
+        "trials": Recorded(receivers, range(first, first + scenario.record_trials), n),
+        "journal": Journals(receivers, [shard.scenario.trials for shard in shards]),
+    }
+    for name, gathered in tables.items():
+        gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
+    wall = 0.0 if started is None else time.monotonic() - started
+    score = Score.merged([Score.left(shard.folder, shard.scenario) for shard in shards])
+    ending = Ending(wall, how, replay_of(folder, scenario))
+    summary = summary_of(
+        scenario, score.tallies, digests, ending, events=_happened(shards, "events"), detection=score.detection
+    )
+    write_summary(folder, summary)
+    _tidy(folder, shards)
+    return summary
+
+
+def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: ResultsWriter) -> str | None:
+    """Write the digests of one receiver's blocks, and make that of the run of them; None if some are missing."""
+    blocks = [_blocks(shard, name) for shard in shards]
+    for block in sorted(set(chain.from_iterable(blocks))):
+        for shard, own in zip(shards, blocks, strict=True):
+            if block in own:
+                writer.digest_rows(shard.trials.start, {name: {block: own[block]}})
+    digest = RunDigest()
+    for own in blocks:
+        if sorted(own) != block_starts(scenario.slots, scenario.cuts(name)):
+            return None
+        digest.add(own)
+    return digest.hexadecimal
+
+
+def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
+    """Block → digests of the shard's trials, (R, 32), of one receiver."""
+    try:
+        table = pq.read_table(shard.folder / "digests.parquet", filters=[("peer", "=", name)])
+    except (OSError, pa.ArrowException):  # whoever wrote it was killed before it was whole
+        return {}
+    starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())
+    digests = np.frombuffer(values, np.uint8).reshape(-1, DIGEST_BYTES)
+    return {int(start): digests[starts == start] for start in np.unique(starts)}
+
+
+def _happened(shards: Sequence[Shard], what: str) -> list[Mapping[str, Any]]:
+    """All that happened in any shard, by an entry of its summary: each once, in order of slots."""
+    found: list[Mapping[str, Any]] = []
+    for results in _results(shards):
+        found += [one for one in results.summary[what] if one not in found]
+    return sorted(found, key=lambda one: int(one["slot"]))
+
+
+def _results(shards: Sequence[Shard]) -> Iterator[Results]:
+    for shard in shards:
+        with suppress(UsageError):
+            yield load_results(shard.folder)
+
+
+def _tidy(folder: Path, shards: Sequence[Shard]) -> None:
+    """Keep the logs of the shards, and the recording of the first; the rest is in the run's own tables."""
+    for shard in shards:
+        (folder / "logs").mkdir(exist_ok=True)
+        with suppress(FileNotFoundError):
+            os.replace(shard.folder / "logs", folder / "logs" / shard.name)
+    with suppress(FileNotFoundError):
+        os.replace(shards[0].folder / _RECORDING, folder / _RECORDING)
+    shutil.rmtree(shards[0].folder.parent)

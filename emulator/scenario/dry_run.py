@@ -1,0 +1,94 @@
+"""A dry run of the classes that are not built in: some slots of the scenario in memory, before any process is started.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from emulator.conformance.eavesdroppers import EavesdropperChecks, Listening
+from emulator.conformance.links import DelayChecks, LossChecks
+from emulator.conformance.problems import Problem
+from emulator.conformance.rules import Broken
+from emulator.conformance.schemes import SchemeChecks
+from emulator.model.delays import DELAY_MODELS, delay_of
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.links import LOSS_MODELS, loss_of
+from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.modules import names_in
+from emulator.network.access import LEGITIMATE
+from emulator.scenario.tables import Scenario
+from emulator.scenario.words import as_toml
+from emulator.streams import Batch
+
+_SLOTS = 4
+_TRIALS = 3
+
+
+def foreign(tables: Any) -> bool:
+    """Whether tables name any class that is not built in."""
+    built_in = {"pooled"}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS)
+    return any(name not in built_in for name in names_in(tables))
+
+
+def dry_run(scenario: Scenario) -> list[str]:
+    """What breaks when classes that are not built in are put to work: shapes, types, keys, errors. None of a run's digest."""
+    if not foreign(scenario.model_dump(exclude_unset=True)):
+        return []
+    batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
+    problem = Problem(scenario.process.process, batch)
+    found = [*_link_mistakes(scenario, problem)]
+    spec = scenario.encoding.spec
+    kind = SCHEMES[scenario.encoding.scheme]
+    if SCHEMES.foreign(scenario.encoding.scheme):
+        check = SchemeChecks(lambda process: scheme_of(process, spec), kind).shapes
+        broken = _broken(check, problem)
+        if broken is not None:
+            return [*found, f"encoding.scheme: is {as_toml(scenario.encoding.scheme)}; in a dry run: {broken}"]
+    for name, table in scenario.eavesdroppers.items():
+        entry = "strategy" if table.reads_as is None else "reads_as"
+        if not SCHEMES.foreign(scenario.encoding.scheme) and not STRATEGIES.foreign(getattr(table, entry)):
+            continue
+        strategy = STRATEGIES[table.strategy]
+        listening = Listening(
+            table.strategy, strategy, table.parameters, lambda process: scheme_of(process, spec), kind
+        )
+        broken = _broken(EavesdropperChecks(listening).shapes, problem)
+        if broken is not None:
+            found.append(f"eavesdroppers.{name}.{entry}: is {as_toml(getattr(table, entry))}; in a dry run: {broken}")
+    return found
+
+
+def _broken(check: Callable[[Problem], None], problem: Problem) -> str | None:
+    try:
+        check(problem)
+    except Broken as error:
+        return str(error)
+    return None
+
+
+def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
+    for receiver in scenario.receivers:
+        path = f"{LEGITIMATE}.link" if receiver == LEGITIMATE else f"eavesdroppers.{receiver}.link"
+        link = scenario.link(receiver)
+        yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
+    for i, event in enumerate(scenario.event):
+        yield from _settings_mistakes(f"event.{i}.set", event.set or {}, problem)
+
+
+def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
+    losses = settings.get("loss")
+    for spec in losses["links"] if losses and losses["model"] == "pooled" else [losses] if losses else []:
+        if LOSS_MODELS.foreign(spec["model"]):
+            check = LossChecks(lambda spec=spec: loss_of(spec), LOSS_MODELS[spec["model"]]).shapes  # type: ignore[misc]
+            broken = _broken(check, problem)
+            if broken is not None:
+                yield f"{path}.loss.model: is {as_toml(spec['model'])}; in a dry run: {broken}"
+    delay = settings.get("delay")
+    if delay and DELAY_MODELS.foreign(delay["model"]):
+        given = {name: value for name, value in delay.items() if name != "unit"}
+        broken = _broken(DelayChecks(lambda: delay_of(given), DELAY_MODELS[delay["model"]]).shapes, problem)
+        if broken is not None:
+            yield f"{path}.delay.model: is {as_toml(delay['model'])}; in a dry run: {broken}"

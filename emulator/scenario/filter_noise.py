@@ -1,0 +1,126 @@
+"""A sensor that measures and filters: what it makes of the network's process noise, and what is wrong with it.
+
+Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from emulator.model.elementary import semidefinite_factor
+from emulator.model.local_filter import Step, settled
+from emulator.model.process import Floats, Process
+from emulator.scenario.plant import PlantTable, plant_of
+from emulator.scenario.process import ProcessTable
+from emulator.scenario.table import numbers
+
+FILTER = "filter"
+_INVERTS_NOISE = ("bayesian", "genie", "likelihood", "tracker")
+
+
+def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
+    """Put the covariance of the filter's innovations into the place of `Q = "filter"`; the mistakes, with their paths."""
+    process = tables.get("process")
+    if not isinstance(process, dict) or process.get("Q") != FILTER:
+        return []
+    n = len(process["A"]) if isinstance(process.get("A"), list) else 1
+    process["Q"] = np.eye(max(1, n)).tolist()  # until it is known, or in its place
+    plant = tables.get("plant")
+    if not isinstance(plant, Mapping) or plant.get("output_matrix") is None:
+        return [
+            f'process.Q: is "{FILTER}", but the sensor has none; expected a matrix, or output_matrix and measurement_noise '
+            "in [plant]"
+        ]
+    try:
+        step = settled_of(process, plant)
+    except ValidationError:
+        return []
+    except ValueError:  # the plant's own mistake
+        return []
+    process["Q"] = step.innovation.tolist()
+    process["singular_noise"] = is_singular(step.innovation)
+    return []
+
+
+def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> Step:
+    """The filter of tables in the end. Raises ValidationError or ValueError where they have none."""
+    made = ProcessTable.model_validate({**process, "Q": np.eye(len(process["A"])).tolist(), "singular_noise": False})
+    table = PlantTable.model_validate(without_disturbances(plant))
+    A, n = np.array(made.A), len(made.A)
+    if table.output_matrix is None or measured_mistakes(plant, n):
+        raise ValueError("no filter")
+    bare = plant_of(table, made.around)
+    return settled(Process(A, np.eye(n), np.array(made.initial_covariance)), bare)
+
+
+def without_disturbances(plant: Mapping[str, Any]) -> dict[str, Any]:
+    """A plant without its disturbances, which may be a day of numbers."""
+    return {name: value for name, value in plant.items() if not name.startswith("disturbance")}
+
+
+def is_singular(Q: Floats) -> bool:
+    """Whether a covariance has a direction without variance."""
+    return bool(np.any(np.diag(semidefinite_factor(Q)) == 0.0))
+
+
+def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
+    """What is wrong with what the sensor measures of n states."""
+    C, V = plant.get("output_matrix"), plant.get("measurement_noise")
+    found = []
+    if C is None or not numbers(C):
+        return []
+    if not C or any(len(row) != n for row in C):
+        wrong = next((len(row) for row in C if len(row) != n), 0)
+        found.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")
+    if V is None or not numbers(V):
+        return found
+    noise, p = [*map(len, V)], len(C)
+    if noise != [p] * p:
+        found.append(
+            f"plant.measurement_noise: has rows of {noise} numbers; expected {p} × {p}, as output_matrix has rows"
+        )
+        return found
+    matrix = np.array(V, np.float64)
+    try:
+        semidefinite_factor(matrix)
+    except ValueError:
+        found.append("plant.measurement_noise: has an eigenvalue below 0; expected a covariance, such as [[0.01]]")
+    if not np.array_equal(matrix, matrix.T):
+        found.append("plant.measurement_noise: is not symmetric; expected a covariance, such as [[0.01]]")
+    return found
+
+
+def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with the sensor's filter beside process, scheme and eavesdroppers."""
+    process, plant = tables.get("process"), tables.get("plant")
+    if not isinstance(process, Mapping):
+        return
+    if isinstance(plant, Mapping) and plant.get("output_matrix") is not None and isinstance(process.get("A"), list):
+        wrong = measured_mistakes(plant, len(process["A"]))
+        yield from wrong
+        try:
+            settled_of(process, plant)
+        except ValidationError:
+            pass
+        except ValueError:
+            if not wrong:
+                yield (
+                    "plant.output_matrix: leaves the sensor's filter without an end: what it measures must show every state, "
+                    "and plant.noise must move every state, or it trusts no measurement any more"
+                )
+        encoding = tables.get("encoding")
+        if isinstance(encoding, Mapping) and encoding.get("scheme") == "twin-track":
+            yield "plant.output_matrix: is there, but the scheme twin-track decides x_0 itself; expected another scheme"
+    if process.get("singular_noise") is True:
+        eavesdroppers = tables.get("eavesdroppers")
+        for name, table in (eavesdroppers if isinstance(eavesdroppers, Mapping) else {}).items():
+            for entry in ("strategy", "reads_as"):
+                if isinstance(table, Mapping) and table.get(entry) in _INVERTS_NOISE:
+                    yield (
+                        f"eavesdroppers.{name}.{entry}: is {table[entry]}, which reckons with the inverse of Q, and Q may be "
+                        "singular; expected another strategy, or a Q that is not"
+                    )

@@ -1,0 +1,74 @@
+"""`[process]`: what everybody knows of what moves.
+
+Source: docs/scenario.md, process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from emulator.model.process import Process, mistakes_of
+from emulator.scenario.table import Found, Matrix, Number, Table, numbers
+from emulator.scenario.words import as_toml, listed
+
+_MATRICES = ("A", "Q", "initial_covariance")
+
+
+class ProcessTable(Table):
+    """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance)."""
+
+    A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
+    Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
+    initial_covariance: Annotated[Matrix, Field(examples=[[[1.0, 0.0], [0.0, 1.0]]])]
+    singular_noise: Annotated[bool, Field(strict=True, examples=[True])] = False
+    reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
+    states: Annotated[
+        list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
+    ] = None
+    units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Whether the three are a process; what is missing or no matrix at all is left out of the question."""
+        found: list[Found] = []
+        matrices: dict[str, NDArray[np.float64]] = {}
+        for name in _MATRICES:
+            field = cls.model_fields[name]
+            rows = table.get(name)
+            if not numbers(rows) or rows is None:
+                continue
+            lengths = {len(row) for row in rows}
+            if lengths == {len(rows)} and rows:
+                matrices[name] = np.array(rows, np.float64)
+            else:
+                count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
+                shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
+                found.append(
+                    (name, f"has {shape}; expected a square matrix, such as {as_toml((field.examples or [0])[0])}")
+                )
+        if matrices:
+            known = matrices.get("A", next(iter(matrices.values())))
+            stand_in = np.eye(len(known))
+            A, Q, initial = (matrices.get(name, stand_in) for name in _MATRICES)
+            singular = table.get("singular_noise") is True
+            found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
+            for name in ("reference", "states", "units"):
+                values = table.get(name)
+                if isinstance(values, list) and len(values) != len(known):
+                    found.append((name, f"has {len(values)} entries; expected {len(known)}, one for each state"))
+        return found
+
+    @property
+    def around(self) -> list[float]:
+        """The public reference, from which states are transmitted as deviations; 0 unless it is given."""
+        return [0.0] * len(self.A) if self.reference is None else self.reference
+
+    @property
+    def process(self) -> Process:
+        """The process it describes."""
+        return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)

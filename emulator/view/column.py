@@ -1,0 +1,30 @@
+"""Values of one entity over some slots, as Rerun takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from emulator.model.process import Floats
+from emulator.view import paths
+
+
+@dataclass(frozen=True)
+class Column:
+    """Values of one entity over some slots: the arguments of Rerun's `send_columns`."""
+
+    path: str
+    slots: NDArray[np.int64]
+    values: rr.ComponentColumnList
+
+    def send(self, to: rr.RecordingStream) -> None:
+        """Put it into a recording."""
+        to.send_columns(self.path, indexes=[rr.TimeColumn(paths.TIMELINE, sequence=self.slots)], columns=self.values)
+
+
+def scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
+    """A number in each slot."""
+    return Column(path, k, rr.Scalars.columns(scalars=values))

@@ -1,0 +1,45 @@
+"""The controller: from the legitimate estimate of a slot to the inputs that the plant is given from then on."""
+
+from __future__ import annotations
+
+import time
+
+from emulator.brief import Brief
+from emulator.model.controllers import CONTROLLERS
+from emulator.model.controllers.controller import Assignment
+from emulator.model.plant import Plant
+from emulator.network.access import CONTROLLER
+from emulator.network.loop_wire import decided, read_known
+from emulator.network.reporting import DecisionReporter
+from emulator.network.resending import Due
+from emulator.network.session import Session
+from emulator.network.wire import Reader
+from peers.loop import disturbances_in, kept_decisive
+
+
+def steer(brief: Brief) -> None:
+    """Run the controller of a brief."""
+    part, process = brief.part, brief.model.process
+    plant = Plant.of(part["plant"])
+    assignment = Assignment.of(process, plant, part["assignment"])
+    disturbances = disturbances_in(part["disturbances"], brief.slots)
+    controller = CONTROLLERS[part["strategy"]](assignment, brief.trials)
+    on_truth = part["acts_on"] == "truth"
+    with Session(brief) as session:
+        key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
+        inbox, put = session.inbox(key), kept_decisive(session, session.keys.input, brief, assignment.period)
+        # Slots are joined without its reports, so all that is kept is sent again.
+        kept = brief.flow.window + 1 + assignment.period
+        telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
+        due = Due(key, brief.flow.longest_outage)
+        reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
+        session.ready()
+        for k in range(0, brief.slots, assignment.period):
+            message = due.take(lambda: Reader(key, inbox.recv().payload.to_bytes()), k)
+            x = read_known(message, name, k, (process.n, brief.trials))
+            began = time.perf_counter()
+            u = controller.decide(k, x, disturbances[k])
+            took = time.perf_counter() - began
+            put(k, decided(k, u, controller.failed))
+            reporter.add(k, u, controller.failed, took)
+        session.wait_for("end")

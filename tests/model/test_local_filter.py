@@ -1,0 +1,88 @@
+"""The filter at the sensor, against a textbook Kalman filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from emulator.model.local_filter import LocalFilter, Steps, settled
+from emulator.model.plant import Drive, Plant
+from emulator.model.process import Process, Trajectory, mistakes_of
+from emulator.streams import Batch, root_of_seed, stream_key
+
+A = np.array([[1.0, 0.1], [0.0, 0.95]])
+W = np.array([[1e-4, 0.0], [0.0, 4e-4]])
+PROCESS = Process(A, np.eye(2), 0.04 * np.eye(2))
+KEYS = {name: stream_key(root_of_seed(8), name) for name in ("process", "measurement")}
+
+
+def plant(C: np.ndarray, V: np.ndarray, noise: np.ndarray = W) -> Plant:
+    """One input, one disturbance, and what is measured."""
+    inf = np.full(2, np.inf)
+    return Plant(
+        np.array([[0.3], [0.1]]), np.array([[0.0], [0.2]]), noise, np.array([1.0, -1.0]),
+        np.array([-np.inf]), np.array([np.inf]), -inf, inf, C, V,
+    )  # fmt: skip
+
+
+ONE = plant(np.array([[1.0, 0.0]]), np.array([[0.01]]))
+BOTH = plant(np.array([[1.0, 0.0], [0.5, 1.0]]), np.array([[0.01, 0.002], [0.002, 0.02]]))
+
+
+@pytest.mark.parametrize("of", [ONE, BOTH], ids=["one", "both"])
+def test_it_settles_where_the_riccati_equation_has_it(of: Plant) -> None:
+    """Gain, covariance and K S Kᵀ of the stationary filter; of one measurement K S Kᵀ has rank one."""
+    C, V = of.output_matrix, of.measurement_noise
+    predicted = solve_discrete_are(A.T, C.T, W, V)
+    S = C @ predicted @ C.T + V
+    K = predicted @ C.T @ np.linalg.inv(S)
+    step = settled(PROCESS, of)
+    assert np.allclose(step.gain, K, rtol=1e-9)
+    assert np.allclose(step.covariance, predicted - K @ C @ predicted, rtol=1e-8)
+    assert np.allclose(step.innovation, K @ S @ K.T, rtol=1e-8)
+    assert np.array_equal(step.innovation, step.innovation.T)
+    assert np.linalg.matrix_rank(step.innovation, tol=1e-12) == len(C)
+    entries = (A, step.innovation, PROCESS.initial_covariance)
+    assert mistakes_of(*entries, len(C) == 1) == []
+    assert (mistakes_of(*entries) == []) == (len(C) == 2)
+
+
+def test_it_is_the_kalman_filter_slot_by_slot() -> None:
+    """With inputs and disturbances known: estimates, covariances, and errors that are as large as it says."""
+    batch = Batch(60, 4000)
+    drive = Drive(ONE, np.linspace(-1.0, 1.0, 60)[:, None])
+    trajectory = Trajectory(PROCESS, KEYS["process"], batch, None, W)
+    local, steps = LocalFilter(PROCESS, ONE, KEYS["measurement"], batch), Steps(PROCESS, ONE)
+    random = np.random.default_rng(1)
+    C, P = ONE.output_matrix, PROCESS.initial_covariance
+    x_before = np.zeros((2, 4000))
+    for k in range(60):
+        pushed = drive.pushed(k)
+        x = trajectory.advance(pushed)
+        x_hat = local.take(k, x, pushed)
+        step = steps.next()
+        P = P if k == 0 else A @ P @ A.T + W
+        gain = P @ C.T / (C @ P @ C.T + 0.01)
+        P = P - gain @ C @ P
+        assert np.allclose(step.gain, gain, rtol=1e-8)
+        assert np.allclose(step.covariance, P, rtol=1e-7)
+        assert np.allclose(local.predicted, A @ x_before if k else 0.0)
+        error = x - x_hat
+        spread = np.sqrt(np.outer(np.diag(P), np.diag(P)))
+        assert np.abs((error @ error.T / 4000 - P) / spread).max() < 0.1
+        added = x_hat - local.predicted - pushed
+        assert np.allclose(added - gain @ np.linalg.lstsq(gain, added, rcond=None)[0], 0.0, atol=1e-12), "in K's range"
+        drive.hold(random.normal(size=(1, 4000)))
+        x_before = x_hat
+
+
+@pytest.mark.parametrize(
+    ("C", "noise"),
+    [(np.array([[0.0, 1.0]]), W), (np.array([[1.0, 0.0]]), np.zeros((2, 2)))],
+    ids=["a state that is not seen", "no noise"],
+)
+def test_a_filter_without_an_end_is_refused(C: np.ndarray, noise: np.ndarray) -> None:
+    """Its covariance grows for ever, or it trusts no measurement any more."""
+    with pytest.raises(ValueError, match="does not settle"):
+        settled(PROCESS, plant(C, np.array([[0.01]]), noise))

@@ -1,0 +1,222 @@
+"""Two linked routers: what crosses between them, and what an eavesdropper at the second one can get and do.
+
+Each test shows first that the right credentials do get or do what is denied to the attacker.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import zenoh
+from bench import Bench, Ear, bench_of, connect, scenario_of, until
+
+from emulator.brief import Brief
+from emulator.errors import UsageError
+from emulator.network import wire
+from emulator.network.access import RELAY, Grant, Keys, access_control, grants
+from emulator.network.health import is_there
+from emulator.network.linked import at_relay, at_router
+from emulator.network.session import client_config
+from emulator.runs.ports import loopback_places, places_at
+
+EVE = "eve"
+RECEIVERS = ("legitimate", "eve", "mallory", "nadia")
+ONCE = {"timeout_ms": 0, "exit_on_failure": True}
+
+
+@pytest.fixture(scope="module", params=["tcp", "tls"])
+def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """A router and a relay for all tests of this file, in clear and with certificates."""
+    scenario = scenario_of(slots=100_000, network={"routers": 2})
+    with bench_of(scenario, tmp_path_factory.mktemp("linked"), request.param) as one:
+        one.due = 0
+        yield one
+
+
+def flow(stage: Bench) -> None:
+    """Let one slot pass, in which everybody gets a delivery across the link."""
+    k, stage.due = stage.due, stage.due + 1
+    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    for ear in stage.downlinks.values():
+        assert wire.Reader(*ear.hear()).integer("k") == k
+
+
+def test_everything_that_is_granted_crosses(stage: Bench) -> None:
+    """Packets and deliveries, progress back to the sensor, commands to both sites, telemetry of both: whoever is where."""
+    for _ in range(8):
+        flow(stage)
+    assert wire.Reader(*stage.journal.hear()).integer("c") == 8
+    for name in RECEIVERS:
+        stage.put(name, stage.keys.progress(name), wire.progress(3))
+        assert stage.progress[name].hear() == (stage.keys.progress(name), wire.progress(3))
+        stage.settle(name)
+    stage.settle("sensor")
+    for name in ("sensor", *RECEIVERS):
+        stage.put("observer", stage.keys.control(name), wire.control("noted"))
+        assert stage.controls[name].hear() == (stage.keys.control(name), wire.control("noted"))
+
+
+def test_an_eavesdropper_at_the_relay_hears_its_own_alone(stage: Bench) -> None:
+    """With its credentials, by exact keys, wildcards and questions, it gets neither uplink nor anything of others."""
+    keys = stage.keys
+    others = [keys.downlink(name) for name in RECEIVERS if name != EVE]
+    asked = ["**", "evedrop/**", keys.uplink, keys.journal, keys.telemetry("sensor"), *others, "@/**"]
+    with connect(stage.briefs[EVE]) as attacker:
+        ears = {key: Ear() for key in (keys.downlink(EVE), *asked)}
+        for key, ear in ears.items():
+            attacker.declare_subscriber(key, ear)
+        watching = Ear()
+        attacker.liveliness().declare_subscriber("evedrop/**", watching, history=True)
+        until(lambda: flow(stage) or not ears[keys.downlink(EVE)].messages.empty(), "its own delivery")
+        for _ in range(4):
+            flow(stage)
+            stage.settle("sensor")
+        assert {key for ear in ears.values() for key, _ in ear.all()} == {keys.downlink(EVE)}
+        assert watching.all() == []
+        for key in asked:
+            found = [str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None]
+            assert [one for one in found if not one.startswith(f"@/{attacker.zid()}/")] == []
+
+
+def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> None:
+    """What it puts on the keys that cross the link reaches nobody; its own telemetry, put after all that, does."""
+    keys = stage.keys
+    with connect(stage.briefs[EVE]) as attacker:
+        for key in (
+            keys.uplink,
+            keys.journal,
+            keys.acknowledged,
+            *(keys.downlink(name) for name in RECEIVERS),
+            *(keys.progress(name) for name in ("legitimate", "observer")),
+            *(keys.control(name) for name in ("sensor", "router", "relay", "legitimate")),
+            *(keys.telemetry(name) for name in ("sensor", "legitimate")),
+        ):
+            attacker.put(key, wire.control("end"), congestion_control=zenoh.CongestionControl.BLOCK)
+        attacker.put(keys.telemetry(EVE), b"mine", congestion_control=zenoh.CongestionControl.BLOCK)
+        assert stage.telemetry[EVE].hear() == (keys.telemetry(EVE), b"mine")
+    flow(stage)
+    for ears in (stage.controls, stage.progress, stage.telemetry):
+        assert {name: ear.all() for name, ear in ears.items()} == {name: [] for name in ears}
+    assert (stage.router.poll(), stage.relay.poll()) == (None, None)
+
+
+def test_each_router_is_asked_for_itself(stage: Bench) -> None:
+    """Each answers for itself with its own credentials, and the relay for those at its site."""
+    assert is_there(stage.briefs["router"])
+    assert is_there(stage.briefs["relay"])
+    assert not is_there(replace(stage.briefs["relay"], password="of another run"))  # noqa: S106 - that is the point
+
+
+@pytest.mark.parametrize("who", ["eve", "legitimate", "observer"])
+def test_who_belongs_to_the_relay_is_not_let_in_at_the_router(who: str, stage: Bench) -> None:
+    """At the router there are the sensor and the relay, and nobody else has a password there."""
+    near = stage.briefs["sensor"].router
+    with pytest.raises(zenoh.ZError):
+        connect(replace(stage.briefs[who], router=near), connect={"endpoints": [near], **ONCE}).close()
+    connect(stage.briefs["sensor"], connect={"endpoints": [near], **ONCE}).close()
+
+
+def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
+    """Who connects to the relay with the router's Zenoh id, which it may have learnt, is not taken for it."""
+    eve: Brief = stage.briefs[EVE]
+    config = {**client_config(eve), "id": stage.briefs["router"].part["zid"], "mode": "router"}
+    stolen = Ear()
+    try:
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as attacker:
+            attacker.declare_subscriber(stage.keys.progress("legitimate"), stolen)
+            attacker.put(stage.keys.downlink("legitimate"), b"forged")
+            attacker.put(stage.keys.journal, b"forged")
+            stage.put("legitimate", stage.keys.progress("legitimate"), wire.progress(4))
+            assert stage.progress["legitimate"].hear()[1] == wire.progress(4)
+    except zenoh.ZError:
+        pass  # it is not even let in
+    flow(stage)
+    assert stolen.all() == []
+    assert b"forged" not in [payload for _, payload in stage.journal.all()]
+
+
+def test_each_process_has_its_own_place(stage: Bench) -> None:
+    """The sensor and the relay connect to the router, all others to the relay; each router knows the passwords of its own."""
+    router, relay = stage.briefs["router"], stage.briefs["relay"]
+    assert set(router.part["users"]) == {"sensor", "relay"}
+    assert set(relay.part["users"]) == {*RECEIVERS, "observer", "operator"}
+    assert {name for name, brief in stage.briefs.items() if brief.router == router.router} == {
+        "router",
+        "relay",
+        "sensor",
+    }
+    assert relay.keys == {}
+    assert not {"links", "scheme", "scenario"} & set(relay.part)
+
+
+def test_what_crosses_is_no_more_than_it_must_be() -> None:
+    """Uplink and acknowledgements to the sensor stay at the sensor's site, telemetry of receivers and requests at theirs."""
+    keys, table = Keys("r"), grants("r", ("legitimate", "eve"), relayed=True)
+    (relay,) = [one for one in at_router("r", table) if one.process == RELAY]
+    (router,) = [one for one in at_relay("r", table, "abc") if one.process == "router"]
+    assert set(relay.reads) == {
+        keys.downlink("legitimate"),
+        keys.downlink("eve"),
+        keys.journal,
+        keys.telemetry("sensor"),
+    }
+    assert set(relay.writes) == {
+        keys.acknowledged,
+        *(keys.progress(name) for name in ("legitimate", "eve", "observer")),
+        *(keys.control(name) for name in ("sensor", "router")),
+    }
+    assert (router.writes, router.reads) == (relay.reads, relay.writes)
+    assert (relay.asks, relay.answers, router.asks, router.answers) == ((), (), (), ())
+    assert set(relay.watches) == {keys.alive("router"), keys.alive("sensor")}
+    for site in (at_router("r", table), at_relay("r", table, "abc")):
+        assert not [
+            key for rule in access_control(site)["rules"] for key in rule["key_exprs"] if "*" in key or "$" in key
+        ]
+    assert [one.process for one in at_router("r", table)] == ["sensor", RELAY]
+
+
+def test_the_router_is_known_at_the_relay_by_id_and_certificate() -> None:
+    """It does not ask to be let in and so has no user there: its id, and its certificate where there are any."""
+    router = Grant("router", (), (), None, zid="abc")
+    (clear,) = access_control([router])["subjects"]
+    assert clear == {"id": "router", "zids": ["abc"]}
+    (certified,) = access_control([router], certified=True)["subjects"]
+    assert certified == {"id": "router", "zids": ["abc"], "cert_common_names": ["router"]}
+
+
+def test_a_run_of_two_routers_takes_certificates_unless_it_is_told_otherwise() -> None:
+    """On loopback, with free ports of their own, or with those that are given."""
+    found = loopback_places(None, None, relayed=True)
+    assert found.relay is not None
+    assert (found.router.secure, found.relay.secure) == (True, True)
+    assert found.router.listen.port != found.relay.listen.port
+    assert not loopback_places(None).router.secure
+    port = found.router.listen.port
+    clear = loopback_places(f"tcp/127.0.0.1:{port}", None, relayed=True)
+    assert (clear.router.secure, clear.far.secure) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("options", "relayed", "said"),
+    [
+        (("tls/a:1",), True, "has two routers; add --relay"),
+        (("tls/a:1", None, "tls/b:1"), False, "has one router; leave it out, or add --set network.routers=2"),
+        (("tls/a:1", None, "tcp/127.0.0.1:1"), True, "both routers take certificates or none does"),
+        (("tls/a:1", None, "tls/a:1"), True, "is where the first router is; give another port"),
+        (("tls/a:1", None, None, "tls/b:1"), True, "--relay-connect is of a second router; add --relay"),
+        (
+            ("tls/a:1", None, "tls/0.0.0.0:1"),
+            True,
+            "--relay tls/0.0.0.0:1 is every address.*add --relay-connect tls/HOST:1",
+        ),
+        (("tls/a:1", None, "tcp/b:1"), True, "--relay tcp/b:1 is in clear"),
+        (("tls/a:1", None, "b"), True, "--relay b is no endpoint"),
+    ],
+)
+def test_places_that_do_not_fit_are_refused(options: tuple[str | None, ...], relayed: bool, said: str) -> None:
+    """Too few, too many, of two kinds, the same place twice: each with the option that mends it."""
+    with pytest.raises(UsageError, match=said):
+        places_at(*options).check(relayed)  # type: ignore[arg-type]

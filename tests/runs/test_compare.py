@@ -1,0 +1,380 @@
+"""Comparisons: who meets whom, on which losses, what is said of it, and the numbers of the literature."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emulator import compare, montecarlo
+from emulator.errors import ScenarioError, UsageError
+from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.schemes import SCHEMES
+from emulator.runs.compare import Comparison, Kept
+from emulator.runs.matchups import ATTACKERS, adversaries_of, matchups_of
+from emulator.runs.montecarlo import Plan
+from emulator.scenario import load
+from tests.conftest import Evedrop
+
+MARGINAL = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
+"""Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
+
+VERDICTS = {
+    ("plain", "naive"): Kept.BROKEN,
+    ("cipher", "naive"): Kept.PERFECT,
+    ("innovation", "naive"): Kept.PERFECT,
+    ("acknowledged", "reference"): Kept.PERFECT,
+    ("acknowledged", "blocks-critical"): Kept.BROKEN,
+    ("acknowledged", "blocks-all"): Kept.BROKEN,
+    ("acknowledged", "forges"): Kept.BROKEN,
+    ("twin-track", "naive"): Kept.PERFECT,
+    ("twin-track", "tracker"): Kept.PERFECT,
+    ("twin-track", "replay-informed"): Kept.RELATIVE,
+    ("innovation", "genie"): Kept.RELATIVE,
+}
+
+Everything = tuple[Comparison, Path]
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory: pytest.TempPathFactory) -> Everything:
+    """All schemes against all adversaries beside a marginally stable process, by two workers, and the folder."""
+    folder = tmp_path_factory.mktemp("compare") / "run"
+    return compare("bayesian", out=folder, plan=Plan(workers=2), **MARGINAL), folder
+
+
+@pytest.fixture(scope="module")
+def literature(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    """The scenario `acknowledged`, whose last slot is k = 40."""
+    return compare("acknowledged", trials=300, out=tmp_path_factory.mktemp("compare") / "run")
+
+
+def last(found: Comparison, scheme: str, adversary: str) -> tuple[float, float]:
+    """Theory of the last slot: the adversary's, and the legitimate estimator's meanwhile."""
+    cell = found.cell(scheme, adversary)
+    assert cell.eavesdropper is not None
+    assert cell.eavesdropper.theory is not None
+    assert cell.legitimate is not None
+    assert cell.legitimate.theory is not None
+    return cell.eavesdropper.theory.last, cell.legitimate.theory.last
+
+
+def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
+    """Every scheme has a cell for every adversary: two errors and a verdict, or a reason."""
+    found, _ = everything
+    assert set(found.schemes) == set(SCHEMES)
+    assert set(found.adversaries) == set(STRATEGIES) | set(ATTACKERS)
+    for scheme in found.schemes.values():
+        assert tuple(scheme.cells) == found.adversaries
+        for cell in scheme.cells.values():
+            played = [cell.eavesdropper, cell.legitimate, cell.secrecy, cell.ratio]
+            assert [one is None for one in played] == [cell.match.not_defined is not None] * 4
+
+
+@pytest.mark.parametrize(
+    ("scheme", "adversary", "why"),
+    [
+        ("cipher", "smart", "schedule"),
+        ("twin-track", "suspicious", "schedule"),
+        ("plain", "bayesian", "innovations"),
+        ("innovation", "reference", "references"),
+        ("acknowledged", "selective", "header"),
+        ("innovation", "tracker", "two tracks"),
+        ("innovation", "blocks-critical", "acknowledgements"),
+    ],
+)
+def test_pairs_that_mean_nothing_say_why(everything: Everything, scheme: str, adversary: str, why: str) -> None:
+    """By what is lacking."""
+    reason = everything[0].cell(scheme, adversary).match.not_defined
+    assert reason is not None
+    assert why in reason
+
+
+def test_every_adversary_is_played_somewhere(everything: Everything) -> None:
+    """None is there to be refused alone, and each scheme that needs acknowledgements meets all attacks on them."""
+    found, _ = everything
+    for adversary in found.adversaries:
+        assert any(found.cell(scheme, adversary).eavesdropper for scheme in found.schemes)
+    for name, scheme in SCHEMES.items():
+        for attacker in ATTACKERS:
+            assert (found.cell(name, attacker).eavesdropper is not None) == scheme.needs_acknowledgements
+
+
+def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) -> None:
+    """The scenario that the folder has of a scheme gives the figures of its cells, by `montecarlo`, to the bit."""
+    found, folder = everything
+    for file, scheme in (("innovation", "innovation"), ("acknowledged-blocks-critical", "acknowledged")):
+        alone = montecarlo(folder / "scenarios" / f"{file}.toml", trials=found.trials, out=tmp_path / file).summary
+        matched = [cell for cell in found.schemes[scheme].cells.values() if cell.match.strategy in alone["peers"]]
+        attack = "none" if file == scheme else "critical"
+        matched = [cell for cell in matched if cell.match.attack == attack]
+        assert matched
+        for cell in matched:
+            peer = alone["peers"][cell.match.receiver]
+            assert cell.eavesdropper is not None
+            assert cell.legitimate is not None
+            assert cell.secrecy is not None
+            assert cell.eavesdropper.mean == peer["mean_squared_error"]
+            assert cell.eavesdropper.quantiles == peer["error_quantiles"]
+            assert cell.legitimate.mean == alone["peers"]["legitimate"]["mean_squared_error"]
+            assert cell.secrecy.as_dict() == alone["secrecy"][cell.match.receiver]
+
+
+def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> None:
+    """Whoever reads what is sent in clear, of whatever scheme, has the error that `plain` has."""
+    found, _ = everything
+    user = found.schemes["plain"].legitimate.mean
+    assert found.schemes["cipher"].legitimate.mean == pytest.approx(user, rel=1e-9)
+    assert found.schemes["acknowledged"].legitimate.mean == pytest.approx(user, rel=1e-6)
+    constant = {scheme: found.cell(scheme, "constant").eavesdropper for scheme in SCHEMES}
+    assert len({one.mean for scheme, one in constant.items() if one is not None and scheme != "twin-track"}) == 1
+    blocked = found.cell("scheduled", "blocks-all").eavesdropper
+    clear = found.cell("plain", "naive").eavesdropper
+    assert blocked is not None
+    assert clear is not None
+    assert blocked.mean == clear.mean
+
+
+def test_simulation_agrees_with_theory(everything: Everything) -> None:
+    """No mean over trials is five standard errors off its closed form, user and adversary of every pair that has one."""
+    judged = 0
+    for scheme in everything[0].schemes.values():
+        for cell in scheme.cells.values():
+            for one in (cell.eavesdropper, cell.legitimate):
+                if one is None or one.theory is None or one.theory.bound or one.standard_error is None:
+                    continue
+                assert abs(one.mean - one.theory.mean) < 5.0 * one.standard_error, cell.match
+                judged += 1
+    assert judged > 40
+
+
+def test_the_cipher_dominates(everything: Everything, literature: Comparison) -> None:
+    """Nothing is cheaper for the user in the long run, and nothing keeps every adversary further off."""
+    assert everything[0].dominant == literature.dominant == ("cipher",)
+
+
+def test_verdicts(everything: Everything) -> None:
+    """Plain packets are an open book; an error that grows without bound is perfect secrecy; equal errors are none."""
+    found, _ = everything
+    assert {pair: found.cell(*pair).verdict for pair in VERDICTS} == VERDICTS
+
+
+def test_one_trial_decides_nothing(tmp_path: Path) -> None:
+    """But what theory alone decides: too few trials to tell is the verdict, and no standard error is given."""
+    found = compare(
+        "bayesian", schemes=["innovation"], adversaries=["naive", "smart"], trials=1, slots=40, out=tmp_path
+    )
+    for adversary in ("naive", "smart"):
+        cell = found.cell("innovation", adversary)
+        assert cell.eavesdropper is not None
+        assert cell.verdict is Kept.UNDECIDED
+        assert cell.eavesdropper.standard_error is None
+
+
+def test_what_each_scheme_needs(everything: Everything) -> None:
+    """Two states: payload and header of 64-bit numbers, and the secret of docs/schemes.md."""
+    needs = {name: one.needs for name, one in everything[0].schemes.items()}
+    assert {name: (one.payload_bits, one.header_bits) for name, one in needs.items()} == {
+        **dict.fromkeys(SCHEMES, (128, 0)),
+        "acknowledged": (128, 64),
+        "encrypted-schedule": (128, 64),
+    }
+    secret = {name: (one.secret_bits_per_slot, one.initial_secret_bits) for name, one in needs.items()}
+    assert secret == {
+        **dict.fromkeys(SCHEMES, (0, 0)),
+        "cipher": (128, 0),
+        "encrypted-schedule": (128, 0),
+        "innovation": (192, 0),
+        "twin-track": (64, 256),
+    }
+    assert {name for name, one in needs.items() if one.acknowledgements} == {
+        "acknowledged",
+        "encrypted-schedule",
+        "scheduled",
+    }
+    assert needs["plain"].sent_fraction == 1.0
+    assert needs["withholding"].sent_fraction == pytest.approx(0.3, abs=0.03)
+
+
+def test_blocking_critical_acknowledgements_undoes_the_state_secrecy_code(literature: Comparison) -> None:
+    """At k = 40 whoever blocks them has the user's own 2.284e-4, and 4.91e7 with acknowledgements that are honest."""
+    for attacker in ("blocks-critical", "blocks-all"):
+        jammer, user = last(literature, "acknowledged", attacker)
+        assert jammer == pytest.approx(user, rel=1e-9)
+        assert user == pytest.approx(2.284e-4, rel=3e-4)
+    assert last(literature, "acknowledged", "reference")[0] == pytest.approx(4.91e7, rel=1e-3)
+
+
+def test_innovations_have_no_acknowledgements_to_block(literature: Comparison) -> None:
+    """Under the paper's scheme every adversary of the same link stays above the user, in theory and in simulation."""
+    for adversary in ("naive", "suspicious", "smart", "genie", "bayesian"):
+        other, user = last(literature, "innovation", adversary)
+        assert other > user
+        cell = literature.cell("innovation", adversary)
+        assert cell.ratio is not None
+        assert cell.ratio > 1.0
+        assert cell.verdict in {Kept.RELATIVE, Kept.PERFECT}
+
+
+def test_a_forged_acknowledgement_is_the_users_loss(literature: Comparison) -> None:
+    """Its error is without bound, in theory as in simulation, and as large as the eavesdropper's."""
+    cell = literature.cell("acknowledged", "forges")
+    assert cell.legitimate is not None
+    assert cell.legitimate.theory is not None
+    assert cell.legitimate.theory.limit == math.inf
+    assert cell.legitimate.typical > 1e3
+
+
+@pytest.mark.parametrize(
+    ("mu_d", "user", "genie", "smart"), [(0.9, 2.672e-4, 4.462e-4, 5.077e-4), (0.7, 4.756e-4, 1.545e-3, 1.760e-3)]
+)
+def test_the_numerical_example_at_slot_sixty(
+    mu_d: float, user: float, genie: float, smart: float, tmp_path: Path
+) -> None:
+    """Exact values for μ = μ_e = 0.9, Σ0 = Q, k = 60, of a scheme that is not the scenario's own."""
+    found = compare(
+        "acknowledged",
+        schemes=["innovation"],
+        adversaries=["smart", "genie"],
+        parameters={"innovation.state_probability": mu_d},
+        trials=2,
+        slots=61,
+        out=tmp_path,
+    )
+    assert last(found, "innovation", "smart") == pytest.approx((smart, user), rel=5e-4)
+    assert last(found, "innovation", "genie") == pytest.approx((genie, user), rel=5e-4)
+
+
+def test_the_scenario_says_what_it_says_and_the_rest_is_documented() -> None:
+    """A strategy's first eavesdropper is taken as it is; others listen behind the link of the scenario's first."""
+    groups = {group.name: group.scenario for group in matchups_of(load("numerical")).groups}
+    innovation = groups["innovation"]
+    assert innovation.encoding.parameters == groups["withholding"].encoding.parameters == {"state_probability": 0.56}
+    assert {name: innovation.quality[name] for name in ("legitimate", "smart", "naive", "genie")} == {
+        "legitimate": 0.9,
+        "smart": 0.85,
+        "naive": 0.85,
+        "genie": 0.85,
+    }
+    suspicious = innovation.eavesdroppers["suspicious"]
+    assert (suspicious.use_state, suspicious.use_innovation) == (0.8, 0.2)
+    assert innovation.eavesdroppers["colluding"].reads_as == "bayesian"
+    assert innovation.quality["colluding"] == pytest.approx(1.0 - 0.15**2)
+    assert innovation.eavesdroppers["replay-informed"].learns_at == 40
+    assert groups["acknowledged"].acknowledgements is not None
+    assert groups["acknowledged"].acknowledgements.link.quality == 1.0
+    attacked = groups["acknowledged-blocks-critical"].acknowledgements
+    assert attacked is not None
+    assert (attacked.attack, attacked.jammer) == ("critical", "reference")
+
+
+@pytest.mark.parametrize("name", ["numerical", "vehicle", "fading", "colluding", "restart", "late", "driving-away"])
+def test_shipped_scenarios_can_be_compared(name: str) -> None:
+    """Whatever their links, events and eavesdroppers are."""
+    assert len(matchups_of(load(name)).groups) >= len(SCHEMES)
+
+
+def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
+    """Exit 2, every name that is none, and what there is."""
+    options = ("--schemes", "cypher,plain", "--adversaries", "smrt", "--with", "innovation.mu_d=0.7")
+    done = evedrop("compare", "numerical", *options)
+    assert (done.status, done.out) == (2, "")
+    for said in ("cypher is no scheme", "did you mean cipher?", "smrt is no adversary", "did you mean smart?"):
+        assert said in done.err
+    assert "innovation.mu_d is no parameter of a scheme" in done.err
+    assert all(name in done.err for name in (*SCHEMES, *adversaries_of(), "innovation.state_probability"))
+    assert not list(evedrop.folder.glob("runs/*"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--schemes", ""),
+        ("--with", "innovation.state_probability"),
+        ("--with", "innovation.state_probability=2.0"),
+        ("--trials", "0"),
+        ("--workers", "0"),
+        ("--slots", "5000"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(evedrop: Evedrop, options: tuple[str, ...]) -> None:
+    """Exit 2 and a reason, before anything is run."""
+    done = evedrop("compare", "numerical", *options)
+    assert (done.status, done.out) == (2, "")
+    assert done.err.startswith("evedrop: ")
+
+
+def test_mistakes_of_a_scheme_name_it() -> None:
+    """A scenario's links may be none for a scheme that stays silent."""
+    scenario = load("bayesian", {"expect": [], "legitimate.link": {"quality": 0.9, "rate": 0.9}})
+    with pytest.raises(ScenarioError, match=r"with the scheme withholding: legitimate\.link\.rate"):
+        matchups_of(scenario)
+    with pytest.raises(UsageError, match="no scheme is named"):
+        matchups_of(scenario, schemes=[])
+
+
+def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> None:
+    """Every scheme and pair in the table; compare.json, two pictures and the scenarios in the folder."""
+    names = ("--schemes", "innovation,acknowledged", "--adversaries", "smart,reference,blocks-critical")
+    done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--out", "found")
+    assert (done.status, done.err) == (0, "")
+    for said in ("innovation", "acknowledged", "blocks-critical (reference)", "✕ broken", "not defined: smart"):
+        assert said in done.out
+    folder = evedrop.folder / "found"
+    assert sorted(path.name for path in folder.iterdir()) == ["compare.json", "compare.pdf", "compare.png", "scenarios"]
+    assert sorted(path.stem for path in (folder / "scenarios").iterdir()) == [
+        "acknowledged",
+        "acknowledged-blocks-critical",
+        "innovation",
+    ]
+    assert (folder / "compare.png").stat().st_size > 20_000
+
+
+def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
+    """One line on standard output, as compare.json says it, without numbers that JSON lacks."""
+    names = ("--schemes", "innovation,acknowledged", "--adversaries", "naive,reference,forges")
+    done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--json", "--out", "found")
+
+    def refused(constant: str) -> None:
+        raise AssertionError(constant)
+
+    found: dict[str, Any] = json.loads(done.out, parse_constant=refused)
+    assert done.out.count("\n") == 1
+    assert found == json.loads((evedrop.folder / "found" / "compare.json").read_text())
+    assert set(found) == {
+        *("scenario", "slots", "trials", "seed", "first_trial", "adversaries", "dominant", "schemes"),
+    }
+    scheme = found["schemes"]["acknowledged"]
+    assert set(scheme) == {"parameters", "needs", "legitimate", "closest", "against"}
+    assert set(scheme["needs"]) == {
+        *("acknowledgements", "payload_bits", "header_bits", "packet_bits", "sent_fraction"),
+        *("secret_bits_per_slot", "initial_secret_bits"),
+    }
+    cell = scheme["against"]["forges"]
+    assert set(cell) == {"reads_as", "attack", "eavesdropper", "legitimate", "ratio", "verdict", "secrecy"}
+    measured = {"mean", "standard_error", "quantiles", "infinite_variance", "theory"}
+    assert set(cell["eavesdropper"]) == set(cell["legitimate"]) == measured
+    assert set(cell["legitimate"]["theory"]) == {"mean", "last", "limit", "bound"}
+    assert cell["legitimate"]["theory"]["limit"] == "inf"
+    assert set(found["schemes"]["innovation"]["against"]["reference"]) == {"not_defined"}
+
+
+def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:
+    """In the order of schemes and adversaries."""
+    found, _ = everything
+    rows = found.table.to_pylist()
+    assert [(row["scheme"], row["adversary"]) for row in rows] == [
+        (scheme, adversary) for scheme in found.schemes for adversary in found.adversaries
+    ]
+
+
+def test_workers_change_nothing(everything: Everything, tmp_path: Path) -> None:
+    """One worker finds what two found."""
+    some = {"schemes": ["scheduled", "cipher"], "adversaries": ["naive", "blocks-all"]}
+    alone = compare("bayesian", out=tmp_path, plan=Plan(workers=1), **some, **MARGINAL)
+    for scheme in some["schemes"]:
+        for adversary in some["adversaries"]:
+            assert alone.cell(scheme, adversary) == everything[0].cell(scheme, adversary)

@@ -1,0 +1,152 @@
+"""Tables of shards as one: what one writer of all trials writes, however the rows of each came and however few fit at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.model.links.link import REASONS
+from emulator.runs.gathered_tables import Gathered, Journals, Recorded, Statistics
+from emulator.runs.joined import ReceiverSlots, Slots
+from emulator.runs.results import ResultsWriter
+from emulator.runs.score import slot_sums, squared_errors
+
+NAMES = ("legitimate", "smart", "naive")
+N, SLOTS, TRIALS, RECORDED = 2, 40, 11, 5
+
+
+def slots_of(seed: int) -> Slots:
+    """What a run of all trials might have been."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(SLOTS, N, TRIALS))
+    receivers = {}
+    for name in NAMES:
+        action = rng.integers(0, 4, (SLOTS, TRIALS)).astype(np.uint8)
+        delivered = action > 0
+        lost = {reason: np.zeros(SLOTS, np.uint32) for reason in REASONS}
+        lost["lost"] = np.count_nonzero(~delivered, axis=1).astype(np.uint32)
+        P = rng.random((SLOTS, N, N, TRIALS))
+        receivers[name] = ReceiverSlots(
+            x + rng.normal(size=x.shape), action, P, rng.random((SLOTS, 2)), delivered, lost
+        )
+    return Slots(0, x, rng.random((SLOTS, TRIALS)) < 0.5, receivers)
+
+
+def part_of(whole: Slots, rows: slice, trials: slice, recorded: int) -> Slots:
+    """Some slots of some trials of it, of which the first `recorded` in full."""
+    receivers = {}
+    for name, one in whole.receivers.items():
+        trace = np.einsum("kiir->kr", one.P)[rows, trials]
+        delivered = one.delivered[rows, trials]
+        lost = {**{reason: counts[rows] for reason, counts in one.lost.items()}}
+        lost["lost"] = np.count_nonzero(~delivered, axis=1).astype(np.uint32)
+        receivers[name] = ReceiverSlots(
+            one.x_hat[rows, :, trials],
+            one.action[rows, trials],
+            one.P[rows, :, :, trials][..., :recorded],
+            np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
+            delivered,
+            lost,
+        )
+    return Slots(rows.start, whole.x[rows, :, trials], whole.nu[rows, trials], receivers)
+
+
+def write(folder: Path, whole: Slots, trials: slice, recorded: int, ends: Sequence[int]) -> None:
+    """The tables of some trials, of slots that came in parts with these ends; none at all without a part."""
+    folder.mkdir()
+    if not ends:
+        return
+    with ResultsWriter(folder, NAMES, N) as writer:
+        for first, end in zip([0, *ends], ends, strict=False):
+            part = part_of(whole, slice(first, end), trials, recorded)
+            errors = {name: squared_errors(part.x, one.x_hat) for name, one in part.receivers.items()}
+            for name, one in part.receivers.items():
+                sums = slot_sums(errors[name], one.action, one.trace)
+                writer.slot_rows(first, name, sums, np.arange(first, end) / 7.0)
+            writer.trial_rows(part, errors, 100 + trials.start)
+            writer.journal_rows(part)
+
+
+def gathered(
+    folder: Path, shards: Sequence[Path], sizes: Sequence[int], at_once: int
+) -> Iterator[tuple[str, pa.Table]]:
+    """The tables of the run, put together so many slots at a time."""
+    folder.mkdir()
+    with ResultsWriter(folder, NAMES, N):
+        pass
+    made: dict[str, Gathered] = {
+        "slots": Statistics(NAMES),
+        "trials": Recorded(NAMES, range(100, 100 + RECORDED), N),
+        "journal": Journals(NAMES, sizes),
+    }
+    for name, one in made.items():
+        one.slots_at_once = at_once
+        one.write([shard / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
+        yield name, pq.read_table(folder / f"{name}.parquet")
+
+
+def sorted_rows(table: pa.Table) -> pa.Table:
+    """By slot, receiver and trial."""
+    by = "link" if "link" in table.column_names else "peer"
+    keys = ["slot", "who", *(["trial"] if "trial" in table.column_names else [])]
+    plain = table.append_column("who", table[by].cast(pa.string())).drop_columns([by])
+    for i, field in enumerate(plain.schema):
+        if pa.types.is_dictionary(field.type):
+            plain = plain.set_column(i, field.name, plain[field.name].cast(pa.string()))
+    return plain.sort_by([(key, "ascending") for key in keys])
+
+
+def same(found: pa.Table, wanted: pa.Table) -> None:
+    """Check that two tables have the same rows, numbers of statistics within rounding."""
+    assert found.schema == wanted.schema
+    found, wanted = sorted_rows(found), sorted_rows(wanted)
+    for name in wanted.column_names:
+        if name in ("mean_squared_error", "mean_trace_covariance", "standard_error"):
+            np.testing.assert_allclose(found[name].to_numpy(), wanted[name].to_numpy(), rtol=1e-12, err_msg=name)
+        else:
+            assert found[name].to_pylist() == wanted[name].to_pylist(), name
+
+
+ends = st.lists(st.integers(1, SLOTS - 1), max_size=6, unique=True).map(lambda some: [*sorted(some), SLOTS])
+
+
+@settings(max_examples=25)
+@given(cut=st.integers(1, TRIALS - 1), first=ends, second=ends, at_once=st.integers(1, 50), seed=st.integers(0, 9))
+def test_two_shards_are_the_whole(cut: int, first: list[int], second: list[int], at_once: int, seed: int) -> None:
+    """Wherever the trials are cut, in whatever parts their slots came, and however many slots fit into memory."""
+    whole = slots_of(seed)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write(folder / "whole", whole, slice(0, TRIALS), RECORDED, [SLOTS])
+        write(folder / "1", whole, slice(0, cut), min(cut, RECORDED), first)
+        write(folder / "2", whole, slice(cut, TRIALS), max(1, RECORDED - cut), second)
+        shards, sizes = [folder / "1", folder / "2"], [cut, TRIALS - cut]
+        for table, found in gathered(folder / "run", shards, sizes, at_once):
+            same(found, pq.read_table(folder / "whole" / f"{table}.parquet"))
+
+
+@pytest.mark.parametrize("missing", [[], [13]], ids=["killed", "cut short"])
+def test_a_shard_that_came_to_less_leaves_the_others_as_they_are(tmp_path: Path, missing: list[int]) -> None:
+    """The rows of slots that one shard did not come to are of the others' trials, and its bits are 0."""
+    whole = slots_of(1)
+    write(tmp_path / "1", whole, slice(0, 4), 4, [SLOTS])
+    write(tmp_path / "2", whole, slice(4, TRIALS), 1, missing)
+    found = dict(gathered(tmp_path / "run", [tmp_path / "1", tmp_path / "2"], [4, TRIALS - 4], 9))
+    here = missing[0] if missing else 0
+    for row in found["slots"].to_pylist():
+        assert row["trials"] == (TRIALS if row["slot"] < here else 4)
+    for row in found["journal"].to_pylist():
+        flags = whole.receivers[row["link"]].delivered[row["slot"]].copy()
+        flags[slice(TRIALS if row["slot"] < here else 4, None)] = False
+        assert row["offered"] == (TRIALS if row["slot"] < here else 4)
+        assert row["delivered_mask"] == np.packbits(flags, bitorder="little").tobytes()
+    trials = found["trials"].to_pylist()
+    assert len(trials) == len(NAMES) * (4 * SLOTS + here)

@@ -1,0 +1,179 @@
+"""The house of a run: table, figures in the summary, expectations, and that workers and blocks change nothing."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from emulator import cli
+from emulator.api import montecarlo
+from emulator.errors import ScenarioError
+from emulator.model import privacy
+from emulator.model.controllers import mpc
+from emulator.model.energy import Meter, energy
+from emulator.runs.montecarlo import Plan
+from emulator.scenario import checked, load
+from tests.conftest import Evedrop
+from tests.test_plant_tables import LOOP
+
+SLOTS = 3600
+
+
+def tables(**changes: Any) -> dict[str, Any]:
+    """The scenario of the plant's tests with a house; changes by dotted key, `__` for the dot; None takes one out."""
+    made = copy.deepcopy(LOOP)
+    made["household"] = {"grid": "P_grid", "load": "P_load", "sun": "P_solar", "battery": "SOC"}
+    made["eavesdroppers"] = {"eve": {"strategy": "smart", "link": {"quality": 0.6}}}
+    for key, value in changes.items():
+        *path, last = key.split("__")
+        inner = made
+        for name in path:
+            inner = inner[name]
+        if value is None:
+            del inner[last]
+        else:
+            inner[last] = value
+    return made
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"household__grid": "P_net"}, 'household.grid: is "P_net", which is none of plant.inputs; expected one of P_H'),
+        ({"household__load": "P_H"}, 'household.load: is "P_H", which is none of plant.disturbances; expected one of P_so'),
+        ({"household__battery": "soc"}, 'household.battery: is "soc", which is none of process.states; expected one of SOC'),
+        ({"process__states": None}, 'household.battery: is "SOC", which is none of process.states; expected process.st'),
+        ({"household__grid": None}, "household.grid: is missing; expected"),
+        ({"household__window_seconds": 0.0}, "household.window_seconds: is 0.0; expected"),
+        ({"household__stove": "x"}, "household.stove: "),
+        ({"expect": [{"figure": "household.bought", "below": 1.0}]}, 'expect.0.figure: is "household.bought"; expected hous'),
+        ({"expect": [{"figure": "household.adam.activity_area", "below": 1.0}]}, "expect.0.figure: is "),
+        ({"expect": [{"figure": "household.sold_energy", "below": 1.0, "slots": [0, 2]}]}, "expect.0.slots: is set, but a"),
+        ({"household": None, "expect": [{"figure": "household.sold_energy", "below": 1.0}]}, "expect.0.figure: is "),
+    ],
+)  # fmt: skip
+def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], said: str) -> None:
+    """With its path, what was found and what there is."""
+    with pytest.raises(ScenarioError) as caught:
+        checked(tables(**changes), "file")
+    assert [line for line in caught.value.mistakes if line.startswith(said)], caught.value.mistakes
+
+
+def test_without_the_solver_one_line_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the scenario that needs it; the list of scenarios, and those that do not, need no extra."""
+    monkeypatch.setattr(mpc, "find_spec", lambda _: None)
+    assert cli.main(["check", "microgrid-mpc"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("evedrop[microgrid]") == 1
+    assert "microgrid-mpc: 1 mistake" in told
+    assert (
+        "controller.strategy: is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first"
+        in told
+    )
+    assert cli.main(["check", "microgrid"]) == 0
+    assert cli.main(["list"]) == 0
+    assert "microgrid-mpc" in capsys.readouterr().out
+
+
+def test_a_house_needs_a_plant() -> None:
+    """And a controller."""
+    with pytest.raises(ScenarioError) as caught:
+        checked(tables(plant=None, controller=None, legitimate__knows_input=False), "file")
+    assert "household: is there without a [plant] and a [controller]" in caught.value.mistakes[0]
+
+
+def test_the_figures_are_those_of_the_tables(tmp_path: Path) -> None:
+    """Energies from the recorded inputs of every trial; a run that acts on the truth differs from that by nothing."""
+    made = {}
+    for acts_on in ("estimate", "truth"):
+        made[acts_on] = montecarlo(
+            "microgrid", trials=3, slots=SLOTS, out=tmp_path / acts_on, record_trials=3,
+            controller__acts_on=acts_on, encoding__state_probability=0.3, plan=Plan(workers=1),
+        )  # fmt: skip
+    power = {}
+    for acts_on, results in made.items():
+        assert results.inputs is not None
+        u = np.array(results.inputs["u"].to_pylist()).reshape(SLOTS, 3, 2)
+        power[acts_on] = u[:, :, 1]
+    meter = Meter.over(power["estimate"], power["truth"])
+    found = made["estimate"].summary["household"]
+    assert found["bought_energy"] == pytest.approx(energy(meter.bought, 1.0).mean())
+    assert found["sold_energy"] == pytest.approx(energy(meter.sold, 1.0).mean())
+    assert found["knowing_truth"]["bought_energy"] == pytest.approx(energy(meter.other_bought, 1.0).mean())
+    for name in ("net", "total", "summed"):
+        assert found[f"{name}_difference"] == pytest.approx(getattr(meter.difference, name).mean(), rel=1e-9)
+        assert made["truth"].summary["household"][f"{name}_difference"] == 0.0
+    assert found["summed_difference"] > 1e-4
+
+
+def test_active_windows_are_the_days(tmp_path: Path) -> None:
+    """Their number is that of the load; who has nothing to go by is near a coin, the legitimate estimator far above."""
+    results = montecarlo(
+        "microgrid",
+        trials=2,
+        slots=30_000,
+        out=tmp_path / "x",
+        plan=Plan(workers=1),
+        eavesdroppers__bayesian__strategy="smart",
+    )
+    house = results.summary["household"]
+    scenario = load("microgrid")
+    assert scenario.plant is not None
+    assert scenario.plant.disturbance_values is not None
+    load_power = np.array(scenario.plant.disturbance_values)[: 499 * 60, 1]
+    assert house["windows"] == 499
+    assert house["active_windows"] == int(privacy.active(load_power, 60, 0.7).sum()) > 5
+    told = house["receivers"]
+    assert told["legitimate"]["activity_area"] > 0.99
+    assert told["smart"]["activity_area"] > 0.97
+    assert 0.3 < told["naive"]["activity_area"] < 0.7
+
+
+def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
+    """The same figures from one process and from two."""
+    options = {"trials": 501, "slots": 130, "eavesdroppers__bayesian__strategy": "smart"}
+    one = montecarlo("microgrid", out=tmp_path / "one", plan=Plan(workers=1), **options)
+    two = montecarlo("microgrid", out=tmp_path / "two", plan=Plan(workers=2), **options)
+    assert one.summary["household"] == two.summary["household"]
+    assert one.summary["household"]["windows"] == 2
+
+
+def test_expectations_of_a_house_are_judged(tmp_path: Path) -> None:
+    """One that holds, one that fails, and one that the run does not tell: no window has been active yet."""
+    expect = [
+        {"figure": "household.sold_energy", "below": 100.0},
+        {"figure": "household.summed_difference", "above": 3.0},
+        {"figure": "household.naive.activity_area", "below": 0.9},
+    ]
+    results = montecarlo("microgrid", trials=1, slots=200, out=tmp_path / "x", expect=expect)
+    assert [one["held"] for one in results.summary["expectations"]] == [True, False, None]
+
+
+def test_a_sweep_over_a_house_has_its_figures(evedrop: Evedrop) -> None:
+    """In every row, and in a plot of their own; another sweep has neither."""
+    options = ["--slots", "130", "--trials", "2", "--set=eavesdroppers.bayesian.strategy=smart"]
+    done = evedrop("sweep", "microgrid", "--over", "encoding.state_probability=0.1,0.9", *options, "--out", "house")
+    assert done.status == 0, done.err
+    table = pq.read_table(evedrop.folder / "house" / "sweep.parquet").to_pylist()
+    assert len(table) == 2 * 4
+    assert all(row["sold_energy"] >= 0.0 for row in table)
+    assert table[0]["summed_difference"] > table[4]["summed_difference"] > 0.0
+    assert (evedrop.folder / "house" / "household.png").stat().st_size > 10_000
+    done = evedrop("sweep", "eavesdroppers", "--over", "slots=20,30", "--trials", "2", "--out", "other")
+    assert "sold_energy" not in pq.read_table(evedrop.folder / "other" / "sweep.parquet").column_names
+    assert not (evedrop.folder / "other" / "household.png").exists()
+
+
+def test_the_closing_report_says_what_became_of_the_house(evedrop: Evedrop) -> None:
+    """What it buys and sells, and by how much that differs; without active windows nothing of who can tell them."""
+    done = evedrop("montecarlo", "microgrid", "--slots", "200", "--trials", "1", "--out", "x")
+    assert "the house buys 0.0" in done.out
+    assert "slot by slot" in done.out
+    assert "who can tell" not in done.out

@@ -1,0 +1,347 @@
+"""A run in shards is the run without them: digests, tables, summary, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from emulator import load_results, montecarlo, run
+from emulator.errors import RunError, UsageError
+from emulator.runs.results import Results
+from emulator.runs.shards import OneProgress, shards_of
+from emulator.scenario import load
+from tests.conftest import Evedrop, Live, wait_until, with_mark
+
+TRIALS = 7
+ENDLESS = ("--trials", "5", "--slots", "1000000", "--set", "shards=2")
+EVENTFUL: dict[str, Any] = {
+    "slots": 300,
+    "trials": TRIALS,
+    "first_trial": 11,
+    "record_trials": 4,
+    "legitimate__window": 2,
+    "legitimate__link": {"quality": 0.8, "delay": {"model": "normal", "mean": 0.5, "deviation": 1.0}},
+    "event": [
+        {"from": 40, "to": 130, "kill": "smart", "state": "last"},
+        {"from": 50, "to": 60, "cut": "naive"},
+        {"from": 100, "to": 120, "pause": "suspicious"},
+        {"at": 200, "link": "naive", "set": {"quality": 0.4}},
+    ],
+    "expect": [
+        {"figure": "naive.mean_squared_error", "slots": [100, 200], "quantile": 0.5, "above": 0.0},
+        {"figure": "legitimate.mean_squared_error", "below": 1e-9},
+        {"in_step": "smart", "by": 290},
+        {"link": "naive"},
+    ],
+}
+"""Trials that divide into no equal shards, with everything that may happen to a process and to a packet."""
+
+
+Ran = Callable[[int], Results]
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """The run in so many shards; in memory for 0."""
+    folder = tmp_path_factory.mktemp("shards")
+
+    @cache
+    def once(shards: int) -> Results:
+        if shards == 0:
+            return montecarlo("eavesdroppers", out=folder / "memory", **EVENTFUL)
+        return run("eavesdroppers", out=folder / str(shards), shards=shards, **EVENTFUL)
+
+    return once
+
+
+def in_order(table: pa.Table) -> dict[str, list[Any]]:
+    """The columns of a table, its rows by slot or block, receiver and trial: live runs write them as they come."""
+    keys = [name for name in ("slot", "block", "peer", "link", "trial") if name in table.column_names]
+    plain = table.set_column(
+        table.column_names.index(keys[1] if keys[1] in ("peer", "link") else keys[0]),
+        "who",
+        table["peer" if "peer" in keys else "link"].cast(pa.string()),
+    )
+    order = ["who" if name in ("peer", "link") else name for name in keys]
+    columns: dict[str, list[Any]] = plain.sort_by([(name, "ascending") for name in order]).to_pydict()
+    return columns
+
+
+@pytest.mark.parametrize("shards", [2, 3])
+@pytest.mark.parametrize("name", ["trials", "journal", "digests"])
+def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, name: str, shards: int) -> None:
+    """Recorded trials, every packet's fate with its bit mask, and digests do not depend on the number of shards."""
+    assert in_order(getattr(ran(shards), name)) == in_order(getattr(ran(1), name))
+
+
+@pytest.mark.parametrize("shards", [2, 3])
+def test_the_statistics_of_every_slot_agree(ran: Ran, shards: int) -> None:
+    """Counts are equal, and means and standard errors over all trials within rounding."""
+    whole, gathered = in_order(ran(1).slots), in_order(ran(shards).slots)
+    assert whole.keys() == gathered.keys()
+    for name, column in whole.items():
+        exact = name in ("slot", "who", "trials", "received_fraction", "used_fraction", "expected_trace_covariance")
+        if exact or column[0] is None:
+            assert gathered[name] == column, name
+        else:
+            np.testing.assert_allclose(gathered[name], column, rtol=1e-13, err_msg=name)
+
+
+@pytest.mark.parametrize("shards", [2, 3])
+def test_the_summary_is_that_of_all_trials(ran: Ran, shards: int) -> None:
+    """Figures, accounts, quantiles, events, verdicts and expectations are those of the whole run."""
+    close(dict(ran(shards).summary), dict(ran(1).summary), "summary")
+
+
+def close(found: Any, wanted: Any, where: str) -> None:
+    """Check that two parts of summaries are the same, numbers within rounding; but for times and folders."""
+    if isinstance(wanted, Mapping):
+        assert found.keys() == wanted.keys(), where
+        for name in wanted.keys() - {"wall_seconds", "slots_per_second", "replay"}:
+            close(found[name], wanted[name], f"{where}.{name}")
+    elif isinstance(wanted, list):
+        assert len(found) == len(wanted), where
+        for i, (one, other) in enumerate(zip(found, wanted, strict=True)):
+            close(one, other, f"{where}.{i}")
+    elif isinstance(wanted, float):
+        assert found == pytest.approx(wanted, rel=1e-12), where
+    else:
+        assert found == wanted, where
+
+
+@pytest.mark.parametrize("shards", [1, 2, 3])
+def test_digests_are_those_of_memory(ran: Ran, shards: int) -> None:
+    """However many processes carry a trial's packets, it is that trial."""
+    digests = [
+        {name: peer["digest"] for name, peer in results.summary["peers"].items()} for results in (ran(shards), ran(0))
+    ]
+    assert digests[0] == digests[1]
+    assert None not in digests[0].values()
+
+
+def test_nothing_is_left_of_the_shards_but_their_logs(ran: Ran) -> None:
+    """One folder, as of any run, whose scenario says that it was in shards and runs again."""
+    folder = ran(3).folder
+    left = {path.name for path in folder.iterdir()}
+    tables = {f"{name}.parquet" for name in ("slots", "trials", "journal", "digests")}
+    assert left == {"scenario.toml", "summary.json", "logs", *tables}
+    assert {path.name for path in (folder / "logs").iterdir()} == {"shard-1", "shard-2", "shard-3"}
+    assert (folder / "logs" / "shard-2" / "smart.log").is_file()
+    assert load(folder).shards == 3
+    assert load(folder).trials == TRIALS
+
+
+def test_shards_are_contiguous_and_as_equal_as_can_be() -> None:
+    """Every trial is in one shard, in order, and the recorded ones are in the first."""
+    scenario = load("eavesdroppers", {"trials": TRIALS, "first_trial": 11, "record_trials": 4, "shards": 3})
+    shards = shards_of(scenario, Path("run"))
+    assert [trial for shard in shards for trial in shard.trials] == list(range(11, 18))
+    assert sorted(len(shard.trials) for shard in shards) == [2, 2, 3]
+    assert [shard.scenario.record_trials for shard in shards] == [2, 2, 1]
+    assert len({shard.folder for shard in shards}) == 3
+
+
+def test_progress_is_that_of_the_slowest() -> None:
+    """Nothing is told before all have begun, and never more than all have done."""
+    told: list[Mapping[str, Any]] = []
+    shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
+    one = OneProgress(shards, told.append)
+    first, second = (one.of(shard) for shard in shards)
+    first({"event": "started"})
+    first({"event": "progress", "done": 50, "rate": 9.0, "rate_unit": "slots/s", "squared_errors": {"smart": 1.0}})
+    assert told == []
+    second({"event": "started"})
+    second({"event": "progress", "done": 20, "rate": 4.0, "rate_unit": "slots/s", "squared_errors": {"smart": 4.0}})
+    assert [news["event"] for news in told] == ["started", "progress"]
+    assert (told[1]["done"], told[1]["rate"], told[1]["squared_errors"]) == (20, 4.0, {"smart": 3.0})
+    second({"event": "ended", "status": 0})
+    first({"event": "progress", "done": 70, "rate": 9.0, "rate_unit": "slots/s", "squared_errors": {"smart": 1.0}})
+    assert told[-1]["done"] == 70
+
+
+def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_status(evedrop: Evedrop) -> None:
+    """No shard is done before its slots have passed, and what is expected is judged once, of all trials."""
+    done = evedrop(
+        *("run", "eavesdroppers", "--view", "off", "--json", "--out", "run", "--slots", "60", "--pace", "0.02"),
+        *("--trials", "2", "--set", "shards=2"),
+        *("--set", "expect=[{ figure = 'legitimate.mean_squared_error', below = 1e-9 }]"),
+    )
+    assert done.status == 1, done.err
+    assert done.summary["wall_seconds"] >= 59 * 0.02
+    assert [one["held"] for one in done.summary["expectations"]] == [False]
+
+
+def child(live: Live, shard: int, name: str) -> int:
+    """The process id of one process of one shard, which its log tells, as soon as it is there."""
+
+    def found() -> int | None:
+        for pid in with_mark(str(live.temporary)):
+            try:
+                log = os.readlink(f"/proc/{pid}/fd/2")
+            except OSError:
+                continue
+            if log.endswith(f"/shards/{shard}/logs/{name}.log"):
+                return pid
+        return None
+
+    pid: int = wait_until(found, f"a process {name} of shard {shard}")
+    return pid
+
+
+def whole(live: Live) -> int:
+    """Check that the folder of a run cut short is one, its tables as far as its trials came; the rows of slots."""
+    results = live.results
+    assert not (live.folder / "shards").exists()
+    rows = results.slots.num_rows
+    assert rows == results.journal.num_rows
+    trials = results.slots["trials"].to_pylist()
+    assert sum(trials) == sum(link["offered"] for link in results.summary["links"].values())
+    assert set(trials) <= {2, 3, 5}
+    return rows
+
+
+@pytest.mark.parametrize("name", ["smart", "sensor"])
+def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> None:
+    """The shard and the process are named, with the log where it is, and no slot that was scored is lost."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    os.kill(child(live, 2, name), signal.SIGKILL)
+    done = live.end()
+    assert done.status == 3
+    assert f"shard 2 (trials 2 to 4): {name} was ended by signal 9" in done.err
+    assert f"logs/shard-2/{name}.log" in done.err
+    live.nothing_left()
+    assert live.results.summary["ended"] in done.err
+    assert (live.folder / "logs" / "shard-2" / f"{name}.log").is_file()
+    assert whole(live) > 0
+    assert live.results.summary["slots"] > 0
+
+
+def test_a_killed_observer_costs_the_tables_of_its_shard_alone(evedrop: Evedrop) -> None:
+    """What the other shard has measured is in the folder."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    os.kill(child(live, 2, "observer"), signal.SIGKILL)
+    done = live.end()
+    assert done.status == 3
+    assert "shard 2 (trials 2 to 4): observer was ended by signal 9" in done.err
+    live.nothing_left()
+    assert whole(live) > 0
+    assert set(live.results.slots["trials"].to_pylist()) == {2}
+    assert live.results.summary["slots"] == 0
+
+
+def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -> None:
+    """Ctrl-C ends all shards: exit 130, what was measured is readable, nothing is left."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.process.send_signal(signal.SIGINT)
+    done = live.end()
+    assert done.status == 130, done.err
+    live.nothing_left()
+    assert live.results.summary["ended"] == "interrupted"
+    assert whole(live) > 0
+
+
+def test_an_interrupt_before_anything_has_begun_leaves_a_whole_folder_too(evedrop: Evedrop) -> None:
+    """With processes that are just being started: empty tables, and a summary that says so."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    wait_until(live.left, "a first process")
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+    live.nothing_left()
+    assert live.results.summary["ended"] == "interrupted"
+    whole(live)
+
+
+def test_of_a_killed_launcher_the_shards_are_left(evedrop: Evedrop) -> None:
+    """Nobody makes them one, but each is a results folder of its trials, and the run's says so."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.process.kill()
+    live.process.communicate()
+    wait_until(lambda: not live.left(), "no process left of the run")
+    for number, trials in ((1, 2), (2, 3)):
+        results = load_results(live.folder / "shards" / str(number))
+        assert results.summary["trials"] == trials
+        assert results.slots.num_rows == results.summary["slots"] * 4 > 0
+    with pytest.raises(UsageError, match="shards/1"):
+        load_results(live.folder)
+
+
+def test_a_run_in_shards_tells_how_it_does_and_is_not_steered(evedrop: Evedrop) -> None:
+    """`status` is of all shards; what would change the run in one of them alone is refused with the way out."""
+    live = evedrop.live("eavesdroppers", *ENDLESS, "--pace", "0.01")
+    controls = [live.folder / "shards" / str(number) / "control.json" for number in (1, 2)]
+    wait_until(lambda: all(control.is_file() for control in controls), "shards that can be asked")
+    status = evedrop("status", str(live.folder), "--json").summary
+    assert status["state"] == "running"
+    assert all(status["processes"].values())
+    assert status["links"].keys() == {"legitimate", "naive", "suspicious", "smart"}
+    for words in (("link", "smart", "cut"), ("pause",), ("resume",), ("step", "3")):
+        refused = evedrop(words[0], str(live.folder), *words[1:])
+        assert refused.status == 2
+        assert "this run is in shards, which are not steered" in refused.err
+        assert "--set shards=1" in refused.err
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+    assert live.results.summary["events"] == []
+
+
+def test_what_shards_cannot_do_is_refused(evedrop: Evedrop) -> None:
+    """Briefs and a fixed endpoint are of one router; more shards than trials leave one without work."""
+    sharded = ("--trials", "4", "--set", "shards=2")
+    for words, said in (
+        (("brief", "eavesdroppers", *sharded, "--out", "briefs", "--results", "there"), "give --set shards=1"),
+        (("run", "eavesdroppers", *sharded, "--view", "off", "--listen", "tcp/127.0.0.1:17461"), "give --set shards=1"),
+        (("run", "eavesdroppers", "--set", "shards=2"), "shards: is 2; expected at most trials, which is 1"),
+        (("run", "eavesdroppers", "--set", "shards=0"), "shards: is 0; expected a number at least 1"),
+    ):
+        done = evedrop(*words)
+        assert done.status == 2, done
+        assert said in done.err
+    assert not (evedrop.folder / "runs").exists()
+    assert not (evedrop.folder / "briefs").exists()
+
+
+def test_a_secret_that_is_gone_leaves_no_folder(tmp_path: Path) -> None:
+    """What keeps all shards from starting is told once, and the folder can be used again."""
+    secret = tmp_path / "secret.bin"
+    secret.write_bytes(bytes(32))
+    scenario = load("eavesdroppers", {"trials": 2, "shards": 2, "slots": 10, "secret_file": str(secret)})
+    secret.unlink()
+    from emulator.runs.launcher import launch
+
+    with pytest.raises(UsageError, match="--secret"):
+        launch(scenario, tmp_path / "run", "off", None, lambda _: None)
+    assert not (tmp_path / "run").exists()
+
+
+def test_shards_that_cannot_be_made_one_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that is full at the end costs nothing: each shard's results are where the message says."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("emulator.runs.gathering.summary_of", full)
+    with pytest.raises(RunError, match="No space left"):
+        run("eavesdroppers", out=tmp_path / "run", trials=2, shards=2, slots=20, expect=[])
+    for number in (1, 2):
+        assert load_results(tmp_path / "run" / "shards" / str(number)).summary["slots"] == 20
+
+
+def test_the_trial_to_watch_is_run_without_shards(evedrop: Evedrop) -> None:
+    """A single trial has one shard, and the command that shows it says so."""
+    done = evedrop(
+        "montecarlo", "eavesdroppers", "--trials", "20", "--slots", "50", "--set", "shards=2", "--out", "study"
+    )
+    assert done.status in {0, 1}
+    assert "--set shards=1 --first-trial" in done.out

@@ -1,0 +1,335 @@
+"""Classes of anybody's own: the tutorial as it stands, other ways to name them, and the mistakes that are made with them."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emulator.errors import ScenarioError
+from emulator.runs.results import load_results
+from emulator.scenario import load
+from emulator.scenario.amended import with_event
+from tests.conftest import Evedrop
+
+PAGE = Path(__file__).parents[1] / "docs" / "your-own.md"
+BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+SCENARIO = """
+title = "Somebody's own"
+slots = 40
+trials = 3
+
+[process]
+A = [[1.0, 0.1], [0.0, 1.0]]
+Q = [[1e-3, 0.0], [0.0, 1e-3]]
+initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
+
+[encoding]
+scheme = "plain"
+
+[legitimate]
+link = { quality = 0.9 }
+
+[eavesdroppers.eve]
+strategy = "naive"
+link = { quality = 0.8 }
+"""
+
+
+@pytest.fixture(autouse=True)
+def _imports_forgotten(tmp_path: Path) -> Iterator[None]:
+    """What a test imports from its folder is no other test's."""
+    before = list(sys.path)
+    yield
+    sys.path[:] = before
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def tutorial(evedrop: Evedrop) -> Evedrop:
+    """The command in a folder with the files of the tutorial."""
+    for name, text in BLOCK.findall(PAGE.read_text(encoding="utf-8")):
+        (evedrop.folder / name).write_text(text, encoding="utf-8")
+    return evedrop
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Receiver → digest of a run."""
+    return {name: peer["digest"] for name, peer in load_results(folder).summary["peers"].items()}
+
+
+def test_the_tutorial_has_three_short_classes_and_a_scenario() -> None:
+    """Each is complete in less than 40 lines."""
+    blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
+    assert set(blocks) == {"flipped.py", "tracker.py", "shifts.py", "three.toml"}
+    assert all(text.count("\n") < 39 for text in blocks.values())
+
+
+def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
+    """Its classes are checked, and run live, in memory and again from the results, with the same digests."""
+    commands = [
+        line.split()[1:] for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("evedrop ")
+    ]
+    assert {words[0] for words in commands} == {"check", "run", "montecarlo", "diff"}
+    for words in [*commands, ["check", "--scheme", "flipped:Flipped"]]:
+        done = tutorial(*words)
+        assert done.status == 0, (words, done.out, done.err)
+        assert "BROKEN" not in done.out
+    assert (
+        "no difference in 180 blocks of 256 slots: legitimate, naive, tracker" in tutorial("diff", "live", "memory").out
+    )
+    assert "is not the one" not in (again := tutorial("montecarlo", "live", "--trials", "20", "--out", "again")).err
+    assert again.status == 0
+    assert digests(tutorial.folder / "again") == digests(tutorial.folder / "live")
+    peers = load_results(tutorial.folder / "live").summary["peers"]
+    assert peers["tracker"]["expected_trace_covariance"] is None
+    assert peers["legitimate"]["expected_trace_covariance"] == pytest.approx(0.00059, rel=0.02)
+
+
+def test_workers_import_it_too(tutorial: Evedrop) -> None:
+    """Trials by worker processes are the trials of this one."""
+    for workers in "12":
+        options = ("--trials", "502", "--slots", "4", "--workers", workers, "--out", workers)
+        assert tutorial("montecarlo", "three.toml", *options).status == 0
+    assert digests(tutorial.folder / "1") == digests(tutorial.folder / "2")
+
+
+def test_a_module_that_has_changed_since_is_warned_of(tutorial: Evedrop) -> None:
+    """Results know the module that they were made with."""
+    assert tutorial("montecarlo", "three.toml", "--trials", "1", "--out", "run").status == 0
+    with (tutorial.folder / "shifts.py").open("a") as module:
+        module.write("# another\n")
+    assert "warning: the module shifts is not the one these results were made with" in tutorial("check", "run").out
+
+
+def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
+    """`modules` is beside the scenario, wherever the command is typed; every process is told what it needs, and no more."""
+    lib, home = tutorial.folder / "home" / "lib", tutorial.folder / "home"
+    lib.mkdir(parents=True)
+    for module in tutorial.folder.glob("*.py"):
+        module.rename(lib / module.name)
+    scenario = 'modules = "lib"\n' + (tutorial.folder / "three.toml").read_text()
+    (home / "three.toml").write_text(scenario)
+    short = ("home/three.toml", "--slots", "20", "--set", "trials=2")
+    assert tutorial("run", *short, "--view", "off", "--out", "live").status == 0
+    assert tutorial("brief", *short, "--out", "briefs").status == 0
+    told = {path.stem: json.loads(path.read_text())["part"].get("modules") for path in tutorial.folder.glob("briefs/*")}
+    assert {name for name, folder in told.items() if folder == str(lib)} == {
+        "sensor",
+        "legitimate",
+        "tracker",
+        "router",
+    }
+    done = tutorial("check", "home/three.toml", "--set", "modules=nowhere")
+    assert done.status == 2
+    assert f'modules: is "{tutorial.folder}/nowhere", which is no folder' in done.err
+
+
+def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entry points of a package on the path are names like any other, in every process; the built-in ones stay."""
+    site = tutorial.folder / "site"
+    (site / "mypackage-1.0.dist-info").mkdir(parents=True)
+    (site / "mypackage-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mypackage\nVersion: 1.0\n")
+    (site / "mypackage-1.0.dist-info" / "entry_points.txt").write_text(
+        "[evedrop.schemes]\nflip = flipped:Flipped\nplain = flipped:Flipped\n"
+        "[evedrop.eavesdroppers]\ntrack = tracker:Tracker\n[evedrop.links]\nshifts = shifts:Shifts\nbad = shifts:Shift\n"
+    )
+    for module in tutorial.folder.glob("*.py"):
+        module.rename(site / module.name)
+    monkeypatch.setenv("PYTHONPATH", str(site), prepend=":")
+    monkeypatch.syspath_prepend(str(site))
+    changes = ("slots=20", "encoding.scheme=flip", "eavesdroppers.tracker.strategy=track")
+    short = ("three.toml", *(word for change in changes for word in ("--set", change)))
+    named = ("--set", "eavesdroppers.tracker.link.loss.model=shifts")
+    assert tutorial("run", *short, *named, "--view", "off", "--set", "trials=2", "--out", "live").status == 0
+    assert tutorial("montecarlo", *short, *named, "--trials", "2", "--out", "memory").status == 0
+    assert digests(tutorial.folder / "live") == digests(tutorial.folder / "memory")
+    assert 'scheme = "flip"' in (tutorial.folder / "live" / "scenario.toml").read_text()
+    assert tutorial("check", "--scheme", "flip").status == 0
+    done = tutorial("check", *short, "--set", "eavesdroppers.tracker.link.loss.model=bad")
+    assert 'loss.model: is "bad", which an installed package says is shifts:Shift, and the module shifts' in done.err
+    done = tutorial("check", "three.toml", "--set", "encoding.scheme=flop")
+    assert done.status == 2
+    assert "encrypted-schedule, flip, innovation" in done.err
+    assert "did you mean flip?" in done.err
+
+
+HEAD = """
+import numpy as np
+from emulator.model.schemes.plain import Plain, PlainEncoder
+from emulator.model.schemes.scheme import NoInnovations, Packet, Scheme
+from emulator.model.eavesdroppers.naive import Naive
+from emulator.model.eavesdroppers.eavesdropper import PacketReader
+from emulator.model.links.bernoulli import Bernoulli
+from emulator.model.delays.constant import Constant
+from emulator.model.schemes.plain import PlainEstimator
+
+
+class Sends(Plain):
+    def shared(self, keys, batch):
+        encode = lambda encoder, k, x, predicted: self.packet(k, x)
+        encoder = type("Encoder", (PlainEncoder,), {"encode": encode})
+        return NoInnovations(self.process, batch.trials, encoder, lambda: PlainEstimator(self.process, batch.trials))
+"""
+ENTRY = {
+    "scheme": "encoding.scheme",
+    "eavesdropper": "eavesdroppers.eve.strategy",
+    "link": "legitimate.link.loss.model",
+    "delay": "legitimate.link.delay.model",
+}
+MISTAKES = {
+    "shape": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return Packet(x.T, np.zeros(3, bool))",
+              "slot 0: Packet.z has shape (3, 2); expected (2, 3): n states, R trials"),
+    "dtype": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return Packet(x.astype(np.float32), np.zeros(3, bool))",
+              "slot 0: Packet.z has type float32; expected float64"),
+    "pair": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return x, None",
+             "slot 0: encode() returned tuple; expected a Packet"),
+    "raises": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return 1 / 0",
+               "slot 0: encode() raised ZeroDivisionError: division by zero, case_raises.py line 20"),
+    "changes": ("scheme", "Mine(Sends):\n    def packet(self, k, x):\n        x += 1.0",
+                "changes in place what it is given"),
+    "header": ("scheme", "Mine(Plain):\n    header = ('one',)", "`header` names 1 numbers"),
+    "key": ("scheme", "Mine(Plain):\n    def shared(self, keys, batch): return keys['noise']",
+            "reaches for the key of 'noise', and has asked for none"),
+    "abstract": ("scheme", "Mine(Scheme):\n    def outcomes(self, mu): return None",
+                 "which lacks shared; expected a class with this method"),
+    "other": ("scheme", "Mine(Naive):\n    pass", "which is no Scheme; expected a class that inherits from emulator.model"),
+    "absent": ("scheme", "Mein(Plain):\n    pass", "has no Mine; did you mean case_absent:Mein?"),
+    "syntax": ("scheme", "Mine(Plain)\n    pass", "cannot be imported (SyntaxError: "),
+    "fails": ("scheme", "Mine(Plain):\n    pass\n\nimport nowhere_at_all",
+              "ModuleNotFoundError: No module named 'nowhere_at_all', "),
+    "needs": ("scheme", "Mine(Plain):\n    parameters = {'depth': 3}",
+              "encoding.depth: is missing; the scheme case_needs:Mine needs it"),
+    "table": ("scheme", "Mine(Plain):\n    parameters = ('depth',)", "whose parameters are no table"),
+    "taken": ("eavesdropper", "Mine(Naive):\n    parameters = {'window': 3}", "one of whose parameters is called window"),
+    "belief": ("eavesdropper", "Mine(Naive):\n    def step(self, k, belief, heard): return belief._replace(x_hat=heard.z[0])",
+               "slot 0: Belief.x_hat has shape (3,); expected (2, 3)"),
+    "infinite": ("eavesdropper",
+                 "Mine(Naive):\n    def step(self, k, belief, heard): return belief._replace(x_hat=heard.z / 0.0 * 0.0)",
+                 "x_hat, trial 0, is nan; expected finite numbers"),
+    "streams": ("eavesdropper", "Mine(Naive):\n    @classmethod\n    def streams(cls, parameters): return ('schedule',)",
+                "knows of the schedule, and the scheme plain has none"),
+    "fate": ("link", "Mine(Bernoulli):\n    parameters = {}\n    def __init__(self): super().__init__(0.9)\n"
+             "    def fates(self, first, uniforms): return uniforms[:, 0] < 0.9", "has type bool; expected uint8"),
+    "quality": ("link", "Mine(Bernoulli):\n    parameters = {}\n    quality = 1.5\n    def __init__(self): super().__init__(0.9)",
+                "expected probabilities"),
+    "late": ("delay", "Mine(Constant):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
+             "    def delays(self, first, numbers): return -numbers", "expected slots, 0 or more"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_mistake_in_a_class_is_named_before_anything_starts(case: str, evedrop: Evedrop) -> None:
+    """With the entry that names the class, what was found and what was expected; status 2, and no results."""
+    kind, body, said = MISTAKES[case]
+    (evedrop.folder / f"case_{case}.py").write_text(f"{HEAD}\n\nclass {body}\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO)
+    given: dict[str, Any] = {ENTRY[kind]: f"case_{case}:Mine"}
+    if kind == "link":
+        given = {"legitimate.link": f'{{loss = {{model = "case_{case}:Mine"}}}}'}
+    changes = [word for key, value in given.items() for word in ("--set", f"{key}={value}")]
+    with pytest.warns(RuntimeWarning) if case == "infinite" else _nothing():
+        done = evedrop("run", "mine.toml", "--view", "off", "--out", "run", *changes)
+    assert done.status == 2, done.err
+    line = next(line for line in done.err.splitlines() if said in line)
+    assert line.startswith(("  encoding.", f"  {ENTRY[kind]}: is"))
+    assert not (evedrop.folder / "run").exists()
+
+
+class _nothing:  # noqa: N801 - a block that expects nothing
+    def __enter__(self) -> None:
+        """Nothing."""
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing."""
+
+
+@pytest.mark.parametrize("name", ["mine", "nowhere.at.all:Mine", "mine:", ":Mine", "__main__:Mine", "os:path"])
+def test_a_name_that_names_nothing_is_refused(name: str, evedrop: Evedrop) -> None:
+    """Whatever is wrong with it, it is a mistake of the scenario with its path."""
+    (evedrop.folder / "mine.toml").write_text(SCENARIO)
+    for entry in ("encoding.scheme", "eavesdroppers.eve.strategy"):
+        done = evedrop("check", "mine.toml", "--set", f'{entry}="{name}"')
+        assert done.status == 2
+        assert f'  {entry}: is "{name}"' in done.err
+        assert "expected" in done.err
+    assert evedrop("check", "--scheme", name).status == 2
+
+
+def test_one_name_is_one_module(evedrop: Evedrop) -> None:
+    """Two folders with a module of one name cannot be used in one session: nobody could tell which class it was."""
+    for folder in ("here", "there"):
+        (evedrop.folder / folder).mkdir()
+        (evedrop.folder / folder / "twice.py").write_text(f"{HEAD}\n\nclass Mine(Plain):\n    pass\n")
+        (evedrop.folder / folder / "s.toml").write_text(SCENARIO.replace('"plain"', '"twice:Mine"'))
+    assert evedrop("check", "here/s.toml").status == 0
+    done = evedrop("check", "there/s.toml")
+    assert done.status == 2
+    assert "another one of this name is loaded already" in done.err
+    assert evedrop.process("check", "there/s.toml").status == 0
+
+
+def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -> None:
+    """The scenario is refused without the table, with what to write, and runs with it."""
+    body = "from emulator.model.schemes.acknowledged import Acknowledged\n\n\nclass Mine(Acknowledged):\n    pass\n"
+    (evedrop.folder / "heeds.py").write_text(body)
+    (evedrop.folder / "mine.toml").write_text(SCENARIO.replace('"plain"', '"heeds:Mine"'))
+    done = evedrop("run", "mine.toml", "--view", "off", "--out", "run")
+    assert done.status == 2
+    assert "acknowledgements: is missing; the scheme heeds:Mine acts on acknowledgements; expected a table" in done.err
+    with_table = ("--set", "acknowledgements.link.quality=0.9")
+    assert evedrop("run", "mine.toml", "--view", "off", "--out", "live", *with_table).status == 0
+    assert evedrop("montecarlo", "mine.toml", "--trials", "3", "--out", "memory", *with_table).status == 0
+    assert digests(evedrop.folder / "live") == digests(evedrop.folder / "memory")
+
+
+def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
+    """In memory as live, by a worker too: status 3, what was raised, and where."""
+    body = "Mine(Naive):\n    def uses(self, k):\n        return None if k < 20 else 1 / 0"
+    (evedrop.folder / "tires.py").write_text(f"{HEAD}\n\nclass {body}\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO.replace('"naive"', '"tires:Mine"'))
+    for words in (
+        ("montecarlo", "--trials", "2"),
+        ("montecarlo", "--trials", "600", "--workers", "2"),
+        ("run", "--view", "off"),
+    ):
+        done = evedrop(words[0], "mine.toml", *words[1:], "--out", f"run{len(words)}{words[0]}")
+        assert done.status == 3
+        assert "ZeroDivisionError: division by zero" in done.err
+        assert "tires.py" in done.err
+
+
+def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedrop) -> None:
+    """The router knows where the run's modules are; a run that was started without any gets none on the way."""
+    shifts = {"link": "legitimate", "set": {"loss": {"model": "shifts:Shifts", "period": 10, "good": 0.9, "bad": 0.1}}}
+    scenario = load(tutorial.folder / "three.toml")
+    assert with_event(scenario, shifts, 30).event[0].set == shifts["set"]
+    with pytest.raises(ScenarioError, match="set: names shifts:Shifts, and the run was started without modules"):
+        with_event(load("vehicle"), shifts, 30)
+    event = 'event=[{from = 5, to = 15, kill = "tracker"}, {at = 10, link = "naive", set = {loss = {model = "shifts:Shifts", '
+    event += "period = 10, good = 0.9, bad = 0.1}}}]"
+    for name, command in (
+        ("live", ("run", "--view", "off", "--set", "trials=2")),
+        ("memory", ("montecarlo", "--trials", "2")),
+    ):
+        words = (command[0], "three.toml", *command[1:], "--slots", "30", "--out", name, "--set", event)
+        assert tutorial(*words).status == 0
+    assert digests(tutorial.folder / "live") == digests(tutorial.folder / "memory")
+
+
+def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:
+    """No closed form is invented for a scheme of somebody's own; an eavesdropper without one is left out and named."""
+    done = tutorial("design", "three.toml")
+    assert done.status == 2
+    assert "no closed form is known for flipped:Flipped" in done.err
+    paper = ("--set", 'encoding={scheme = "innovation", state_probability = 0.5}')
+    done = tutorial("design", "three.toml", *paper, "--set", "eavesdroppers.tracker.link={quality = 0.9}", "--json")
+    assert json.loads(done.out)["left_out"] == {"tracker": "tracker:Tracker"}
