@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.conftest import wait_until
+from tests.privileged import CannotRun, run, tried
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"dockerd": "docker.io", "docker-compose": "docker-compose", "debootstrap": "debootstrap", "ip": "iproute2"}
@@ -28,42 +29,6 @@ BASE = "evedrop-base"
 _START_SECONDS = 60.0
 
 _INIT = 'mount -t proc proc /proc && ip link set lo up && exec "$@"'
-
-
-class CannotRun(Exception):
-    """No containers can be started on this machine; why, in words."""
-
-
-def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    """A command that must succeed. Raises AssertionError with all it said."""
-    quiet = {"capture_output": True, "text": True, "timeout": 600.0, "stdin": subprocess.DEVNULL, **options}
-    done = subprocess.run([str(word) for word in command], check=False, **quiet)
-    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
-    return done
-
-
-def tried(*command: str | Path, what: str, **options: Any) -> str:
-    """What a command says on its standard output. Raises CannotRun if it fails: that is not what we test."""
-    try:
-        return run(*command, **options).stdout
-    except (AssertionError, OSError, subprocess.TimeoutExpired) as error:
-        raise CannotRun(f"{what}: {str(error)[-2000:]}") from error
-
-
-def install() -> None:
-    """Have every command that is needed. Raises CannotRun."""
-    if sys.platform != "linux" or os.getuid() != 0:
-        raise CannotRun("it takes Linux and root")
-    missing = [package for command, package in PACKAGES.items() if shutil.which(command) is None]
-    if missing:
-        if shutil.which("apt-get") is None:
-            raise CannotRun(f"{', '.join(missing)} are not installed, and there is no apt-get")
-        # A daemon of the machine's own is neither needed nor ours to start.
-        quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "RUNLEVEL": "1"}
-        tried("apt-get", "update", "-q", what="apt-get update", env=quiet)
-        command = ("apt-get", "install", "-q", "-y", "--no-install-recommends", *missing)
-        tried(*command, what=f"apt-get install {' '.join(missing)}", env=quiet)
-    tried("unshare", "--net", "--mount", "--pid", "--fork", "true", what="namespaces cannot be made")
 
 
 def mirror() -> tuple[str, str]:
@@ -81,9 +46,22 @@ def mirror() -> tuple[str, str]:
     raise CannotRun(f"apt knows no mirror of {release}")
 
 
-def bootstrap(folder: Path) -> Path:
-    """A file system with Python from Debian's own packages, as a tar. Raises CannotRun if the mirror cannot be reached."""
+def base(folder: Path) -> Path:
+    """A file system with Python from Debian's own packages, as a tar, kept in build/. Raises CannotRun if it cannot be made."""
     address, release = mirror()
+    kept = ROOT / "build" / f"test-base-{release}-{platform.machine()}.tar"
+    if not kept.exists():
+        kept.parent.mkdir(exist_ok=True)
+        half = kept.with_name(f"{kept.name}-{os.getpid()}")
+        try:
+            shutil.move(_bootstrapped(folder, address, release), half)
+            half.replace(kept)
+        finally:
+            half.unlink(missing_ok=True)
+    return kept
+
+
+def _bootstrapped(folder: Path, address: str, release: str) -> Path:
     system, tar = folder / "system", folder / "system.tar"
     tried(
         *("debootstrap", "--variant=minbase", "--include=python3,python3-venv", release, system, address),
