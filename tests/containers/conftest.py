@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.containers.machine import BASE, PACKAGES, Docker, base, checkout
+from tests.containers.machine import BASE, PACKAGES, Docker, base, checkout, take_away_leftovers
 from tests.containers.project import Project, projects
 from tests.privileged import CannotRun, prepare, run, skip
 
@@ -28,6 +28,7 @@ def docker(request: pytest.FixtureRequest) -> Iterator[Docker]:
         folder = Path(made)
         try:
             prepare(PACKAGES)
+            take_away_leftovers()
             daemon = Docker(folder)
         except CannotRun as error:
             skip(error)
