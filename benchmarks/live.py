@@ -21,8 +21,9 @@ from processes import Usage, watch
 
 from emulator.brief import Brief
 from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
+from emulator.network.packets import uplink
 from emulator.network.session import Session
-from emulator.network.wire import progress, uplink
+from emulator.network.wire import progress
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.ports import free_port
 from emulator.scenario import load

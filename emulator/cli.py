@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
-from emulator import commands, operate
+from emulator import commands, operate, roles
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 
 Command = Callable[[argparse.Namespace], int]
@@ -147,11 +147,11 @@ def _parser() -> argparse.ArgumentParser:
         "fit", commands.fit_link, "the loss model, and delays, of a recorded link", _argument("trace", "TRACE"), _fits
     )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
-    add("brief", commands.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
-    add("health", commands.health, "whether the process of a brief is on the network", _argument("brief", "BRIEF"))
+    add("brief", roles.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
+    add("health", roles.health, "whether the process of a brief is on the network", _argument("brief", "BRIEF"))
     for role in ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
         of_role = (_role(role), _observed, _served) if role == "observer" else (_role(role),)
-        add(role, commands.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
+        add(role, roles.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser
 
 

@@ -88,11 +88,13 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
     try:
         found = ask(control, request, patience)
     except zenoh.ZError as error:
-        raise no_run(run, f"nobody answers at {control.router}") from error
+        raise no_run(
+            run, f"nobody answers at {control.router}, or not yet again: a router that was lost is started again"
+        ) from error
     if found is None and time.monotonic() - began >= patience:
         raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
     if found is None:
-        raise no_run(run, "it ended before it answered")
+        raise no_run(run, "it ended before it answered, or its router did, which is started again")
     if found.refused:
         count = "1 mistake" if len(found.refused) == 1 else f"{len(found.refused)} mistakes"
         raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in found.refused)]))

@@ -13,10 +13,12 @@ from emulator.brief import Brief
 from emulator.model.follower import Follower
 from emulator.model.receiver import Belief, Receiver
 from emulator.model.transit import Arrival
+from emulator.network.packets import acknowledgement, is_hold, read_acknowledgement, read_delivery
 from emulator.network.reporting import BeliefReporter
 from emulator.network.resending import Due
 from emulator.network.session import Inbox, Session
-from emulator.network.wire import Reader, acknowledgement, is_hold, leaving, read_acknowledgement, read_delivery
+from emulator.network.telemetry import leaving
+from emulator.network.wire import Reader
 from peers.loop import Consultation
 
 

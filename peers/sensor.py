@@ -14,10 +14,12 @@ from emulator.model.receiver import Flags
 from emulator.model.schemes import scheme_of
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.network.access import OBSERVER, SENSOR
+from emulator.network.packets import Beside, hold, once_more, read_acknowledgement, uplink
 from emulator.network.reporting import TruthReporter
 from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
-from emulator.network.wire import Beside, Reader, held, hold, once_more, read_acknowledgement, read_progress, uplink
+from emulator.network.telemetry import held
+from emulator.network.wire import Reader, read_progress
 from peers.loop import Actuator
 
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed

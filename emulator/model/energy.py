@@ -41,22 +41,26 @@ class Meter:
     @classmethod
     def over(cls, grid_power: Floats, other: Floats) -> Meter:
         """Of some slots; both (slots, …)."""
-        return cls(
-            np.maximum(grid_power, 0.0).sum(axis=0),
-            np.maximum(-grid_power, 0.0).sum(axis=0),
-            np.maximum(other, 0.0).sum(axis=0),
-            np.maximum(-other, 0.0).sum(axis=0),
-            np.abs(grid_power - other).sum(axis=0),
-        )
+        return cls.zero(*grid_power.shape[1:]).then(grid_power, other)
 
     @classmethod
-    def zero(cls, trials: int) -> Meter:
-        """Of no slots."""
-        return cls(*(np.zeros(trials) for _ in range(5)))
+    def zero(cls, *shape: int) -> Meter:
+        """Of no slots; shape: that of (…)."""
+        return cls(*(np.zeros(shape) for _ in range(5)))
 
-    def with_more(self, more: Meter) -> Meter:
-        """Of these slots and others."""
-        return Meter(*(mine + theirs for mine, theirs in zip(self._sums, more._sums, strict=True)))
+    def then(self, grid_power: Floats, other: Floats) -> Meter:
+        """Of these slots and the next ones, both (slots, …): the same bits in whatever parts the slots come."""
+        other = np.broadcast_to(other, grid_power.shape)
+        more = (
+            np.maximum(grid_power, 0.0),
+            np.maximum(-grid_power, 0.0),
+            np.maximum(other, 0.0),
+            np.maximum(-other, 0.0),
+            np.abs(grid_power - other),
+        )
+        # A sum of numpy's adds up in an order of its own, and the differences of such sums are small.
+        sums = (np.add.accumulate([mine, *rows])[-1] for mine, rows in zip(self._sums, more, strict=True))
+        return Meter(*sums)
 
     @classmethod
     def of_all(cls, parts: list[Meter]) -> Meter:

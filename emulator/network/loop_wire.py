@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from emulator.model.digest import Digests
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
-from emulator.network.wire import Reader, pack, packed_flags, read_digests, read_failed
+from emulator.network.telemetry import read_digests, read_failed
+from emulator.network.wire import Reader, pack, packed_flags
 
 
 def known(name: str, k: int, x: Floats) -> bytes:

@@ -16,7 +16,8 @@ from emulator.model.digest import BeliefLog, Digests, InputLog
 from emulator.model.process import Floats
 from emulator.model.receiver import Belief, Flags, trace_of
 from emulator.network.loop_wire import Decisions
-from emulator.network.wire import Report, Truth, progress
+from emulator.network.telemetry import Report, Truth
+from emulator.network.wire import progress
 
 
 def is_due(brief: Brief, k: int) -> bool:

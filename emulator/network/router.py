@@ -29,24 +29,23 @@ from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access
 from emulator.network.commands import Anew, Commands
 from emulator.network.doorkeeping import until_all_left, users_file
 from emulator.network.linked import at_router
-from emulator.network.postman import Postman
-from emulator.network.resending import Due
-from emulator.network.session import Session, router_config
-from emulator.network.wire import (
+from emulator.network.packets import (
     Beside,
-    Journal,
-    Reader,
     acknowledgement,
     delivery,
     hold,
     is_hold,
     is_once_more,
-    packed_flags,
     packed_header,
     read_acknowledgement,
     read_beside,
     read_uplink,
 )
+from emulator.network.postman import Postman
+from emulator.network.resending import Due
+from emulator.network.session import Session, router_config
+from emulator.network.telemetry import Journal
+from emulator.network.wire import Reader, packed_flags
 
 
 class Downlink:

@@ -345,7 +345,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
     title = some.title.rpartition(" (")[0]
     schemes = {}
     for scheme in whole:
-        groups = [(group, merger.totals) for group, merger in played if group.scheme == scheme]
+        groups = [(group, merger.totals.tallies) for group, merger in played if group.scheme == scheme]
         cells = {one.adversary: Cell(one) for one in matchups.undefined if one.scheme == scheme}
         for group, totals in groups:
             cells |= _cells(group, totals)

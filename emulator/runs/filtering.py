@@ -6,6 +6,7 @@ Source: docs/results.md, filter.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,8 @@ class FilterTally:
         known = [part for part in parts if part is not None]
         if not known:
             return None
-        whole = known[0]
+        whole = copy(known[0])
+        whole.sums = dict(whole.sums)
         for part in known[1:]:
             whole.slots = min(whole.slots, part.slots)
             whole.count += part.count

@@ -29,11 +29,11 @@ class Gathered(ABC):
     """How the rows of some slots of all shards become those of the run. Abstract."""
 
     def __init__(self, receivers: Sequence[str], row_bytes: float) -> None:
-        """row_bytes: how large a row of the run's table is, about."""
+        """receivers: none of a table without a column of them; row_bytes: how large a row of the run's table is, about."""
         self.receivers = pa.array(receivers)
         self.by = "peer"
         """The column of the receivers."""
-        self.slots_at_once = max(1, int(min(_ROWS, _BYTES / row_bytes)) // len(receivers))
+        self.slots_at_once = max(1, int(min(_ROWS, _BYTES / row_bytes)) // max(1, len(receivers)))
 
     def write(self, sources: Sequence[Path], table: Path) -> None:
         """Put together the tables of the shards, in order, in place of an empty table of the run."""
@@ -49,7 +49,9 @@ class Gathered(ABC):
         os.replace(unfinished, table)
 
     def codes(self, table: pa.Table) -> NDArray[np.int64]:
-        """The receiver of every row, by its place among them."""
+        """The receiver of every row, by its place among them; 0 of a table without them."""
+        if not len(self.receivers):
+            return np.zeros(table.num_rows, np.int64)
         found = pc.index_in(table[self.by].cast(pa.string()), value_set=self.receivers)
         codes: NDArray[np.int64] = found.to_numpy().astype(np.int64)
         return codes
@@ -86,7 +88,7 @@ class _Rows:
     def __init__(self, path: Path, schema: pa.Schema, gathered: Gathered) -> None:
         self._gathered = gathered
         self._held: pa.Table = schema.empty_table()
-        self._reach = np.zeros(len(gathered.receivers), np.int64)
+        self._reach = np.zeros(max(1, len(gathered.receivers)), np.int64)
         try:
             self._batches = pq.ParquetFile(path).iter_batches(gathered.slots_at_once * len(self._reach))
         except (OSError, pa.ArrowException):
@@ -177,9 +179,9 @@ class Journals(Gathered):
 class Recorded(Gathered):
     """The recorded trials, each in full. Final."""
 
-    def __init__(self, receivers: Sequence[str], trials: range, n: int) -> None:
-        """trials: those that are recorded, of a process of n states."""
-        super().__init__(receivers, len(trials) * 8.0 * (6 + 2 * n + n * n))
+    def __init__(self, receivers: Sequence[str], trials: range, numbers: int) -> None:
+        """trials: those that are recorded; numbers: in a row of one of them."""
+        super().__init__(receivers, len(trials) * 8.0 * numbers)
         self._trials = trials
 
     def _one(self, first: int, parts: Sequence[pa.Table], schema: pa.Schema) -> pa.Table:

@@ -23,11 +23,12 @@ import pyarrow.parquet as pq
 
 from emulator.errors import UsageError
 from emulator.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
-from emulator.runs.gathered_tables import Journals, Recorded, Statistics
+from emulator.runs.gathered_tables import Gathered, Journals, Recorded, Statistics
 from emulator.runs.judge import replay_of
-from emulator.runs.results import Results, ResultsWriter, load_results, write_summary
+from emulator.runs.results import ResultsWriter, load_results, write_summary
 from emulator.runs.scorekeeper import Ending, summary_of, write_resolved
-from emulator.runs.shard_score import Score
+from emulator.runs.shard_score import left
+from emulator.runs.totals import Totals
 from emulator.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -45,30 +46,37 @@ def gather(
     cannot be written, with the shards' own as they are.
     """
     write_resolved(folder, scenario)
-    n, receivers = len(scenario.process.A), scenario.receivers
-    with ResultsWriter(folder, receivers, n) as writer:
-        digests = {name: _digest(scenario, name, shards, writer) for name in receivers}
-    first = scenario.first_trial
-    tables = {
-        "slots": Statistics(receivers),
-        "trials": Recorded(receivers, range(first, first + scenario.record_trials), n),
-        "journal": Journals(receivers, [shard.scenario.trials for shard in shards]),
-    }
-    for name, gathered in tables.items():
+    with ResultsWriter.of(folder, scenario) as writer:
+        digests = {name: _digest(scenario, name, shards, writer) for name in scenario.digested}
+    for name, gathered in _tables(scenario, shards).items():
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
     wall = 0.0 if started is None else time.monotonic() - started
-    score = Score.merged([Score.left(shard.folder, shard.scenario) for shard in shards])
-    ending = Ending(wall, how, replay_of(folder, scenario))
-    summary = summary_of(
-        scenario, score.tallies, digests, ending, events=_happened(shards, "events"), detection=score.detection
-    )
+    totals = Totals.merged([left(shard.folder, shard.scenario) for shard in shards])
+    replay = replay_of(folder, scenario)
+    ending = Ending(wall, how, replay, events=_events(shards), outages=_outages(shards))
+    summary = summary_of(scenario, totals, digests, ending)
     write_summary(folder, summary)
     _tidy(folder, shards)
     return summary
 
 
+def _tables(scenario: Scenario, shards: Sequence[Shard]) -> dict[str, Gathered]:
+    """How the tables are made one, by name."""
+    n, receivers, first = len(scenario.process.A), scenario.receivers, scenario.first_trial
+    recorded = range(first, first + scenario.record_trials)
+    tables: dict[str, Gathered] = {
+        "slots": Statistics(receivers),
+        "trials": Recorded(receivers, recorded, 6 + 2 * n + n * n),
+        "journal": Journals(receivers, [shard.scenario.trials for shard in shards]),
+    }
+    if scenario.controller is not None and scenario.plant is not None:
+        plant = scenario.plant
+        tables["inputs"] = Recorded((), recorded, 4 + len(plant.inputs) + len(plant.disturbances))
+    return tables
+
+
 def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: ResultsWriter) -> str | None:
-    """Write the digests of one receiver's blocks, and make that of the run of them; None if some are missing."""
+    """Write the digests of one who makes them, and make that of the run of them; None if some blocks are missing."""
     blocks = [_blocks(shard, name) for shard in shards]
     for block in sorted(set(chain.from_iterable(blocks))):
         for shard, own in zip(shards, blocks, strict=True):
@@ -83,7 +91,7 @@ def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: Resu
 
 
 def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
-    """Block → digests of the shard's trials, (R, 32), of one receiver."""
+    """Block → digests of the shard's trials, (R, 32), of one peer."""
     try:
         table = pq.read_table(shard.folder / "digests.parquet", filters=[("peer", "=", name)])
     except (OSError, pa.ArrowException):  # whoever wrote it was killed before it was whole
@@ -93,18 +101,25 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     return {int(start): digests[starts == start] for start in np.unique(starts)}
 
 
-def _happened(shards: Sequence[Shard], what: str) -> list[Mapping[str, Any]]:
-    """All that happened in any shard, by an entry of its summary: each once, in order of slots."""
+def _events(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
+    """All that happened in any shard: each once, in order of slots."""
     found: list[Mapping[str, Any]] = []
-    for results in _results(shards):
-        found += [one for one in results.summary[what] if one not in found]
+    for _, summary in _summaries(shards):
+        found += [one for one in summary["events"] if one not in found]
     return sorted(found, key=lambda one: int(one["slot"]))
 
 
-def _results(shards: Sequence[Shard]) -> Iterator[Results]:
+def _outages(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
+    """Who was cut off in any shard, and in which, in order of slots."""
+    found = [{"shard": shard.number, **one} for shard, summary in _summaries(shards) for one in summary["outages"]]
+    return sorted(found, key=lambda one: int(one["slot"]))
+
+
+def _summaries(shards: Sequence[Shard]) -> Iterator[tuple[Shard, Mapping[str, Any]]]:
+    """Of those that have left one."""
     for shard in shards:
         with suppress(UsageError):
-            yield load_results(shard.folder)
+            yield shard, load_results(shard.folder).summary
 
 
 def _tidy(folder: Path, shards: Sequence[Shard]) -> None:

@@ -6,6 +6,7 @@ Source: docs/microgrid.md, energy and privacy; docs/results.md, household.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -38,11 +39,12 @@ class HouseholdTally:
     def __init__(self, scenario: Scenario, table: HouseholdTable, trials: int) -> None:
         plant, controller, assignment = scenario.driven, scenario.controller, scenario.assignment
         assert plant is not None and controller is not None and assignment is not None and scenario.plant is not None  # noqa: S101, PT018 - a house has them
-        self._scenario, self._table, self._plant = scenario, table, plant
+        self._table, self._plant = table, plant
+        self._slot_seconds = scenario.slot_seconds or 1.0
         self._disturbances = disturbances_of(scenario)
         self._grid = scenario.plant.inputs.index(table.grid)
         self._period = controller.period
-        self._window = table.window(self._period * (scenario.slot_seconds or 1.0))
+        self._window = table.window(self._period * self._slot_seconds)
         strategy = CONTROLLERS[controller.strategy]
         own = strategy(assignment, trials)
         self._perfect = PerfectLoop(scenario.process.process, plant, own, self._period, self._disturbances)
@@ -63,7 +65,7 @@ class HouseholdTally:
         for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
             other[row] = self._perfect.follow(state, inputs)[self._grid]
             grid[row] = self._plant.limited(inputs)[self._grid]
-        self.meter = self.meter.with_more(Meter.over(grid, other))
+        self.meter = self.meter.then(grid, other)
         for row in range(-self.done % self._period, len(x), self._period):
             for name, guess in self._guesses.items():
                 load = guess.take(self.done + row, estimates[name][row])
@@ -71,23 +73,29 @@ class HouseholdTally:
                     self._guessed[name].append(load)
         self.done += len(x)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the controllers, which may hold what only their own process can: it takes no further slots elsewhere."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_perfect", "_guesses")}
+
     @classmethod
     def merged(cls, parts: Sequence[HouseholdTally | None]) -> HouseholdTally | None:
-        """Of several sets of trials, in order; all have come to the slot that the first left off at."""
+        """Of several sets of trials, in order. Where some came to fewer slots, guesses are those of the slots of all."""
         known = [part for part in parts if part is not None]
         if not known:
             return None
-        whole = known[0]
+        whole = copy(known[0])
         whole.meter = Meter.of_all([part.meter for part in known])
+        whole.done = min(part.done for part in known)
         fewest = min(len(loads) for part in known for loads in part._guessed.values())
-        for name in whole._guessed:
+        whole._guessed = {}
+        for name in known[0]._guessed:
             rows = zip(*(part._guessed[name][:fewest] for part in known), strict=True)
             whole._guessed[name] = [np.concatenate(row) for row in rows]
         return whole
 
     def summary(self) -> dict[str, Any]:
         """What the summary says of the house: means over trials; None for what there is none of."""
-        meter, seconds = self.meter, self._scenario.slot_seconds or 1.0
+        meter, seconds = self.meter, self._slot_seconds
         apart = meter.difference
         return {
             "bought_energy": _mean(energy(meter.bought, seconds)),

@@ -17,15 +17,8 @@ from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
 from emulator.network.access import CONTROLLER
 from emulator.network.loop_wire import read_decisions
-from emulator.network.wire import (
-    Journal,
-    Reader,
-    Report,
-    Truth,
-    read_journal,
-    read_report,
-    read_truth,
-)
+from emulator.network.telemetry import Journal, Report, Truth, read_journal, read_report, read_truth
+from emulator.network.wire import Reader
 
 Message = TypeVar("Message")
 

@@ -125,15 +125,15 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
     """How the run ended, in its summary; an empty one if the observer did not come to it."""
     # Tables and theory take longer to import than all else here, and a run that ends well needs neither.
     from emulator.runs.results import ResultsWriter, load_results, write_summary  # noqa: PLC0415
-    from emulator.runs.score import Tally  # noqa: PLC0415
     from emulator.runs.scorekeeper import Ending, summary_of  # noqa: PLC0415
+    from emulator.runs.totals import Totals  # noqa: PLC0415
 
     with contextlib.suppress(OSError):
         try:
             summary = {**load_results(folder).summary, "ended": how}
         except UsageError:
-            tallies = {name: Tally(scenario.slots, scenario.trials) for name in scenario.receivers}
-            summary = summary_of(scenario, tallies, dict.fromkeys(scenario.digested), Ending(0.0, how))
+            totals = Totals.nothing(scenario, scenario.trials)
+            summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
             if not any(folder.glob("*.parquet")):
                 with ResultsWriter.of(folder, scenario):
                     pass

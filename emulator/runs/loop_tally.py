@@ -6,6 +6,7 @@ Source: docs/results.md, controller.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,7 +123,7 @@ class LoopTally:
         known = [part for part in parts if part is not None]
         if not known:
             return None
-        whole = known[0]
+        whole = copy(known[0])
         for part in known[1:]:
             whole.slots += part.slots
             whole.failed += part.failed

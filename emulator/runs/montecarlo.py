@@ -10,7 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,17 @@ from emulator.model.digest import RunDigest, block_starts
 from emulator.model.eavesdroppers import STRATEGIES
 from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.schemes import scheme_of
-from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
-from emulator.runs.filtering import FilterTally
 from emulator.runs.folder import new_folder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
 from emulator.runs.judge import replay_of
-from emulator.runs.loop_tally import LoopTally, SolveTimes
 from emulator.runs.results import ResultsWriter, write_summary
-from emulator.runs.score import SlotSums, Tally, merged, squared_errors
+from emulator.runs.score import SlotSums, squared_errors
 from emulator.runs.scorekeeper import Ending, events_of, summary_of, write_resolved
 from emulator.runs.signals import stop_on_signals
 from emulator.runs.simulation import Mode
+from emulator.runs.totals import Totals
 from emulator.runs.trials import BatchResult, Task, tasks_of
 from emulator.runs.workers import connected, in_processes, in_this_process, on_cluster
 from emulator.scenario import Scenario
@@ -213,21 +211,17 @@ class Merger:
         self._mode = mode
         names = scenario.receivers
         self._sums = {name: SlotSums.zero(scenario.slots) for name in names}
-        self._tallies: dict[str, dict[int, Tally]] = {name: {} for name in names}
+        self._totals: list[Totals] = []
         self._digests = {name: RunDigest() for name in scenario.digested}
         self._errors: dict[str, SlotHistograms] = {}
         self._traces: dict[str, SlotHistograms] = {}
         self._whole = mode is Mode.EXACT
-        self._detections: list[Detection] = []
-        self._loops: list[LoopTally | None] = []
-        self._solve_times = SolveTimes()
-        self._filters: list[FilterTally | None] = []
         self.trials = 0
 
     @property
     def complete(self) -> bool:
         """Whether every trial has every slot."""
-        done = (tally.done == tally.slots for tallies in self._tallies.values() for tally in tallies.values())
+        done = (tally.done == tally.slots for totals in self._totals for tally in totals.tallies.values())
         return self.trials == self._scenario.trials and all(done)
 
     @np.errstate(over="ignore")
@@ -235,15 +229,11 @@ class Merger:
         """Take the next batch; its digests and recorded trials are written if there is somewhere to."""
         for block in result.blocks:
             self.trials += block.trials
-            self._detections.append(block.detection)
-            self._loops.append(block.loop)
-            self._filters.append(block.filter)
+            self._totals.append(block.totals)
             for name in self._scenario.receivers:
                 self._sums[name].add(0, block.sums[name])
-                self._tallies[name][block.start] = block.tallies[name]
             if self._mode is Mode.EXACT:
                 self._add_digests(block.start, block.digests, writer)
-        self._solve_times.merge(result.solve_times)
         for mine, theirs in ((self._errors, result.errors), (self._traces, result.traces)):
             for name, histograms in theirs.items():
                 if name in mine:
@@ -278,21 +268,15 @@ class Merger:
             writer.slot_rows(0, name, sums, expected[name][:count], quantiles[:count], covariances)
 
     @property
-    def totals(self) -> dict[str, Tally]:
-        """Receiver → the tally of all that was added."""
-        return {name: merged(tallies) for name, tallies in self._tallies.items()}
+    def totals(self) -> Totals:
+        """Of all that was added."""
+        return Totals.merged(self._totals)
 
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> dict[str, Any]:
-        """The summary of all that was added."""
+        """The summary of all that was added; mode and events are told here."""
         totals = self.totals
         whole = self._whole and self.complete
         digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
-        detection = Detection.merged(self._detections) if self._mode is Mode.EXACT else None
-        events = events_of(self._scenario, min(total.done for total in totals.values()))
-        loop = LoopTally.merged(self._loops) if self._mode is Mode.EXACT else None
-        looped = None if loop is None else (loop, self._solve_times)
-        filtered = FilterTally.merged(self._filters) if self._mode is Mode.EXACT else None
-        return summary_of(
-            self._scenario, totals, digests, ending, self._mode.value, events, detection, looped, filtered
-        )
+        events = events_of(self._scenario, min(tally.done for tally in totals.tallies.values()))
+        return summary_of(self._scenario, totals, digests, replace(ending, mode=self._mode.value, events=events))

@@ -28,17 +28,17 @@ from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Question, Session
-from emulator.network.wire import Reader, is_held, is_leaving, read_leaving
+from emulator.network.telemetry import is_held, is_leaving, read_leaving
+from emulator.network.wire import Reader
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
-from emulator.runs.loop_tally import SolveTimes
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
-from emulator.runs.shard_score import Score
+from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
@@ -134,7 +134,6 @@ class Observation:
         loop = None if table is None or plant is None else (plant.inputs, table.period)
         measures = plant is not None and plant.output_matrix is not None
         self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
-        self._solve_times = SolveTimes()
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -257,7 +256,7 @@ class Observation:
         steering, now = self._steering, time.monotonic()
         before, done = self._recent
         links = {}
-        for name, tally in self._keeper.tallies.items():
+        for name, tally in self._keeper.totals.tallies.items():
             account = tally.link
             fraction = account["delivered"] / account["offered"] if account["offered"] else None
             links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
@@ -277,9 +276,9 @@ class Observation:
             return
         if source == ROUTER:
             for name, account in self._joiner.journal(message).items():
-                self._keeper.tallies[name].count(account)
+                self._keeper.totals.tallies[name].count(account)
         elif source == CONTROLLER:
-            self._solve_times.add(self._joiner.decisions(message).tolist())
+            self._keeper.totals.solve_times.add(self._joiner.decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
@@ -355,20 +354,11 @@ class Observation:
         safe = self._recording.close() if self._recording is not None else True
         if self._brief.part["shard"]:
             with suppress(OSError):  # of a full disk, which the summary says
-                Score(self._keeper.tallies, self._keeper.detection).leave(self.folder)
+                leave(self._keeper.totals, self.folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
-        ending = Ending(self._ended - self._started, how, replay_of(self.folder, self._scenario))
-        summary = summary_of(
-            self._scenario,
-            self._keeper.tallies,
-            digests,
-            ending,
-            events=self._events,
-            outages=self._outages,
-            detection=self._keeper.detection,
-            filtered=self._keeper.filter,
-            loop=None if self._keeper.loop is None else (self._keeper.loop, self._solve_times),
-        )
+        replay = replay_of(self.folder, self._scenario)
+        ending = Ending(self._ended - self._started, how, replay, events=self._events, outages=self._outages)
+        summary = summary_of(self._scenario, self._keeper.totals, digests, ending)
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
             summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"

@@ -90,7 +90,8 @@ class ProgressLine:
 def outage_line(outage: News) -> str:
     """An outage of the summary as a sentence."""
     went = "the run did not go on" if outage["until"] is None else f"the run went on after {outage['seconds']:.1f} s"
-    return f"{outage['process']} cut off at slot {outage['slot']}; {went}"
+    where = f" of shard {outage['shard']}" if "shard" in outage else ""
+    return f"{outage['process']}{where} cut off at slot {outage['slot']}; {went}"
 
 
 def closing_table(summary: News, width: int) -> Table:

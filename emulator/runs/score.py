@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -215,9 +215,8 @@ def trial_means(tally: Tally) -> Floats:
     return means
 
 
-def merged(tallies: Mapping[int, Tally]) -> Tally:
-    """One tally of several disjoint sets of trials, in the order of their keys."""
-    parts = [tallies[key] for key in sorted(tallies)]
+def merged(parts: Sequence[Tally]) -> Tally:
+    """One tally of several disjoint sets of trials, in their order."""
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
     total.watched = Watched.of([part.watched for part in parts])
     total.done = min(part.done for part in parts)

@@ -19,17 +19,16 @@ from emulator.model.process import Floats
 from emulator.modules import sources_of
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.plant_data import disturbances_text
-from emulator.runs.acknowledging import Detection
 from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
-from emulator.runs.filtering import FilterTally, true_errors
+from emulator.runs.filtering import true_errors
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
-from emulator.runs.loop_tally import Acted, LoopTally, SolveTimes
+from emulator.runs.loop_tally import Acted
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
+from emulator.runs.totals import Totals
 from emulator.runs.verdict import Secrecy, secrecy
-from emulator.runs.watched import Watched, watches_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
@@ -52,46 +51,45 @@ class Scorekeeper:
 
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
-        self.detection = Detection(trials)
-        self.loop = LoopTally.of(scenario, trials)
-        self.filter = FilterTally.of(scenario)
-        self.tallies = {
-            name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches_of(scenario).items()
-        }
+        self.totals = Totals.of(scenario, trials)
 
     def add(self, slots: Slots) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory."""
         scored = {}
-        if slots.alarms is not None:
-            self.detection.add(slots.first, slots.alarms)
-        if slots.true is not None and self.filter is not None:
-            x_hats = {name: one.x_hat for name, one in slots.receivers.items()}
-            self.filter.add(true_errors(slots.true, slots.x, x_hats))
-        if slots.inputs is not None and self.loop is not None:
-            estimates = {name: one.x_hat for name, one in slots.receivers.items()}
-            true = slots.x if slots.true is None else slots.true
-            self.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
+        self._add_plant(slots)
         for name, receiver in slots.receivers.items():
             errors = squared_errors(slots.x, receiver.x_hat)
             one = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
-            self.tallies[name].add(slots.first, *one)
-            self.tallies[name].account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
+            tally = self.totals.tallies[name]
+            tally.add(slots.first, *one)
+            tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
-                self.tallies[name].account_sent(slots.sent, receiver.delivered, receiver.unsent)
+                tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)
             late = None
             if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
                 late = (receiver.late, receiver.late_used)
-                self.tallies[name].account_late(receiver.late_delivered, *late)
-            self.tallies[name].watched.add(slots.first, errors, receiver.action, one.sums.trace, late)
+                tally.account_late(receiver.late_delivered, *late)
+            tally.watched.add(slots.first, errors, receiver.action, one.sums.trace, late)
             scored[name] = one
         return scored
+
+    def _add_plant(self, slots: Slots) -> None:
+        """Take what slots say of alarms, of a controller, and of a sensor that filters."""
+        totals, estimates = self.totals, {name: one.x_hat for name, one in slots.receivers.items()}
+        if slots.alarms is not None and totals.detection is not None:
+            totals.detection.add(slots.first, slots.alarms)
+        if slots.true is not None and totals.filter is not None:
+            totals.filter.add(true_errors(slots.true, slots.x, estimates))
+        if slots.inputs is not None and totals.loop is not None:
+            true = slots.x if slots.true is None else slots.true
+            totals.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended."""
+    """How a run went, to its end."""
 
     wall_seconds: float
     """Start command to last row on disk."""
@@ -99,6 +97,12 @@ class Ending:
     """`complete`, `interrupted`, or why it failed."""
     replay: str | None = None
     """The command that runs it once more, for whoever sees an expectation fail."""
+    mode: str = "live"
+    """Or that of a run in memory."""
+    events: Sequence[Mapping[str, Any]] = ()
+    """As the summary has them."""
+    outages: Sequence[Mapping[str, Any]] = ()
+    """The same."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -108,19 +112,9 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
     return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
 
 
-def summary_of(
-    scenario: Scenario,
-    tallies: Mapping[str, Tally],
-    digests: Mapping[str, str | None],
-    ending: Ending,
-    mode: str = "live",
-    events: Sequence[Mapping[str, Any]] = (),
-    detection: Detection | None = None,
-    loop: tuple[LoopTally, SolveTimes] | None = None,
-    filtered: FilterTally | None = None,
-    outages: Sequence[Mapping[str, Any]] = (),
-) -> dict[str, Any]:
+def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> dict[str, Any]:
     """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
+    tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     expected = expectations_of(scenario)
     peers: dict[str, dict[str, Any]] = {
         name: {
@@ -131,18 +125,17 @@ def summary_of(
         }
         for name, tally in tallies.items()
     }
-    if mode == "covariance-only":
+    if ending.mode == "covariance-only":
         for peer in peers.values():
             peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
-    house = None if loop is None else loop[0].household
-    household = None if house is None else house.summary()
+    household = None if loop is None or loop.household is None else loop.household.summary()
     user = tallies[LEGITIMATE]
     links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
     evidence = Evidence(scenario, peers, links, tallies, expected, secret, household)
     return {
         "scenario": scenario.title,
-        "mode": mode,
+        "mode": ending.mode,
         "seed": scenario.seed,
         "slots": user.done,
         "trials": user.trials,
@@ -152,14 +145,14 @@ def summary_of(
         "ended": ending.how,
         "peers": peers,
         "links": links,
-        "events": list(events),
-        "outages": list(outages),
+        "events": list(ending.events),
+        "outages": list(ending.outages),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
         "controller": None
         if loop is None
-        else loop[0].summary(scenario, peers[LEGITIMATE], loop[1], digests[CONTROLLER]),
-        "filter": None if filtered is None else filtered.summary(scenario),
+        else loop.summary(scenario, peers[LEGITIMATE], totals.solve_times, digests[CONTROLLER]),
+        "filter": None if totals.filter is None else totals.filter.summary(scenario),
         "household": household,
         "surprising": _surprising(scenario, tallies),
         "expectations": evidence.judged(ending.replay),

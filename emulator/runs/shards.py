@@ -110,7 +110,7 @@ class OneProgress:
         else:
             if kind == "ended" and number in self._latest:  # its last slots were too few to be told of
                 self._latest[number] = {**self._latest[number], "done": self._slots}
-            self._tell(news)
+            self._tell({**news, "shard": number} if kind == "reconnected" else news)
 
     def _all(self) -> dict[str, Any]:
         """The slowest one's place and rate, and errors over all trials."""

@@ -16,15 +16,12 @@ import numpy as np
 from emulator.model.account import Accountant
 from emulator.model.digest import Digests
 from emulator.model.process import Floats
-from emulator.runs.acknowledging import Detection
 from emulator.runs.expectation import expected_traces_of
-from emulator.runs.filtering import FilterTally
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import Slots
-from emulator.runs.loop_tally import LoopTally, SolveTimes
-from emulator.runs.score import SlotSums, Tally, slot_sums
+from emulator.runs.score import SlotSums, slot_sums
 from emulator.runs.simulation import Chunk, Measured, Mode, Simulation
-from emulator.runs.watched import Watched, watches_of
+from emulator.runs.totals import Totals
 from emulator.scenario import Scenario
 
 BLOCK_TRIALS = 500
@@ -49,12 +46,9 @@ class Block:
     start: int
     trials: int
     sums: dict[str, SlotSums]
-    tallies: dict[str, Tally]
+    totals: Totals
     accountants: dict[str, Accountant]
     digests: dict[str, dict[int, Digests]]
-    detection: Detection
-    loop: LoopTally | None = None
-    filter: FilterTally | None = None
 
 
 @dataclass(frozen=True)
@@ -67,7 +61,6 @@ class BatchResult:
     traces: dict[str, SlotHistograms]
     recorded: list[Slots] = field(default_factory=list)
     """The recorded trials of the task, in parts."""
-    solve_times: SolveTimes = field(default_factory=SolveTimes)
 
 
 def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
@@ -91,27 +84,21 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     scale = float(np.trace(scenario.process.process.Q))
     result = BatchResult(
         task.start,
-        [_empty_block(scenario, start, task.stop) for start in trials[::BLOCK_TRIALS]],
+        [_empty_block(scenario, task, start) for start in trials[::BLOCK_TRIALS]],
         {name: SlotHistograms(slots, scale) for name in names},
         {name: SlotHistograms(slots, scale) for name in names},
     )
-    for name, watches in watches_of(scenario).items():
-        for block in result.blocks:
-            block.tallies[name].watched = Watched(watches, block.trials)
     expected = expected_traces_of(scenario)
     for chunk in simulation.chunks():
         _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
-        if chunk.alarms is not None:
-            for block in result.blocks:
-                place = block.start - result.start
-                block.detection.add(chunk.first, chunk.alarms[:, place : place + block.trials])
         _add_plant(result, chunk)
         if chunk.recorded is not None:
             result.recorded.append(chunk.recorded.copied())
         tell(len(trials) * _count(chunk))
         if stopped():
             break
-    result.solve_times.merge(simulation.solve_times)
+    # All trials of the task were side by side, so that one decision was of all of them.
+    result.blocks[0].totals.solve_times.merge(simulation.solve_times)
     for block in result.blocks:
         rows = slice(block.start - task.start, block.start - task.start + block.trials)
         for name, digests in simulation.digests.items():
@@ -119,19 +106,17 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     return result
 
 
-def _empty_block(scenario: Scenario, start: int, stop: int) -> Block:
-    names, slots = scenario.receivers, scenario.slots
-    trials = min(BLOCK_TRIALS, stop - start)
+def _empty_block(scenario: Scenario, task: Task, start: int) -> Block:
+    names = scenario.receivers
+    trials = min(BLOCK_TRIALS, task.stop - start)
+    totals = Totals.of if task.mode is Mode.EXACT else Totals.nothing
     return Block(
         start,
         trials,
-        {name: SlotSums.zero(slots) for name in names},
-        {name: Tally(slots, trials) for name in names},
+        {name: SlotSums.zero(scenario.slots) for name in names},
+        totals(scenario, trials),
         {name: Accountant(scenario.window(name), trials) for name in names},
         {},
-        Detection(trials),
-        LoopTally.of(scenario, trials),
-        FilterTally.of(scenario),
     )
 
 
@@ -146,25 +131,29 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
                 trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
                 sums = slot_sums(part.error, part.action, trace)
             block.sums[name].add(chunk.first, sums)
-            block.tallies[name].watched.add(chunk.first, part.error, part.action, sums.trace, part.late)
-            block.tallies[name].add(chunk.first, part.error, sums, expected[name])
+            tally = block.totals.tallies[name]
+            tally.watched.add(chunk.first, part.error, part.action, sums.trace, part.late)
+            tally.add(chunk.first, part.error, sums, expected[name])
             account = block.accountants[name].account(range(chunk.first, chunk.first + len(part.error)), part.fates)
-            block.tallies[name].account(account.delivered, part.action, account.lost, account.unsent)
-            block.tallies[name].count(account)
+            tally.account(account.delivered, part.action, account.lost, account.unsent)
+            tally.count(account)
             if account.late is not None and part.late is not None:
-                block.tallies[name].account_late(account.late, *part.late)
+                tally.account_late(account.late, *part.late)
         result.errors[name].add(chunk.first, measured.error)
         result.traces[name].add(chunk.first, measured.trace)
 
 
 def _add_plant(result: BatchResult, chunk: Chunk) -> None:
-    """Take what a chunk says of a plant's controller and filter."""
+    """Take what a chunk says of alarms, and of a plant's controller and filter."""
     for block in result.blocks:
+        totals = block.totals
         rows = slice(block.start - result.start, block.start - result.start + block.trials)
-        if block.loop is not None and chunk.acted is not None:
-            block.loop.add(chunk.acted.part(rows))
-        if block.filter is not None and chunk.true_errors is not None:
-            block.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
+        if totals.detection is not None and chunk.alarms is not None:
+            totals.detection.add(chunk.first, chunk.alarms[:, rows])
+        if totals.loop is not None and chunk.acted is not None:
+            totals.loop.add(chunk.acted.part(rows))
+        if totals.filter is not None and chunk.true_errors is not None:
+            totals.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
 
 
 def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tuple[Block, Measured]]:

@@ -58,12 +58,12 @@ def test_what_differs_slot_by_slot_bounds_the_rest(run: np.ndarray, reference: n
 
 
 def test_a_meter_may_be_read_in_parts() -> None:
-    """Slots after slots, and trials beside trials, come to what all come to at once."""
+    """Slots after slots, and trials beside trials, come to what all come to at once, to the bit."""
     rng = np.random.default_rng(4)
     run, other = rng.standard_normal((2, 50, 4))
     whole = Meter.over(run, other)
-    by_slots = Meter.zero(4).with_more(Meter.over(run[:20], other[:20])).with_more(Meter.over(run[20:], other[20:]))
+    by_slots = Meter.zero(4).then(run[:20], other[:20]).then(run[20:], other[20:])
     by_trials = Meter.of_all([Meter.over(run[:, :1], other[:, :1]), Meter.over(run[:, 1:], other[:, 1:])])
     for name in ("net", "total", "summed"):
-        assert np.allclose(getattr(by_slots.difference, name), getattr(whole.difference, name))
-        assert np.allclose(getattr(by_trials.difference, name), getattr(whole.difference, name))
+        assert np.array_equal(getattr(by_slots.difference, name), getattr(whole.difference, name))
+        assert np.array_equal(getattr(by_trials.difference, name), getattr(whole.difference, name))

@@ -18,7 +18,7 @@ import pytest
 import zenoh
 from bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
 
-from emulator.network import wire
+from emulator.network import packets, telemetry, wire
 from emulator.network.access import Grant, access_control, grants
 
 EVE = "eve"
@@ -39,15 +39,15 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def flow(stage: Bench) -> None:
     """Let one slot pass: everybody who should gets exactly what they should, and nothing else was in the way."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
     for name, ear in stage.downlinks.items():
         key, payload = ear.hear()
-        (gamma, z, *_), late = wire.read_delivery(wire.Reader(key, payload), k, SHAPE)
+        (gamma, z, *_), late = packets.read_delivery(wire.Reader(key, payload), k, SHAPE)
         assert np.array_equal(z, np.where(gamma, stage.packet(k), 0.0)), name
         assert late == (), name
     if stage.due % BATCH == 0:
         windows = dict.fromkeys(stage.scenario.receivers, 0)
-        journal = wire.read_journal(wire.Reader(*stage.journal.hear()), stage.due - BATCH, windows, 5)
+        journal = telemetry.read_journal(wire.Reader(*stage.journal.hear()), stage.due - BATCH, windows, 5)
         assert journal.count == BATCH
 
 
@@ -204,7 +204,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
     """What it puts on any other key, and any deletion, reaches nobody; the run goes on as if nothing had been."""
     keys = all_keys(stage)
     own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
-    payloads = (wire.uplink(stage.due, np.zeros(SHAPE)), wire.control("end"), wire.progress(10**9), b"\xc1")
+    payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), wire.control("end"), wire.progress(10**9), b"\xc1")
     block = zenoh.CongestionControl.BLOCK
     with attacking(stage, mode) as attacker:
         for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:

@@ -22,7 +22,7 @@ from cryptography.x509.oid import NameOID
 from emulator.brief import Brief, Identity, read_brief
 from emulator.control import Control, read_control
 from emulator.errors import BriefError, RunError, UsageError
-from emulator.network import wire
+from emulator.network import packets, wire
 from emulator.network.certificates import check_identity
 from emulator.network.connecting import Door, connected
 from emulator.network.session import client_config, door_of
@@ -46,7 +46,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def flow(stage: Bench) -> None:
     """Let one slot pass, in which everybody gets a delivery."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
     for ear in stage.downlinks.values():
         assert wire.Reader(*ear.hear()).integer("k") == k
 

@@ -20,7 +20,7 @@ from bench import LIMIT_SECONDS, Ear, connect, until
 
 from emulator import montecarlo
 from emulator.brief import Brief, read_brief
-from emulator.network import wire
+from emulator.network import packets, wire
 from emulator.network.access import Keys
 from emulator.runs.briefs import StreamKeys
 from emulator.runs.results import load_results
@@ -131,7 +131,7 @@ def disturb(eve: Brief, keys: Keys) -> None:
             if key in own:
                 continue
             attacker.declare_queryable(key, lambda query: query.reply(query.key_expr, b"\xc1"))
-            for payload in (wire.control("end"), wire.progress(10**9), wire.uplink(0, np.zeros((2, 3))), b"\xc1"):
+            for payload in (wire.control("end"), wire.progress(10**9), packets.uplink(0, np.zeros((2, 3))), b"\xc1"):
                 attacker.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
             attacker.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
             if key.rpartition("/")[2] in PROCESSES and "/alive/" in key:

@@ -18,7 +18,7 @@ from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.elementary import normal_quantile
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
-from emulator.network import loop_wire, operator, wire
+from emulator.network import loop_wire, operator, packets, telemetry, wire
 from emulator.network.access import Keys, Wiring, grants
 from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
@@ -58,12 +58,12 @@ def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
     mask = wire.packed_flags(flags(value["gamma"])).tobytes()
     late = tuple(Late(one["k"], heard_of(shape, one["gamma"], one["z"])) for one in value.get("late", ()))
-    return wire.delivery(value["k"], mask, np.array(value["z"], float).tobytes(), late)
+    return packets.delivery(value["k"], mask, np.array(value["z"], float).tobytes(), late)
 
 
 def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As a receiver reads it."""
-    arrival = wire.read_delivery(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
+    arrival = packets.read_delivery(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
     late = [{"k": one.k, **packets_of(one.heard)} for one in arrival.late]
     return {"k": value["k"], **packets_of(arrival.heard), **({"late": late} if late else {})}
 
@@ -73,12 +73,12 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     columns = (np.array(value[name], float) for name in ("P", "trace"))
     x_hat, action = np.array(value["x_hat"], float), np.array(value["action"], np.uint8)
     late = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
-    return wire.Report(value["k"], x_hat, action, *columns, next(late), digests_of(value), next(late)).pack()
+    return telemetry.Report(value["k"], x_hat, action, *columns, next(late), digests_of(value), next(late)).pack()
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    report = wire.read_report(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), shape["recorded"])
+    report = telemetry.read_report(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), shape["recorded"])
     columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in report.digests.items()}
     late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(report, name)) is not None}
@@ -88,13 +88,13 @@ def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
 def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the sensor makes it."""
     steered = (np.array(value["u"], float), flags(value["failed"])) if "u" in value else (None, None)
-    return wire.Truth(value["k"], np.array(value["x"], float), flags(value["nu"]), None, None, *steered).pack()
+    return telemetry.Truth(value["k"], np.array(value["x"], float), flags(value["nu"]), None, None, *steered).pack()
 
 
 def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
     inputs = shape.get("inputs", 0)
-    truth = wire.read_truth(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), inputs)
+    truth = telemetry.read_truth(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), inputs)
     found = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
     return {**found, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()} if inputs else found
 
@@ -145,12 +145,12 @@ def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
         bursts[: len(link["bursts"])] = link["bursts"]
         delays = np.array(link["delays"], np.uint32)
         accounts[name] = Account(flags(link["delivered"]), lost, late, bursts, delays)
-    return wire.Journal(value["k"], value["c"], accounts).pack()
+    return telemetry.Journal(value["k"], value["c"], accounts).pack()
 
 
 def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    journal = wire.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], shape["trials"])
+    journal = telemetry.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], shape["trials"])
     links = {
         name: {
             "delivered": link.delivered.astype(int).tolist(),
@@ -167,35 +167,35 @@ def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
 def encode_leaving(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As a receiver makes it."""
     belief = Belief(np.array(value["x_hat"]), np.array(value["P"]), np.zeros(shape["trials"], np.uint8))
-    return wire.leaving(value["k"], belief)
+    return telemetry.leaving(value["k"], belief)
 
 
 def decode_leaving(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
     message = wire.Reader(KEY, raw)
-    assert wire.is_leaving(message)
-    k, belief = wire.read_leaving(message, (shape["n"], shape["trials"]))
+    assert telemetry.is_leaving(message)
+    k, belief = telemetry.read_leaving(message, (shape["n"], shape["trials"]))
     return {"k": k, "x_hat": belief.x_hat.tolist(), "P": belief.P.tolist()}
 
 
 def decode_mark(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As router and receivers read it."""
     message = wire.Reader(KEY, raw)
-    assert wire.is_hold(message)
+    assert packets.is_hold(message)
     return {"k": message.slot(value["k"]), "hold": message.flag("hold")}
 
 
 def decode_once_more(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the router reads it."""
     message = wire.Reader(KEY, raw)
-    assert wire.is_once_more(message)
+    assert packets.is_once_more(message)
     return {name: message.integer(name) for name in value}
 
 
 def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
     message = wire.Reader(KEY, raw)
-    assert wire.is_held(message)
+    assert telemetry.is_held(message)
     return {"k": message.slot(value["k"]), "held": message.flag("held")}
 
 
@@ -225,13 +225,13 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
 
 def decode_packet(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the router reads it."""
-    z = wire.read_uplink(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
+    z = packets.read_uplink(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
     return {"k": value["k"], "z": z.tolist()}
 
 
 def decode_acknowledgement(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the router and the sensor read it."""
-    gamma = wire.read_acknowledgement(wire.Reader(KEY, raw), value["k"], shape["trials"])
+    gamma = packets.read_acknowledgement(wire.Reader(KEY, raw), value["k"], shape["trials"])
     return {"k": value["k"], "gamma": gamma.astype(int).tolist()}
 
 
@@ -261,10 +261,10 @@ def rest_of(value: dict[str, Any]) -> dict[str, Any]:
 
 
 CODECS: dict[str, tuple[Encode, Decode]] = {
-    "packet": (lambda _shape, value: wire.uplink(value["k"], np.array(value["z"])), decode_packet),
+    "packet": (lambda _shape, value: packets.uplink(value["k"], np.array(value["z"])), decode_packet),
     "delivery": (encode_delivery, decode_delivery),
     "acknowledgement": (
-        lambda _shape, value: wire.acknowledgement(value["k"], flags(value["gamma"])),
+        lambda _shape, value: packets.acknowledgement(value["k"], flags(value["gamma"])),
         decode_acknowledgement,
     ),
     "progress": (
@@ -272,9 +272,9 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw)},
     ),
     "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
-    "once more": (lambda _shape, value: wire.once_more(value["n"], value["again"], value["k"]), decode_once_more),
-    "mark": (lambda _shape, value: wire.hold(value["k"]), decode_mark),
-    "held": (lambda _shape, value: wire.held(value["k"]), decode_held),
+    "once more": (lambda _shape, value: packets.once_more(value["n"], value["again"], value["k"]), decode_once_more),
+    "mark": (lambda _shape, value: packets.hold(value["k"]), decode_mark),
+    "held": (lambda _shape, value: telemetry.held(value["k"]), decode_held),
     "leaving": (encode_leaving, decode_leaving),
     "request": (lambda _shape, value: operator.Request(**value).pack(), decode_request),
     "answer": (encode_answer, decode_answer),

@@ -13,7 +13,7 @@ import pytest
 from bench import LIMIT_SECONDS, Bench
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
-from emulator.network import wire
+from emulator.network import packets, telemetry, wire
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
@@ -32,10 +32,10 @@ def run_through(bench: Bench) -> tuple[dict[str, np.ndarray], dict[str, np.ndarr
     shape = (2, scenario.trials)
     gammas = {name: np.zeros((scenario.slots, scenario.trials), bool) for name in scenario.receivers}
     for k in range(scenario.slots):
-        bench.put("sensor", keys.uplink, wire.uplink(k, bench.packet(k)))
+        bench.put("sensor", keys.uplink, packets.uplink(k, bench.packet(k)))
     for name in scenario.receivers:
         for k in range(scenario.slots):
-            (gamma, z, *_), late = wire.read_delivery(wire.Reader(*bench.downlinks[name].hear()), k, shape)
+            (gamma, z, *_), late = packets.read_delivery(wire.Reader(*bench.downlinks[name].hear()), k, shape)
             assert np.array_equal(z, np.where(gamma, bench.packet(k), 0.0))
             assert late == ()
             gammas[name][k] = gamma
@@ -43,7 +43,7 @@ def run_through(bench: Bench) -> tuple[dict[str, np.ndarray], dict[str, np.ndarr
     k = 0
     while k < scenario.slots:
         windows = dict.fromkeys(scenario.receivers, 0)
-        journal = wire.read_journal(wire.Reader(*bench.journal.hear()), k, windows, scenario.trials)
+        journal = telemetry.read_journal(wire.Reader(*bench.journal.hear()), k, windows, scenario.trials)
         rows = slice(k, k + journal.count)
         for name in scenario.receivers:
             assert np.array_equal(journal.links[name].delivered, gammas[name][rows])
@@ -81,16 +81,16 @@ def test_passwords_do_not_outlast_the_opening(bench: Callable[..., Bench]) -> No
     assert list(bench().private.iterdir()) == []
 
 
-GOOD = wire.uplink(0, np.zeros((2, 5)))
+GOOD = packets.uplink(0, np.zeros((2, 5)))
 BAD = {
     "gap": (
-        [wire.uplink(k, np.zeros((2, 5))) for k in (1, 2)],
+        [packets.uplink(k, np.zeros((2, 5))) for k in (1, 2)],
         "gap on .*/uplink: slot 2 arrived where slot 0 was due",
     ),
     "not msgpack": ([b"\xc1"], "malformed message on .*/uplink: not msgpack .*c1"),
     "too short": ([GOOD[:-1]], "malformed message on .*/uplink"),
-    "other shape": ([wire.uplink(0, np.zeros((2, 4)))], "malformed .*z of 64 bytes; expected 80 bytes"),
-    "not finite": ([wire.uplink(0, np.full((2, 5), np.nan))], "malformed .*z with a NaN or infinity"),
+    "other shape": ([packets.uplink(0, np.zeros((2, 4)))], "malformed .*z of 64 bytes; expected 80 bytes"),
+    "not finite": ([packets.uplink(0, np.full((2, 5), np.nan))], "malformed .*z with a NaN or infinity"),
     "not a map": ([msgpack.packb([0])], "malformed .*a list; expected a msgpack map"),
     "slot below 0": ([msgpack.packb({"k": -1, "z": bytes(80)})], "malformed .*k = -1"),
 }
@@ -114,10 +114,10 @@ def test_a_doubled_packet_is_delivered_once(bench: Callable[..., Bench]) -> None
     """A slot that comes twice, and one that comes too early, are ignored."""
     stage = bench()
     for k in (0, 0, 2, 1):
-        stage.put("sensor", stage.keys.uplink, wire.uplink(k, np.zeros((2, 5))))
+        stage.put("sensor", stage.keys.uplink, packets.uplink(k, np.zeros((2, 5))))
     for ear in stage.downlinks.values():
         assert [wire.Reader(*ear.hear()).integer("k") for _ in range(2)] == [0, 1]
-    stage.put("sensor", stage.keys.uplink, wire.uplink(2, np.zeros((2, 5))))
+    stage.put("sensor", stage.keys.uplink, packets.uplink(2, np.zeros((2, 5))))
     for ear in stage.downlinks.values():
         assert wire.Reader(*ear.hear()).integer("k") == 2
 
@@ -129,7 +129,7 @@ def test_a_part_of_a_slot_is_waited_for_in_real_time(bench: Callable[..., Bench]
     stage = bench(slots=3, pace=0.1, legitimate={"link": delayed}, eavesdroppers={"eve": eve})
     for k in range(3):
         began = time.monotonic()
-        stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+        stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
         stage.downlinks["eve"].hear()
         stage.downlinks["legitimate"].hear()
         assert time.monotonic() - began >= 0.05

@@ -15,7 +15,7 @@ from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 from emulator.brief import Brief
 from emulator.errors import UsageError
-from emulator.network import wire
+from emulator.network import packets, wire
 from emulator.network.access import RELAY, Grant, Keys, access_control, grants
 from emulator.network.health import is_there
 from emulator.network.linked import at_relay, at_router
@@ -39,7 +39,7 @@ def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def flow(stage: Bench) -> None:
     """Let one slot pass, in which everybody gets a delivery across the link."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, wire.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
     for ear in stage.downlinks.values():
         assert wire.Reader(*ear.hear()).integer("k") == k
 
@@ -139,10 +139,10 @@ def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
 
 
 def test_each_process_has_its_own_place(stage: Bench) -> None:
-    """The sensor and the relay connect to the router, all others to the relay; each router knows the passwords of its own."""
+    """The sensor and the relay connect to the router, all others to the relay; each router knows those it lets in, and itself."""
     router, relay = stage.briefs["router"], stage.briefs["relay"]
-    assert set(router.part["users"]) == {"sensor", "relay"}
-    assert set(relay.part["users"]) == {*RECEIVERS, "observer", "operator"}
+    assert set(router.part["users"]) == {"router", "sensor", "relay"}
+    assert set(relay.part["users"]) == {*RECEIVERS, "relay", "observer", "operator"}
     assert {name for name, brief in stage.briefs.items() if brief.router == router.router} == {
         "router",
         "relay",
@@ -175,7 +175,7 @@ def test_what_crosses_is_no_more_than_it_must_be() -> None:
         assert not [
             key for rule in access_control(site)["rules"] for key in rule["key_exprs"] if "*" in key or "$" in key
         ]
-    assert [one.process for one in at_router("r", table)] == ["sensor", RELAY]
+    assert [one.process for one in at_router("r", table)] == ["sensor", "router", RELAY]
 
 
 def test_the_router_is_known_at_the_relay_by_id_and_certificate() -> None:

@@ -18,7 +18,7 @@ from emulator.model.account import COUNTED_BURSTS, Account
 from emulator.model.links.link import REASONS
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
-from emulator.network import wire
+from emulator.network import packets, telemetry, wire
 from emulator.network.wire import Reader
 from emulator.runs.joined import Joiner
 
@@ -32,7 +32,7 @@ SIZES = st.integers(1, 19)
 def test_packet(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A packet reads back bit by bit, negative zeros and subnormal numbers included."""
     z = data.draw(arrays(float, (n, trials), elements=FINITE))
-    assert wire.read_uplink(Reader("u", wire.uplink(k, z)), k, (n, trials)).tobytes() == z.tobytes()
+    assert packets.read_uplink(Reader("u", packets.uplink(k, z)), k, (n, trials)).tobytes() == z.tobytes()
 
 
 @settings(deadline=None)
@@ -41,8 +41,8 @@ def test_delivery(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A receiver gets γ, and z of exactly the trials that received; of the others not a bit is in the message."""
     z = data.draw(arrays(float, (n, trials), elements=FINITE))
     gamma = data.draw(arrays(bool, trials))
-    raw = wire.delivery(k, wire.packed_flags(gamma).tobytes(), z[:, gamma].tobytes())
-    heard, late = wire.read_delivery(Reader("d", raw), k, (n, trials))
+    raw = packets.delivery(k, wire.packed_flags(gamma).tobytes(), z[:, gamma].tobytes())
+    heard, late = packets.read_delivery(Reader("d", raw), k, (n, trials))
     assert np.array_equal(heard.gamma, gamma)
     assert heard.z.tobytes() == np.where(gamma, z, 0.0).tobytes()
     assert late == ()
@@ -63,8 +63,8 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
         )
         for _ in range(count)
     )
-    raw = wire.delivery(k, bytes((trials + 7) // 8), b"", late)
-    heard, found = wire.read_delivery(Reader("d", raw), k, (n, trials))
+    raw = packets.delivery(k, bytes((trials + 7) // 8), b"", late)
+    heard, found = packets.read_delivery(Reader("d", raw), k, (n, trials))
     assert not heard.gamma.any()
     assert [one.k for one in found] == [one.k for one in late]
     for one, sent in zip(found, late, strict=True):
@@ -78,16 +78,16 @@ def test_a_late_packet_from_the_future_is_refused() -> None:
     """What arrives in slot 4 was not sent in slot 5."""
     late = (Late(5, Heard(np.ones(1, bool), np.zeros((1, 1)))),)
     with pytest.raises(MalformedMessage, match="a late packet of slot 5; expected one of slot 4 or before"):
-        wire.read_delivery(Reader("d", wire.delivery(4, b"\0", b"", late)), 4, (1, 1))
+        packets.read_delivery(Reader("d", packets.delivery(4, b"\0", b"", late)), 4, (1, 1))
 
 
 @given(SLOTS)
 def test_marks(k: int) -> None:
     """A mark is no packet and no delivery, a word that the sensor holds no truth, and each says before which slot."""
-    mark, held = Reader("u", wire.hold(k)), Reader("t", wire.held(k))
-    assert (wire.is_hold(mark), wire.is_hold(Reader("u", wire.uplink(k, np.zeros((1, 1)))))) == (True, False)
-    truth = wire.Truth(k, np.zeros((1, 1, 1)), np.zeros((1, 1), bool)).pack()
-    assert (wire.is_held(held), wire.is_held(Reader("t", truth))) == (True, False)
+    mark, held = Reader("u", packets.hold(k)), Reader("t", telemetry.held(k))
+    assert (packets.is_hold(mark), packets.is_hold(Reader("u", packets.uplink(k, np.zeros((1, 1)))))) == (True, False)
+    truth = telemetry.Truth(k, np.zeros((1, 1, 1)), np.zeros((1, 1), bool)).pack()
+    assert (telemetry.is_held(held), telemetry.is_held(Reader("t", truth))) == (True, False)
     assert mark.slot(k) == held.slot(k) == k
 
 
@@ -97,9 +97,9 @@ def test_leaving(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A receiver's last word reads back bit by bit."""
     x_hat = data.draw(arrays(float, (n, trials), elements=FINITE))
     P = data.draw(arrays(float, (n, n, trials), elements=FINITE))
-    message = Reader("t", wire.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
-    assert wire.is_leaving(message)
-    found, belief = wire.read_leaving(message, (n, trials))
+    message = Reader("t", telemetry.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
+    assert telemetry.is_leaving(message)
+    found, belief = telemetry.read_leaving(message, (n, trials))
     assert (found, belief.x_hat.tobytes(), belief.P.tobytes()) == (k, x_hat.tobytes(), P.tobytes())
     assert not belief.action.any()
 
@@ -110,7 +110,7 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     """Truth reads back."""
     x = data.draw(arrays(float, (count, n, trials), elements=FINITE))
     nu = data.draw(arrays(bool, (count, trials)))
-    found = wire.read_truth(Reader("t", wire.Truth(k, x, nu).pack()), k, (n, trials))
+    found = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, (n, trials))
     assert (found.first, found.count, found.x.tobytes()) == (k, count, x.tobytes())
     assert np.array_equal(found.nu, nu)
 
@@ -120,7 +120,7 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
 def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) -> None:
     """A report reads back, with any number of blocks' digests."""
     recorded = data.draw(st.integers(1, trials))
-    report = wire.Report(
+    report = telemetry.Report(
         k,
         data.draw(arrays(float, (count, n, trials), elements=FINITE)),
         data.draw(arrays(np.uint8, (count, trials), elements=st.integers(0, 3))),
@@ -129,7 +129,7 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
         data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials)))),
         {b: data.draw(arrays(np.uint8, (trials, 32))) for b in data.draw(st.sets(st.integers(0, 2**24), max_size=2))},
     )
-    found = wire.read_report(Reader("r", report.pack()), k, (n, trials), recorded)
+    found = telemetry.read_report(Reader("r", report.pack()), k, (n, trials), recorded)
     for name in ("x_hat", "action", "P", "trace"):
         assert getattr(found, name).tobytes() == getattr(report, name).tobytes()
     assert {b: d.tobytes() for b, d in found.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
@@ -162,7 +162,7 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
         )
         for name, window in windows.items()
     }
-    found = wire.read_journal(Reader("j", wire.Journal(k, count, links).pack()), k, windows, trials)
+    found = telemetry.read_journal(Reader("j", telemetry.Journal(k, count, links).pack()), k, windows, trials)
     assert (found.first, found.count, set(found.links)) == (k, count, set(links))
     for name, link in links.items():
         for column in ("delivered", "bursts", "delays"):
@@ -175,9 +175,9 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
 
 
 READERS = {
-    "packet": lambda raw: wire.read_uplink(Reader("key", raw), 0, (2, 3)),
-    "mark": lambda raw: wire.is_hold(Reader("key", raw)) and Reader("key", raw).slot(0),
-    "delivery": lambda raw: wire.read_delivery(Reader("key", raw), 0, (2, 3)),
+    "packet": lambda raw: packets.read_uplink(Reader("key", raw), 0, (2, 3)),
+    "mark": lambda raw: packets.is_hold(Reader("key", raw)) and Reader("key", raw).slot(0),
+    "delivery": lambda raw: packets.read_delivery(Reader("key", raw), 0, (2, 3)),
     "progress": lambda raw: wire.read_progress("key", raw),
     "control": lambda raw: Reader("key", raw).text("do"),
     "go": lambda raw: (Reader("key", raw).names("absent"), Reader("key", raw).integer("until")),
@@ -186,10 +186,10 @@ READERS = {
         Reader("key", raw).map("settings"),
         Reader("key", raw).flag("cut"),
     ),
-    "truth": lambda raw: wire.read_truth(Reader("key", raw), 0, (2, 3)),
-    "report": lambda raw: wire.read_report(Reader("key", raw), 0, (2, 3), 1),
-    "leaving": lambda raw: wire.read_leaving(Reader("key", raw), (2, 3)),
-    "journal": lambda raw: wire.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, 3),
+    "truth": lambda raw: telemetry.read_truth(Reader("key", raw), 0, (2, 3)),
+    "report": lambda raw: telemetry.read_report(Reader("key", raw), 0, (2, 3), 1),
+    "leaving": lambda raw: telemetry.read_leaving(Reader("key", raw), (2, 3)),
+    "journal": lambda raw: telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, 3),
 }
 FIELDS = ("k", "c", "z", "x", "nu", "gamma", "late", "x_hat", "action", "P", "trace", "digests", "links", "do", "absent",
           "until", "link", "settings", "cut", "hold")  # fmt: skip
@@ -224,12 +224,12 @@ def test_anything_else_is_an_error_of_ours(name: str, raw: bytes | dict[str, obj
 def test_errors_say_what_was_found_where_and_what_to_do() -> None:
     """A malformed message shows key, found, expected and the bytes; a gap both slots; either ends with a remedy."""
     with pytest.raises(MalformedMessage) as malformed:
-        wire.read_uplink(Reader("evedrop/r/uplink", wire.uplink(0, np.zeros((2, 2)))), 0, (2, 3))
+        packets.read_uplink(Reader("evedrop/r/uplink", packets.uplink(0, np.zeros((2, 2)))), 0, (2, 3))
     assert str(malformed.value).startswith(
         "malformed message on evedrop/r/uplink: z of 32 bytes; expected 48 bytes, <f8 of shape (2, 3). Its 40 bytes: 82 a1 6b"
     )
     with pytest.raises(Gap) as gap:
-        wire.read_uplink(Reader("evedrop/r/uplink", wire.uplink(7, np.zeros((2, 3)))), 6, (2, 3))
+        packets.read_uplink(Reader("evedrop/r/uplink", packets.uplink(7, np.zeros((2, 3)))), 6, (2, 3))
     assert "gap on evedrop/r/uplink: slot 7 arrived where slot 6 was due" in str(gap.value)
     assert issubclass(Gap, RunError)
     assert issubclass(MalformedMessage, RunError)
@@ -239,16 +239,16 @@ def test_errors_say_what_was_found_where_and_what_to_do() -> None:
 @pytest.mark.parametrize("value", [4, 255])
 def test_unknown_actions_are_refused(value: int) -> None:
     """An action beyond the documented four is malformed."""
-    report = wire.Report(
+    report = telemetry.Report(
         0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2)), None, {}
     )
     with pytest.raises(MalformedMessage, match=f"action {value}; expected actions from 0 to 3"):
-        wire.read_report(Reader("key", report.pack()), 0, (1, 1), 1)
+        telemetry.read_report(Reader("key", report.pack()), 0, (1, 1), 1)
 
 
 def test_a_journal_without_a_receiver_is_refused() -> None:
     """Every receiver must be in every journal message."""
-    raw = wire.Journal(0, 1, {"a": account_of(np.ones((1, 3), bool))}).pack()
+    raw = telemetry.Journal(0, 1, {"a": account_of(np.ones((1, 3), bool))}).pack()
     with pytest.raises(MalformedMessage, match="b = None; expected a map b"):
         READERS["journal"](raw)
 
@@ -257,7 +257,7 @@ def test_a_journal_without_a_receiver_is_refused() -> None:
 def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
     """A journal gives every reason of the links and no other: columns of messages must fit together."""
     counts = {reason: np.zeros(1, np.uint32) for reason in reasons}
-    raw = wire.Journal(0, 1, dict.fromkeys("ab", account_of(np.ones((1, 3), bool), lost=counts))).pack()
+    raw = telemetry.Journal(0, 1, dict.fromkeys("ab", account_of(np.ones((1, 3), bool), lost=counts))).pack()
     with pytest.raises(
         MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['corrupted', 'cut', 'down', "
     ):
@@ -265,11 +265,11 @@ def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
 
 
 TELEMETRY = {
-    "truth": lambda k: wire.Truth(k, np.zeros((2, 1, 3)), np.zeros((2, 3), bool)).pack(),
-    "report": lambda k: wire.Report(
+    "truth": lambda k: telemetry.Truth(k, np.zeros((2, 1, 3)), np.zeros((2, 3), bool)).pack(),
+    "report": lambda k: telemetry.Report(
         k, np.zeros((2, 1, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 1, 1, 1)), np.zeros((2, 2)), None, {}
     ).pack(),
-    "journal": lambda k: wire.Journal(k, 2, {"a": account_of(np.ones((2, 3), bool))}).pack(),
+    "journal": lambda k: telemetry.Journal(k, 2, {"a": account_of(np.ones((2, 3), bool))}).pack(),
 }
 
 

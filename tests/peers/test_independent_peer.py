@@ -18,7 +18,7 @@ from emulator.model.digest import BeliefLog, RunDigest
 from emulator.model.process import Trajectory
 from emulator.model.receiver import Heard
 from emulator.model.schemes import SCHEMES
-from emulator.network import wire
+from emulator.network import packets, telemetry, wire
 from emulator.runs.briefs import Observation, StreamKeys, briefs_of
 from emulator.runs.ports import free_port
 from emulator.runs.results import load_results
@@ -78,8 +78,8 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
         digests = log.add(k, belief)
         if digests is not None:
             blocks |= dict([digests])
-        peer.receive(wire.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
-    report = wire.read_report(wire.Reader("telemetry", peer.report()), 0, (model.n, 9), 2)
+        peer.receive(packets.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
+    report = telemetry.read_report(wire.Reader("telemetry", peer.report()), 0, (model.n, 9), 2)
     assert np.array_equal(report.x_hat, [one.x_hat for one in beliefs])
     assert np.array_equal(report.action, [one.action for one in beliefs])
     assert np.array_equal(report.P, [one.P[:, :, :2] for one in beliefs])
@@ -94,7 +94,7 @@ def test_it_refuses_a_gap() -> None:
     made = briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
     peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
-        peer.receive(wire.delivery(1, b"\0\0", b""))
+        peer.receive(packets.delivery(1, b"\0\0", b""))
 
 
 def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:

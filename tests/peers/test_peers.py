@@ -18,7 +18,7 @@ import peers.following
 import peers.sensor
 from emulator.brief import Brief, Flow
 from emulator.errors import Gap, MalformedMessage
-from emulator.network import wire
+from emulator.network import packets, telemetry, wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
 from emulator.network.resending import Kept
@@ -171,7 +171,7 @@ def deliveries(count: int = SLOTS) -> list[bytes]:
     made = []
     for k in range(count):
         gamma = np.arange(3) != k % 3
-        made.append(wire.delivery(k, wire.packed_flags(gamma).tobytes(), np.full((2, 2), float(k)).tobytes()))
+        made.append(packets.delivery(k, wire.packed_flags(gamma).tobytes(), np.full((2, 2), float(k)).tobytes()))
     return made
 
 
@@ -193,7 +193,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     end, blocks = 0, {}
     for key, payload in put:
         if key == keys.telemetry(name):
-            report = wire.read_report(wire.Reader(key, payload), end, (2, 3), 1)
+            report = telemetry.read_report(wire.Reader(key, payload), end, (2, 3), 1)
             end, blocks = end + report.count, {**blocks, **report.digests}
             lost = (np.arange(end - report.count, end) % 3)[:, None] == np.arange(3)
             assert np.array_equal(report.action == 0, lost)
@@ -216,7 +216,7 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
         RECEIVERS[name](brief)
         end, x_hat, P, blocks = 0, [], [], {}
         for payload in stage.all(Keys("r").telemetry(name)):
-            report = wire.read_report(wire.Reader("", payload), end, (2, 3), 1)
+            report = telemetry.read_report(wire.Reader("", payload), end, (2, 3), 1)
             end += report.count
             x_hat.append(report.x_hat)
             P.append(report.P)
@@ -235,10 +235,10 @@ BAD = {
     ),
     "no msgpack": ([b"\xc1"], MalformedMessage, r"malformed message on evedrop/.*/downlink/\w+: not msgpack"),
     "z too short": ([GOOD[0][:-8]], MalformedMessage, "not msgpack"),
-    "mask too long": ([wire.delivery(0, b"\1\0", b"")], MalformedMessage, "gamma of 2 bytes; expected 1 bytes"),
-    "z missing": ([wire.delivery(0, b"\1", b"")], MalformedMessage, "z of None; expected 16 bytes"),
-    "z for nobody": ([wire.delivery(0, b"\0", bytes(16))], MalformedMessage, "z although nothing was received"),
-    "not finite": ([wire.delivery(0, b"\1", np.full(2, np.inf).tobytes())], MalformedMessage, "NaN or infinity"),
+    "mask too long": ([packets.delivery(0, b"\1\0", b"")], MalformedMessage, "gamma of 2 bytes; expected 1 bytes"),
+    "z missing": ([packets.delivery(0, b"\1", b"")], MalformedMessage, "z of None; expected 16 bytes"),
+    "z for nobody": ([packets.delivery(0, b"\0", bytes(16))], MalformedMessage, "z although nothing was received"),
+    "not finite": ([packets.delivery(0, b"\1", np.full(2, np.inf).tobytes())], MalformedMessage, "NaN or infinity"),
     "slot as text": ([msgpack.packb({"k": "0", "gamma": b"\0"})], MalformedMessage, "k = '0'"),
     "slot as truth": ([msgpack.packb({"k": False, "gamma": b"\0"})], MalformedMessage, "k = False"),
 }
@@ -262,7 +262,10 @@ def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
     brief = replace(briefs()[name], run="r")
     found = []
     good = deliveries()
-    for messages in (good, [*good[:20], *good[23:30], wire.hold(25), *good[5:40], wire.hold(7), good[0], *good[30:]]):
+    for messages in (
+        good,
+        [*good[:20], *good[23:30], packets.hold(25), *good[5:40], packets.hold(7), good[0], *good[30:]],
+    ):
         stage.fill(Keys("r").downlink(name), messages)
         stage.commands.put(wire.control("end"))
         RECEIVERS[name](brief)
@@ -289,13 +292,13 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
     def delivered(k: int) -> bytes:
         gamma = np.arange(3) != k % 3
         header = np.full((1, 2), -1).astype("<i8").tobytes()
-        return wire.delivery(k, wire.packed_flags(gamma).tobytes(), bytes(32), header=header)
+        return packets.delivery(k, wire.packed_flags(gamma).tobytes(), bytes(32), header=header)
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
     stage.fill(Keys("r").downlink("legitimate"), [delivered(k) for k in slots])
     stage.commands.put(wire.control("end"))
     estimate(brief)
-    expected = [wire.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
+    expected = [packets.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
     assert stage.all(Keys("r").acknowledged) == expected
 
 
@@ -336,11 +339,11 @@ class Sensing:
         for k in range(first, end):
             key, payload = self.next()
             assert key == self.keys.uplink
-            wire.read_uplink(wire.Reader(key, payload), k, (2, 3))
+            packets.read_uplink(wire.Reader(key, payload), k, (2, 3))
             if (k + 1) % BATCH == 0 or k + 1 == SLOTS:
                 key, payload = self.next()
                 assert key == self.keys.telemetry("sensor")
-                told += wire.read_truth(wire.Reader(key, payload), told, (2, 3)).count
+                told += telemetry.read_truth(wire.Reader(key, payload), told, (2, 3)).count
                 assert told == k + 1
 
     def progress(self, name: str, k: int) -> None:
@@ -383,13 +386,13 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     sensing.packets(WINDOW, WINDOW + 8)
     stage.kept[sensing.keys.uplink].again(4, 10)
     key, payload = sensing.next()
-    assert (key, payload) == (sensing.keys.uplink, wire.once_more(4, 10, 7))
+    assert (key, payload) == (sensing.keys.uplink, packets.once_more(4, 10, 7))
     for k in range(7, WINDOW + 8):
-        wire.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
+        packets.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
     stage.kept[sensing.keys.uplink].again(5, 8)
     assert wire.Reader(*sensing.next()).integer("k") == 5
     for k in range(5, WINDOW + 8):
-        wire.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
+        packets.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
     assert stage.put.empty()
 
 

@@ -69,7 +69,9 @@ ROGUE = """
 import dataclasses
 import peers.sensor
 from emulator.network import reporting
-from emulator.network.wire import Journal, Report, pack, uplink
+from emulator.network.packets import uplink
+from emulator.network.telemetry import Journal, Report
+from emulator.network.wire import pack
 
 def change(how, honest=Report.pack):
     Report.pack = lambda self: honest(dataclasses.replace(self, **how(self)))

@@ -84,7 +84,7 @@ def gathered(
         pass
     made: dict[str, Gathered] = {
         "slots": Statistics(NAMES),
-        "trials": Recorded(NAMES, range(100, 100 + RECORDED), N),
+        "trials": Recorded(NAMES, range(100, 100 + RECORDED), 6 + 2 * N + N * N),
         "journal": Journals(NAMES, sizes),
     }
     for name, one in made.items():

@@ -117,6 +117,14 @@ def close(found: Any, wanted: Any, where: str) -> None:
         assert found == wanted, where
 
 
+def test_every_shard_may_have_two_routers(ran: Ran, tmp_path: Path) -> None:
+    """At places of its own; the trials are the same."""
+    found = run("eavesdroppers", out=tmp_path / "run", shards=2, network={"routers": 2}, **EVENTFUL)
+    assert in_order(found.digests) == in_order(ran(1).digests)
+    for number in (1, 2):
+        assert (found.folder / "logs" / f"shard-{number}" / "relay.log").is_file()
+
+
 @pytest.mark.parametrize("shards", [1, 2, 3])
 def test_digests_are_those_of_memory(ran: Ran, shards: int) -> None:
     """However many processes carry a trial's packets, it is that trial."""
@@ -302,6 +310,7 @@ def test_what_shards_cannot_do_is_refused(evedrop: Evedrop) -> None:
     for words, said in (
         (("brief", "eavesdroppers", *sharded, "--out", "briefs", "--results", "there"), "give --set shards=1"),
         (("run", "eavesdroppers", *sharded, "--view", "off", "--listen", "tcp/127.0.0.1:17461"), "give --set shards=1"),
+        (("run", "eavesdroppers", *sharded, "--view", "off", "--relay", "tcp/127.0.0.1:17461"), "give --set shards=1"),
         (("run", "eavesdroppers", "--set", "shards=2"), "shards: is 2; expected at most trials, which is 1"),
         (("run", "eavesdroppers", "--set", "shards=0"), "shards: is 0; expected a number at least 1"),
     ):

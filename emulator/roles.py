@@ -1,0 +1,93 @@
+"""One process of a run, by its brief: writing the briefs, being a process, asking whether it is there.
+
+Every import of weight waits for the command that needs it, so that a peer starts quickly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from emulator.commands import loaded
+from emulator.errors import BriefError, UsageError
+
+if TYPE_CHECKING:
+    from emulator.brief import Brief
+
+
+def brief(options: argparse.Namespace) -> int:
+    """Write the briefs."""
+    from emulator.runs.briefs import write_briefs
+    from emulator.runs.ports import places_at
+
+    if not 1 <= options.wait <= 30 * 86_400:
+        raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
+    scenario = loaded(options)
+    places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
+    for path in write_briefs(scenario, places, options.results, options.out, options.wait):
+        print(path)
+    return 0
+
+
+def process(options: argparse.Namespace) -> int:
+    """Be one process of a run."""
+    from emulator.brief import read_brief
+    from emulator.modules import look_in
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    brief = read_brief(options.brief, options.role)
+    if getattr(options, "out", None) is not None:
+        brief = replace(brief, part={**brief.part, "results": str(options.out)})
+    if brief.part.get("modules") is not None:
+        look_in(str(brief.part["modules"]))
+    try:
+        return _play(brief, getattr(options, "serve", None))
+    except BriefError as error:
+        raise BriefError(f"{options.brief}: {error}") from error
+
+
+def _play(brief: Brief, serve: str | None) -> int:
+    """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    from emulator.model.registry import NotRegistered
+
+    if brief.identity is not None:
+        from emulator.network.certificates import check_identity
+
+        check_identity(brief.identity, brief.process)
+    match brief.role:
+        case "router":
+            from emulator.network.router import route as play
+        case "relay":
+            from emulator.network.relay import relay as play
+        case "sensor":
+            from peers.sensor import sense as play
+        case "legitimate":
+            from peers.legitimate import estimate as play
+        case "eavesdropper":
+            from peers.eavesdropper import eavesdrop as play
+        case "controller":
+            from peers.controller import steer as play
+        case "observer":
+            from emulator.runs.observer import observe
+
+            return observe(brief, serve)
+        case _:
+            raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
+    try:
+        play(brief)
+    except NotRegistered as error:
+        raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
+    return 0
+
+
+def health(options: argparse.Namespace) -> int:
+    """Say whether a process is there."""
+    from emulator.brief import read_brief
+    from emulator.network.health import is_there
+
+    brief = read_brief(options.brief)
+    there = is_there(brief)
+    print(f"{brief.process} is {'' if there else 'not '}on the network of {brief.run}")
+    return 0 if there else 1
