@@ -15,9 +15,10 @@ test: $(READY)
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long
 
-# As root: every process in a network namespace of its own. Where that cannot be, it says so and fails nothing.
+# As root: every process in a network namespace of its own. Where that cannot be, it says so and fails nothing. Most of the time
+# cables are out and others wait, so there are more tests at a time than processors.
 test-hosts: $(READY)
-	$(BIN)/python -m pytest -m hosts tests/hosts
+	$(BIN)/python -m pytest -n 3 -m hosts tests/hosts
 
 # As root: docker-compose.yml brought up by a Docker daemon of its own. Where that cannot be, it says so and fails nothing.
 test-compose: $(READY)
@@ -38,4 +39,4 @@ $(READY): constraints.txt pyproject.toml
 	touch $(READY)
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*

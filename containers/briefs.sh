@@ -9,6 +9,13 @@ scenario=${EVEDROP_SCENARIO:-two-eavesdroppers}
 owner=${EVEDROP_USER:-1000:1000}
 name=$(basename "$scenario" .toml)-$(date +%Y%m%d-%H%M%S)
 
+case $owner in
+  *[!0-9:]* | :* | *: | *:*:*)
+    echo "evedrop: EVEDROP_USER is $owner, and must be numbers, UID:GID: give \`id -u\`:\`id -g\` (docs/containers.md)" >&2
+    exit 2
+    ;;
+esac
+
 cd /here # a scenario of one's own is named as it is seen from the checkout
 # shellcheck disable=SC2086 - options are words
 evedrop brief "$scenario" ${EVEDROP_OPTIONS:-} --out /tmp/briefs --results "/runs/$name" \
@@ -30,8 +37,8 @@ done
 # shellcheck disable=SC2086 - names are words
 set -- $eavesdroppers
 if [ $# -ne 2 ]; then
-  echo "evedrop: $scenario has $# eavesdroppers:$eavesdroppers; docker-compose.yml has services for two: give" \
-    "EVEDROP_SCENARIO one that has two, or add a service for each (docs/containers.md)" >&2
+  echo "evedrop: $scenario has eavesdroppers:${eavesdroppers:- none}; docker-compose.yml has services for two: give" \
+    "EVEDROP_SCENARIO one that has two, or change the services (docs/containers.md)" >&2
   exit 2
 fi
 

@@ -25,6 +25,7 @@ from hypothesis import HealthCheck, settings
 from emulator import cli
 from emulator.brief import Brief, read_brief
 from emulator.runs.results import Results, load_results
+from tests.privileged import say_what_was_skipped
 
 LIMIT = 120.0
 """Seconds after which a condition that a test waits for counts as never met: far above what a busy machine needs."""
@@ -32,6 +33,13 @@ LIMIT = 120.0
 # Neither how long an example takes nor how long it takes to think of one says anything on a machine that others use.
 settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("unhurried")
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterator[None]:
+    """What this machine could not test has the last word."""
+    yield
+    say_what_was_skipped(terminalreporter)
 
 
 def wait_until(condition: Callable[[], Any], what: str, limit: float = LIMIT) -> Any:

@@ -1,4 +1,4 @@
-"""Docker, the image, and a project to bring up; or, said loudly, why there is none here."""
+"""Docker, the image, and a project to bring up; skipped, which is said loudly, where there can be none."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.containers.machine import BASE, CannotRun, Docker, bootstrap, checkout, install, run
-from tests.containers.project import Project
+from tests.containers.machine import BASE, PACKAGES, Docker, base, checkout, take_away_leftovers
+from tests.containers.project import Project, projects
+from tests.privileged import CannotRun, prepare, run, skip
 
-_REASON = pytest.StashKey[str]()
 _TIMES = pytest.StashKey[dict[str, float]]()
 
 
@@ -27,17 +27,16 @@ def docker(request: pytest.FixtureRequest) -> Iterator[Docker]:
     with tempfile.TemporaryDirectory(prefix="evedrop-docker-") as made:
         folder = Path(made)
         try:
-            install()
+            prepare(PACKAGES)
+            take_away_leftovers()
             daemon = Docker(folder)
         except CannotRun as error:
-            request.config.stash[_REASON] = str(error)
-            pytest.skip(str(error))
+            skip(error)
         try:
             _image(daemon, folder, times)
             yield daemon
         except CannotRun as error:
-            request.config.stash[_REASON] = str(error)
-            pytest.skip(str(error))
+            skip(error)
         finally:
             daemon.end()
 
@@ -57,7 +56,7 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
         text=True,
     )
     try:
-        daemon("import", str(bootstrap(folder)), BASE)
+        daemon("import", str(base(folder)), BASE)
         said, _ = fetching.communicate()
     finally:
         fetching.kill()
@@ -72,24 +71,12 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
 
 @pytest.fixture
 def project(tmp_path: Path, docker: Docker) -> Iterator[Callable[..., Project]]:
-    """Makes the project of a test; takes it down afterwards, whatever became of it."""
-    made: list[Project] = []
-
-    def make(**variables: str) -> Project:
-        one = Project.of(tmp_path, docker, **variables)
-        made.append(one)
-        return one
-
-    yield make
-    for one in made:
-        one.down()
+    """Makes the project of a test; takes it down afterwards."""
+    with projects(tmp_path, docker) as make:
+        yield make
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """How long the preparations took, or that nothing was tested."""
+    """How long the preparations took."""
     for what, seconds in config.stash.get(_TIMES, {}).items():
         terminalreporter.write_line(f"{what}: {seconds:.0f} s")
-    reason = config.stash.get(_REASON, None)
-    if reason is not None:
-        terminalreporter.section("THE CONTAINERS WERE NOT TESTED", sep="!", red=True)
-        terminalreporter.write_line(reason)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.conftest import wait_until
+from tests.privileged import CannotRun, run, tried
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"dockerd": "docker.io", "docker-compose": "docker-compose", "debootstrap": "debootstrap", "ip": "iproute2"}
@@ -27,43 +28,12 @@ PACKAGES = {"dockerd": "docker.io", "docker-compose": "docker-compose", "deboots
 BASE = "evedrop-base"
 _START_SECONDS = 60.0
 
-_INIT = 'mount -t proc proc /proc && ip link set lo up && exec "$@"'
-
-
-class CannotRun(Exception):
-    """No containers can be started on this machine; why, in words."""
-
-
-def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    """A command that must succeed. Raises AssertionError with all it said."""
-    quiet = {"capture_output": True, "text": True, "timeout": 600.0, "stdin": subprocess.DEVNULL, **options}
-    done = subprocess.run([str(word) for word in command], check=False, **quiet)
-    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
-    return done
-
-
-def tried(*command: str | Path, what: str, **options: Any) -> str:
-    """What a command says on its standard output. Raises CannotRun if it fails: that is not what we test."""
-    try:
-        return run(*command, **options).stdout
-    except (AssertionError, OSError, subprocess.TimeoutExpired) as error:
-        raise CannotRun(f"{what}: {str(error)[-2000:]}") from error
-
-
-def install() -> None:
-    """Have every command that is needed. Raises CannotRun."""
-    if sys.platform != "linux" or os.getuid() != 0:
-        raise CannotRun("it takes Linux and root")
-    missing = [package for command, package in PACKAGES.items() if shutil.which(command) is None]
-    if missing:
-        if shutil.which("apt-get") is None:
-            raise CannotRun(f"{', '.join(missing)} are not installed, and there is no apt-get")
-        # A daemon of the machine's own is neither needed nor ours to start.
-        quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "RUNLEVEL": "1"}
-        tried("apt-get", "update", "-q", what="apt-get update", env=quiet)
-        command = ("apt-get", "install", "-q", "-y", "--no-install-recommends", *missing)
-        tried(*command, what=f"apt-get install {' '.join(missing)}", env=quiet)
-    tried("unshare", "--net", "--mount", "--pid", "--fork", "true", what="namespaces cannot be made")
+_INIT = """
+mount -t proc proc /proc && ip link set lo up || exit
+if [ "$(awk '/^MemAvailable/ {print $2}' /proc/meminfo)" -gt 10000000 ]; then mount -t tmpfs tmpfs "$0"; fi
+exec "$@"
+"""
+"""The first command of the namespaces. Where there is room, images are in memory: that is faster, and gone at once."""
 
 
 def mirror() -> tuple[str, str]:
@@ -81,9 +51,22 @@ def mirror() -> tuple[str, str]:
     raise CannotRun(f"apt knows no mirror of {release}")
 
 
-def bootstrap(folder: Path) -> Path:
-    """A file system with Python from Debian's own packages, as a tar. Raises CannotRun if the mirror cannot be reached."""
+def base(folder: Path) -> Path:
+    """A file system with Python from Debian's own packages, as a tar, kept in build/. Raises CannotRun if it cannot be made."""
     address, release = mirror()
+    kept = ROOT / "build" / f"test-base-{release}-{platform.machine()}.tar"
+    if not kept.exists():
+        kept.parent.mkdir(exist_ok=True)
+        half = kept.with_name(f"{kept.name}-{os.getpid()}")
+        try:
+            shutil.move(_bootstrapped(folder, address, release), half)
+            half.replace(kept)
+        finally:
+            half.unlink(missing_ok=True)
+    return kept
+
+
+def _bootstrapped(folder: Path, address: str, release: str) -> Path:
     system, tar = folder / "system", folder / "system.tar"
     tried(
         *("debootstrap", "--variant=minbase", "--include=python3,python3-venv", release, system, address),
@@ -120,13 +103,15 @@ class Docker:
         self.address = f"unix://{folder}/docker.sock"
         self._group = f"evedrop-{os.getpid()}"
         self._log = folder / "dockerd.log"
+        data = folder / "data"
+        data.mkdir()
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [
                     # However the tests end, it ends with them.
                     *("setpriv", "--pdeathsig", "KILL"),
-                    *("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", _INIT, "sh"),
-                    *("dockerd", "--data-root", str(folder / "data"), "--exec-root", str(folder / "exec")),
+                    *("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", _INIT, str(data)),
+                    *("dockerd", "--data-root", str(data), "--exec-root", str(folder / "exec")),
                     *("--host", self.address, "--pidfile", str(folder / "docker.pid"), "--bridge", "none"),
                     # By systemd's means it would ask for control groups of process ids that are not those it has here.
                     *("--exec-opt", "native.cgroupdriver=cgroupfs", "--cgroup-parent", f"/{self._group}"),
@@ -171,14 +156,21 @@ class Docker:
         self._process.kill()
         self._process.wait()
         shutil.rmtree(self.folder / "data", ignore_errors=True)
-        wait_until(self._groups_removed, "no control group left")
+        wait_until(lambda: _removed(self._group), "no control group left")
 
-    def _groups_removed(self) -> bool:
-        left = [path for path in Path("/sys/fs/cgroup").glob(f"**/{self._group}") if path.is_dir()]
-        for path in left:
-            for folder in sorted(path.rglob("*/"), reverse=True):
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
+
+def take_away_leftovers() -> None:
+    """Control groups of tests that were killed."""
+    for name in {path.name for path in Path("/sys/fs/cgroup").glob("**/evedrop-*")}:
+        if not Path("/proc", name.removeprefix("evedrop-")).exists():
+            _removed(name)
+
+
+def _removed(group: str) -> bool:
+    """Try to remove a control group; whether it is gone."""
+    left = [path for path in Path("/sys/fs/cgroup").glob(f"**/{group}") if path.is_dir()]
+    for path in left:
+        for folder in (*sorted(path.rglob("*/"), reverse=True), path):
             with contextlib.suppress(OSError):
-                path.rmdir()
-        return not any(path.exists() for path in left)
+                folder.rmdir()
+    return not any(path.exists() for path in left)

@@ -6,16 +6,30 @@ import json
 import os
 import shutil
 import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from emulator.runs.results import Results, load_results
 from tests.conftest import wait_until
-from tests.containers.machine import ROOT, Docker, run
+from tests.containers.machine import ROOT, Docker
+from tests.privileged import run
 
 ROLES = ("router", "sensor", "legitimate", "eavesdropper-1", "eavesdropper-2", "observer")
 """The services that are processes of a run."""
+
+ENDLESS = "--slots 1000000 --pace 0.002 --set longest_outage=2.0"
+"""Options of a run that does not end by itself."""
+
+_PAGE = """
+import urllib.request
+try:
+    print(urllib.request.urlopen('http://127.0.0.1:17450/').read())
+except OSError as error:
+    print(error)
+"""
 
 
 @dataclass(frozen=True)
@@ -80,11 +94,44 @@ class Project:
         wait_until(lambda: self.progress() > more_than, "a run under way")
         assert self.state("observer")["Running"], "the run must not end before it is disturbed"
 
+    def listening(self) -> set[str]:
+        """The ports of the machine that are listened on; all of them on loopback."""
+        table = self.docker.inside("cat", "/proc/net/tcp").splitlines()[1:]
+        found = [line.split()[1].split(":") for line in table if line.split()[3] == "0A"]
+        assert {address for address, _ in found} <= {"0100007F"}
+        return {str(int(port, 16)) for _, port in found}
+
+    def shown(self) -> None:
+        """Wait until the view's page answers, at its address on loopback, and check that nothing else listens."""
+        wait_until(lambda: "Rerun" in self.docker.inside("python3", "-c", _PAGE), "a page")
+        assert self.listening() == {"17450", "17451"}
+
     def results(self) -> Results:
         """The newest results."""
         newest: Path = max((self.folder / "runs").iterdir(), key=lambda folder: folder.stat().st_mtime_ns)
         return load_results(newest)
 
     def down(self) -> None:
-        """Take everything down."""
+        """Take everything down. Fails if a container, a network or a volume is left."""
         self.compose("down", "--volumes", "--timeout", "5")
+        label = f"label=com.docker.compose.project={self.environment['COMPOSE_PROJECT_NAME']}"
+        for kind in (("container", "--all"), ("network",), ("volume",)):
+            left = self.docker(kind[0], "ls", *kind[1:], "--quiet", "--filter", label)
+            assert not left, f"{kind[0]} {left}"
+
+
+@contextmanager
+def projects(folder: Path, docker: Docker) -> Iterator[Callable[..., Project]]:
+    """Makes projects in a folder; takes them down when the block ends, whatever became of them."""
+    made: list[Project] = []
+
+    def make(**variables: str) -> Project:
+        one = Project.of(folder, docker, **variables)
+        made.append(one)
+        return one
+
+    try:
+        yield make
+    finally:
+        for one in made:
+            one.down()

@@ -1,11 +1,16 @@
-"""Every process on a host of its own; skipped, with the reason, where network namespaces cannot be made."""
+"""Every process on a host of its own; skipped, which is said loudly, where network namespaces cannot be made."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from lan import take_away_leftovers, why_not
+
+from tests.hosts.lan import prove, take_away_leftovers
+from tests.privileged import CannotRun, prepare, skip
+
+PACKAGES = {"ip": "iproute2", "ss": "iproute2", "tcpdump": "tcpdump"}
+"""Command → the Debian package that has it."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -18,7 +23,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _namespaces() -> None:
     """Namespaces can be made here, and none is left of tests that were killed."""
-    reason = why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    try:
+        prepare(PACKAGES)
+        prove()
+    except CannotRun as error:
+        skip(error)
     take_away_leftovers()

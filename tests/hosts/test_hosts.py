@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lan import Lan, lan
 
 from emulator.brief import read_brief
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, checked
 from tests.by_hand import ByHand, as_if_undisturbed, by_hand
+from tests.hosts.lan import Lan, lan
 
 PORT = 7447
 HOSTS = ("router", "sensor", "legitimate", "eve", "observer")

@@ -1,0 +1,27 @@
+"""Tests that a machine cannot run are skipped, fail nothing, and are named by a banner that has the last word."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.privileged import BANNER
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize(("mark", "folder"), [("hosts", "tests/hosts"), ("containers", "tests/containers")])
+def test_what_cannot_be_tested_is_said_loudly(mark: str, folder: str, tmp_path: Path) -> None:
+    """Whoever is not root is told so; whoever is, that there are no commands, and no apt-get to install them."""
+    command = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", mark, folder)
+    where = {"PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, env={**os.environ, **where}, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert " passed" not in done.stdout
+    banner, reason, _ = done.stdout.splitlines()[-3:]
+    assert banner.strip("!") == f" {BANNER}: {folder} "
+    assert "it takes Linux and root" in reason or "there is no apt-get" in reason
