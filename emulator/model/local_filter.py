@@ -20,7 +20,9 @@ from emulator.streams import Batch, BlockReader
 _SETTLED = 1e-14
 _LONGEST = 200_000  # slots after which a filter counts as never settled
 _JUDGED = 32_768  # slots after which one that does not even come nearer does
-_NEARER = 0.45  # what is left of it by then, as 1/k: ½ of the last halving; as an exponential of any use: ⅓; as k: twice
+_NEARER = (
+    0.45  # what is left of it by then, as 1/k: ½ of the last halving; as an exponential of any use: ⅓; as k: twice
+)
 
 
 class Step(NamedTuple):

@@ -82,15 +82,15 @@ def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
 
 
 RUNS: dict[str, dict[str, Any]] = {
-    "as fast as it goes": {"slots": 5000, "trials": 20},
+    "as fast as it goes": {"slots": 8000, "trials": 10},
     "silent and acknowledged": {
-        "slots": 1500, "trials": 20, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED,
+        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED,
     },
     "coded and acknowledged": {
-        "slots": 1500, "trials": 20, "encoding": 'scheme = "acknowledged"', "strategy": "reference", "more": ACKNOWLEDGED,
+        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "acknowledged"', "strategy": "reference", "more": ACKNOWLEDGED,
     },
-    "in a loop that is told its inputs": {"slots": 3000, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true"},
-    "in a loop over the truth": {"slots": 3000, "more": LOOP.format('period = 7\nacts_on = "truth"')},
+    "in a loop that is told its inputs": {"slots": 3000, "pace": 0.002, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true"},
+    "in a loop over the truth": {"slots": 3000, "pace": 0.002, "more": LOOP.format('period = 7\nacts_on = "truth"')},
     "paced, with events": {"slots": 2000, "pace": 0.002, "more": CHANGING},
 }  # fmt: skip
 
