@@ -10,7 +10,7 @@ demo: $(READY)
 	$(BIN)/evedrop demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long and not hosts and not containers"
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m "not long and not hosts and not containers"
 
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long

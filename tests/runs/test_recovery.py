@@ -81,21 +81,28 @@ def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
     return path, load(path)
 
 
+long = pytest.mark.long
+
 RUNS: dict[str, dict[str, Any]] = {
     "as fast as it goes": {"slots": 8000, "trials": 10},
     "silent and acknowledged": {
-        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED,
+        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive",
+        "more": ACKNOWLEDGED,
     },
     "coded and acknowledged": {
-        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "acknowledged"', "strategy": "reference", "more": ACKNOWLEDGED,
+        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "acknowledged"', "strategy": "reference",
+        "more": ACKNOWLEDGED,
     },
-    "in a loop that is told its inputs": {"slots": 3000, "pace": 0.002, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true"},
+    "in a loop that is told its inputs": {
+        "slots": 3000, "pace": 0.002, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true",
+    },
     "in a loop over the truth": {"slots": 3000, "pace": 0.002, "more": LOOP.format('period = 7\nacts_on = "truth"')},
     "paced, with events": {"slots": 2000, "pace": 0.002, "more": CHANGING},
 }  # fmt: skip
+RARER = ("silent and acknowledged", "coded and acknowledged", "in a loop over the truth")
 
 
-@pytest.mark.parametrize("what", RUNS)
+@pytest.mark.parametrize("what", [pytest.param(what, marks=[long] if what in RARER else []) for what in RUNS])
 def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
     path, scenario = scenario_in(tmp_path, **RUNS[what])
@@ -115,11 +122,11 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
     assert all(one["seconds"] > 0.0 and 0 < one["slot"] <= one["until"] for one in outages)
 
 
-@pytest.mark.parametrize("name", ["router", "relay"])
+@pytest.mark.parametrize("name", [pytest.param("router", marks=long), "relay"])
 def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """With a closed loop over both of them: digests and links are those in memory, and the one that was killed is named."""
     more = LOOP.format("period = 2") + "[network]\nrouters = 2"
-    path, scenario = scenario_in(tmp_path, slots=3000, more=more, more_of_legitimate="knows_input = true")
+    path, scenario = scenario_in(tmp_path, slots=3000, pace=0.002, more=more, more_of_legitimate="knows_input = true")
     live = evedrop.live(str(path), "--json")
     live.running(more_than=300)
     before = live.child(name)
@@ -205,8 +212,17 @@ def test_a_router_that_is_started_again_by_hand(tmp_path: Path) -> None:
         assert outage["seconds"] > 3.0
 
 
-@pytest.mark.parametrize("how", ["closed", "silent"])
-@pytest.mark.parametrize("name", ["sensor", "legitimate", "observer"])
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("sensor", "closed"),
+        ("legitimate", "silent"),
+        ("observer", "closed"),
+        pytest.param("sensor", "silent", marks=long),
+        pytest.param("legitimate", "closed", marks=long),
+        pytest.param("observer", "silent", marks=long),
+    ],
+)
 def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: Path) -> None:
     """Closed for two seconds, or without a word for longer than its lease: who was cut off is listed, and all is as ever."""
     given = {"encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED}
@@ -231,7 +247,7 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: 
         assert [one["process"] for one in run.summary["outages"]] == [name]
 
 
-@pytest.mark.parametrize("name", ["controller", "legitimate"])
+@pytest.mark.parametrize("name", [pytest.param("controller", marks=long), "legitimate"])
 def test_a_loop_is_taken_up_where_it_was_cut(name: str, tmp_path: Path) -> None:
     """Estimates and inputs that were lost on the way are said once more: nobody waits for ever, and no input changes."""
     _, scenario = scenario_in(

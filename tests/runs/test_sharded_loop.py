@@ -115,7 +115,9 @@ def test_a_loop_with_a_solver_is_made_one(tmp_path: Path) -> None:
     assert sharded["household"] == memory["household"]
 
 
-@pytest.mark.parametrize(("name", "trials"), [("controller", {2, 3, 5}), ("observer", {2})])
+@pytest.mark.parametrize(
+    ("name", "trials"), [("controller", {2, 3, 5}), pytest.param("observer", {2}, marks=pytest.mark.long)]
+)
 def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str, trials: set[int]) -> None:
     """Inputs, and the figures of controller and house, as far as each shard came; nothing of one without its observer."""
     words = ("--trials", "5", "--set", "shards=2", "--set", "expect=[]", "--set", f"record_trials={RECORDED}")

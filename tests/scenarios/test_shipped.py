@@ -49,11 +49,18 @@ def blocks(results: Results) -> set[tuple[str, int, int, bytes]]:
     return set(zip(*(results.digests[name].to_pylist() for name in ("peer", "trial", "block", "digest")), strict=True))
 
 
-every_scenario = pytest.mark.parametrize("name", sorted(shipped()))
+SLOW = [("microgrid-mpc", "forty trials")]  # a solver for each of them
+every_batch = pytest.mark.parametrize(
+    ("name", "batch"),
+    [
+        pytest.param(name, batch, marks=[pytest.mark.long] if (name, batch) in SLOW else [])
+        for name in sorted(shipped())
+        for batch in BATCHES
+    ],
+)
 
 
-@every_scenario
-@pytest.mark.parametrize("batch", BATCHES)
+@every_batch
 def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callable[[str, str], Pair]) -> None:
     """Equal digests of every receiver, equal sums, and a verdict that agrees."""
     live, memory = twins(name, batch)
@@ -68,8 +75,7 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
     assert live.summary["secrecy"] == memory.summary["secrecy"]
 
 
-@every_scenario
-@pytest.mark.parametrize("batch", BATCHES)
+@every_batch
 def test_every_packet_is_accounted_for(name: str, batch: str, twins: Callable[[str, str], Pair]) -> None:
     """Offered is slots times trials; delivered and lost add up to it; the journal says the same, slot by slot."""
     live, _ = twins(name, batch)
