@@ -1,5 +1,5 @@
 """`python -m emulator` is the command `evedrop`."""
 
-from emulator.cli import main
+from emulator.cli import program
 
-raise SystemExit(main())
+program()

@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, NoReturn, TextIO, TypeVar
 
 from emulator import commands, operate, roles
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
@@ -17,8 +17,21 @@ Command = Callable[[argparse.Namespace], int]
 T = TypeVar("T")
 
 _OUTPUT = "standard output"
+_ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
+
+
+def program() -> NoReturn:
+    """Run the command line, and end."""
+    status = main()
+    if sys.argv[1:2] and sys.argv[1] in _ROLES:
+        # Threads of a process may still be in Zenoh, and an interpreter that ends meanwhile aborts (Python 3.11).
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        os._exit(status)
+    raise SystemExit(status)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -149,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", roles.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
     add("health", roles.health, "whether the process of a brief is on the network", _argument("brief", "BRIEF"))
-    for role in ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"):
+    for role in _ROLES:
         of_role = (_role(role), _observed, _served) if role == "observer" else (_role(role),)
         add(role, roles.process, f"one process of a run, the {role}", _argument("brief", "BRIEF"), *of_role)
     return parser

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from queue import SimpleQueue
 
 from emulator.brief import Brief
+from emulator.errors import RunError
 from emulator.model.detection import Chart, Watch
 from emulator.model.plant import Plant
 from emulator.model.process import Trajectory
@@ -147,6 +148,11 @@ def sense(brief: Brief) -> None:
             if actuator is not None:
                 x, predicted = actuator.transmitted(k, true, trajectory)
             packet = encoder.encode(k, x, predicted)
+            if packet.z.shape != x.shape:
+                found, name = packet.z.shape, brief.part["scheme"]["scheme"]
+                raise RunError(
+                    f"slot {k}: encode of the scheme {name} gave z of shape {found}; expected {x.shape}; mend the class"
+                )
             beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
             send(k, uplink(k, packet.z, **beside.given))
             alarms = back.wait(k, packet) if back is not None else None

@@ -91,6 +91,7 @@ def test_for_people(evedrop: Evedrop) -> None:
         "0.534206 < μ_d ≤ 1",
         "least μ_d",
         "(0.53421, 0.56563]",
+        "(0.53421, 1.00000)  ",  # perfect secrecy against naive: at 1 itself nothing misleads
     ):
         assert words in done.out
     assert "nan" not in done.out

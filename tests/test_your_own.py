@@ -307,6 +307,25 @@ def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
         assert "tires.py" in done.err
 
 
+def test_another_shape_in_a_later_slot_is_not_sent(evedrop: Evedrop) -> None:
+    """Turned round, a packet has as many bytes as ever: live as in memory the run ends with status 3 and says what it was."""
+    lines = (
+        "from emulator.model.schemes.plain import Plain",
+        "class Turns(Plain):",
+        "    def encoder(self, keys, batch):",
+        "        found = super().encoder(keys, batch)",
+        "        encode = found.encode",
+        "        found.encode = lambda k, x, predicted: encode(k, x if k < 30 else x.T, predicted)",
+        "        return found",
+    )
+    (evedrop.folder / "turns.py").write_text("\n".join(lines))
+    (evedrop.folder / "mine.toml").write_text(SCENARIO.replace('"plain"', '"turns:Turns"'))
+    live = evedrop("run", "mine.toml", "--trials", "4", "--view", "off", "--out", "live")
+    assert live.status == 3
+    assert "slot 30: encode of the scheme turns:Turns gave z of shape (4, 2); expected (2, 4)" in live.err
+    assert evedrop("montecarlo", "mine.toml", "--trials", "4", "--out", "memory").status == 3
+
+
 def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedrop) -> None:
     """The router knows where the run's modules are; a run that was started without any gets none on the way."""
     shifts = {"link": "legitimate", "set": {"loss": {"model": "shifts:Shifts", "period": 10, "good": 0.9, "bad": 0.1}}}

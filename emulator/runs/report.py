@@ -269,7 +269,7 @@ def print_design(design: Design) -> None:
         table.add_row(
             name,
             _number(against.bound),
-            "none" if against.perfect is None else f"({against.perfect[0]:.5f}, {against.perfect[1]:.5f}]",
+            "none" if against.perfect is None else _half_open(against.perfect, against.bound),
             "none"
             if not against.relative
             else " ∪ ".join(f"({low:.5f}, {high:.5f})" for low, high in against.relative),
@@ -281,6 +281,12 @@ def print_design(design: Design) -> None:
     console.print(table)
     if design.omission is not None:
         console.print(design.omission)
+
+
+def _half_open(interval: tuple[float, float], bound: float) -> str:
+    """Of perfect secrecy: at its upper end the error is still unbounded, unless it is bounded just there, where all is state."""
+    low, high = interval
+    return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
 
 
 def _figure(value: float | str | None, how: str = ".4g") -> str:

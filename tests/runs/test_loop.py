@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 import tomli_w
 
@@ -99,16 +101,20 @@ def digests(results: Results) -> dict[str, str]:
     return {**found, "controller": results.summary["controller"]["digest"]}
 
 
+def column(table: pa.Table | None, name: str, **where: Any) -> np.ndarray:
+    """The values of one column, in the rows in which others have the values that are given."""
+    assert table is not None
+    for other, value in where.items():
+        table = table.filter(pc.equal(table[other], value))
+    return np.array(table[name].to_pylist())
+
+
 def test_the_loop_is_closed_over_the_estimate(tmp_path: Path) -> None:
     """The tables tell the same story: every state follows from the one before, and every input from the estimate."""
     results = in_memory(tmp_path / "run")
-    rows = results.trials.to_pandas()
-    one = rows[(rows.peer == "legitimate") & (rows.trial == 1)]
-    x, x_hat = (np.stack(one[name].to_list()) - [55.0, 50.0] for name in ("x", "x_hat"))
-    inputs = results.inputs.to_pandas()
-    assert list(inputs.columns) == ["slot", "trial", "u", "d", "failed", "clipped"]
-    inputs = inputs[inputs.trial == 1]
-    u, d = (np.stack(inputs[name].to_list()) for name in ("u", "d"))
+    x, x_hat = (column(results.trials, name, peer="legitimate", trial=1) - [55.0, 50.0] for name in ("x", "x_hat"))
+    assert results.inputs.schema.names == ["slot", "trial", "u", "d", "failed", "clipped"]
+    u, d = (column(results.inputs, name, trial=1) for name in ("u", "d"))
     assert np.array_equal(d, scenario_of().plant.disturbance_values)
     moved = x[:-1] @ np.array([[1.0, 0.05], [0.0, 1.0]]) + u[:-1] * [0.1, 0.0] + d[:-1] * [-0.05, 0.0]
     assert np.allclose(x[1:, 1], moved[:, 1], atol=1e-10)
@@ -276,7 +282,7 @@ def test_both_estimators_are_reported(tmp_path: Path) -> None:
 def test_inputs_are_held_between_decisions(tmp_path: Path) -> None:
     """A decision every period slots."""
     results = in_memory(tmp_path / "run", controller__period=7)
-    u = np.stack(results.inputs.to_pandas().query("trial == 0").u.to_list())[:, 0]
+    u = column(results.inputs, "u", trial=0)[:, 0]
     assert set(np.flatnonzero(np.diff(u)) + 1) <= set(range(0, 300, 7))
     assert results.summary["controller"]["decisions"] == 43
 
@@ -292,8 +298,7 @@ def test_late_packets_are_followed_with_the_inputs(tmp_path: Path) -> None:
         found = results.summary["controller"]["mean_squared_errors"]
         in_loop = results.summary["peers"]["legitimate"]["mean_squared_error"]
         assert found == {"ignoring_input": None, "knowing_input": None, _NAMES[knows]: in_loop}
-        rows = results.slots.to_pandas()
-        late[knows] = rows[(rows.peer == "legitimate") & (rows.slot > 30)].mean_squared_error.max()
+        late[knows] = column(results.slots, "mean_squared_error", peer="legitimate")[31:].max()
     assert late[True] < 1e-18
     assert late[False] > 1e-6
 
@@ -310,7 +315,7 @@ def test_a_plant_without_inputs_needs_no_controller(tmp_path: Path) -> None:
     results = load_results(tmp_path / "run")
     assert results.summary["controller"] is None
     assert results.inputs is None
-    x = np.stack(results.trials.to_pandas().query("trial == 0 and peer == 'smart'").x.to_list())
+    x = column(results.trials, "x", trial=0, peer="smart")
     assert np.allclose(np.diff(x[:, 0]), 0.01)
 
 
