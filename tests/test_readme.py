@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scenario import parse
+from emulator.scenario import load, parse
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -20,6 +20,22 @@ def test_scenario_is_one() -> None:
     """The scenario that the README shows is accepted as it stands."""
     (text,) = blocks("toml")
     assert parse(text, "README.md").receivers == ("legitimate", "antenna")
+
+
+def test_what_is_steered_is_added_to_it(tmp_path: Path) -> None:
+    """The plant and the controller that the README shows fit its scenario, and so do those of a new one fit that."""
+    (tmp_path / "draught.csv").write_text("draught\n" + "0.1\n" * 2000)
+    (text,) = blocks("toml")
+    steered = re.search(r"```\n(\[plant\]\n.*?)```", README, re.S)
+    assert steered is not None
+    (tmp_path / "readme.toml").write_text(f"{text}\n{steered[1]}")
+    new = (ROOT / "scenarios" / "_new.toml").read_text(encoding="utf-8")
+    part = re.search(r"^# \[plant\]\n.*?^# input_weights.*?\n", new, re.S | re.M)
+    assert part is not None
+    uncommented = re.sub(r"^# (?=[\[a-z_]+(\]| =))", "", part[0], flags=re.M)
+    (tmp_path / "new.toml").write_text(new.replace(part[0], uncommented))
+    for name in ("readme", "new"):
+        assert load(tmp_path / f"{name}.toml").controller is not None
 
 
 def test_python_runs(tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ def household_lines(house: Mapping[str, Any] | None) -> list[str]:
     if None not in shares:
         net, total, summed = (f"{100 * share:.2g} %" for share in shares)
         lines.append(
-            f"grid power differs from that one's by {net} in net energy, {total} in total, {summed} slot by slot"
+            f"grid power differs from that one's by {net} in net energy, {total} in total, {summed} summed slot by slot"
         )
     areas = {name: one["activity_area"] for name, one in house["receivers"].items()}
     if None not in areas.values():

@@ -143,6 +143,10 @@ def lines(name: str, events: list[Event]) -> Column:
     return Column(paths.events(name), k, rr.TextLog.columns(text=texts, level=levels))
 
 
+# Where slots share a pixel: the mean of logarithms would be far below the logarithm of the mean.
+_LARGEST = rr.components.AggregationPolicy.Max
+
+
 def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
     """Names and colours of everything, once."""
     driven.log_styles(to, scene)
@@ -150,16 +154,20 @@ def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
     for i, shown in enumerate(scene.receivers):
         bright, label = colour(i), shown.name
         to.log(
-            paths.curve(paths.ERROR, shown.name), rr.SeriesLines(names=label, colors=bright, widths=1.5), static=True
+            paths.curve(paths.ERROR, shown.name),
+            rr.SeriesLines(names=label, colors=bright, widths=1.5, aggregation_policy=_LARGEST),
+            static=True,
         )
         to.log(
             paths.curve(paths.TRACE, shown.name),
-            rr.SeriesLines(names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter"),
+            rr.SeriesLines(
+                names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=_LARGEST
+            ),
             static=True,
         )
         to.log(
             paths.curve(paths.THEORY, shown.name),
-            rr.SeriesLines(names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0),
+            rr.SeriesLines(names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0, aggregation_policy=_LARGEST),
             static=True,
         )
         _log_lane_style(

@@ -103,8 +103,8 @@ class Lqr(Controller):
             return [
                 (
                     "state_weights",
-                    "weigh a state that no input can keep from growing: there is no such regulator; expected weights of "
-                    "0 there, or an input_matrix that reaches it",
+                    "weigh a state that no input can keep from growing: there is no such regulator; expected an "
+                    "input_matrix that reaches it, or weights of 0 there and on every state that it moves",
                 )
             ]
         return []
