@@ -49,7 +49,14 @@ TWO_CLEAR = ("--set", "network.routers=2", "--listen", "tcp/127.0.0.2:{port}", "
 
 @pytest.mark.parametrize(
     ("options", "backwards"),
-    [(TLS, False), (TLS, True), (NAMED, False), (CLEAR, True), (TWO, True), (TWO_CLEAR, False)],
+    [
+        (TLS, False),
+        pytest.param(TLS, True, marks=pytest.mark.long),
+        pytest.param(NAMED, False, marks=pytest.mark.long),
+        (CLEAR, True),
+        (TWO, True),
+        pytest.param(TWO_CLEAR, False, marks=pytest.mark.long),
+    ],
     ids=["tls", "tls, router last", "tls by name", "in clear", "two routers", "two routers in clear"],
 )
 def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards: bool, evedrop: Evedrop) -> None:

@@ -99,7 +99,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "in a loop over the truth": {"slots": 3000, "pace": 0.002, "more": LOOP.format('period = 7\nacts_on = "truth"')},
     "paced, with events": {"slots": 2000, "pace": 0.002, "more": CHANGING},
 }  # fmt: skip
-RARER = ("silent and acknowledged", "coded and acknowledged", "in a loop over the truth")
+RARER = ("silent and acknowledged", "coded and acknowledged", "in a loop over the truth", "paced, with events")
 
 
 @pytest.mark.parametrize("what", [pytest.param(what, marks=[long] if what in RARER else []) for what in RUNS])
