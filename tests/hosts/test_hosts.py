@@ -17,6 +17,7 @@ from emulator.brief import read_brief
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, checked
 from tests.by_hand import ByHand, as_if_undisturbed, by_hand
+from tests.conftest import wait_until
 from tests.hosts.lan import Lan, lan
 
 PORT = 7447
@@ -137,9 +138,14 @@ def test_in_clear_everything_can_be_read(tmp_path: Path) -> None:
     with apart(tmp_path, scenario, "tcp") as (network, run), captured(network, "router", tmp_path / "capture"):
         run.start()
         assert set(run.statuses().values()) == {0}
-        payloads, words = readable(tmp_path / "capture", run)
-        assert payloads > 50
-        assert words == {f"alive/{name}" for name in HOSTS[1:]}
+        everybody = {f"alive/{name}" for name in HOSTS[1:]}
+
+        def all_of_it() -> bool:
+            """Whether what was captured has been written: tcpdump is behind."""
+            payloads, words = readable(tmp_path / "capture", run)
+            return payloads > 50 and words == everybody
+
+        wait_until(all_of_it, "payloads and names in the capture")
 
 
 @pytest.mark.parametrize("host", ["eve", "router"])
