@@ -98,6 +98,8 @@ class _Column:
 def _rows(path: Path) -> list[_Row]:
     """Every line that is neither blank nor a comment."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ValueError("no file")  # a pipe or a device may never end
         raw = path.read_bytes()
         text = (gzip.decompress(raw) if path.suffix == ".gz" else raw).decode("utf-8-sig")
         reader = csv.reader(io.StringIO(text), skipinitialspace=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +285,13 @@ def test_a_file_that_will_not_do_is_told(text: str, what: str, tmp_path: Path) -
     with pytest.raises(ScenarioError) as caught:
         load(scenario_file(tmp_path, text))
     assert any("plant.disturbance_file: " in line and what in line for line in caught.value.mistakes)
+
+
+def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
+    """A pipe that nobody writes to is refused at once."""
+    os.mkfifo(tmp_path / "pipe.csv")
+    (mistake,) = mistakes(plant__disturbance_values=None, plant__disturbance_file=str(tmp_path / "pipe.csv"))
+    assert "pipe.csv cannot be read (no file); expected a CSV file" in mistake
 
 
 def test_a_file_that_is_not_there_is_told() -> None:

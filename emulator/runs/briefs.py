@@ -265,12 +265,11 @@ def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path
             f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
             "itself, with its own --first-trial and --trials"
         )
+    made = briefs_of(scenario, places, Observation(results, True, None), ends_with_stdin=False, patience=patience)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty; give another --out, or empty it")
-        observation = Observation(results, True, None)
-        made = briefs_of(scenario, places, observation, ends_with_stdin=False, patience=patience)
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

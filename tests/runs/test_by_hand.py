@@ -317,6 +317,16 @@ def test_a_router_is_known_by_its_names(listen: str, connect: str | None, names:
     assert isinstance(meeting_at("tcp/0.0.0.0:7447", "tcp/a:7447", insecure=True), Meeting)
 
 
+def test_what_is_refused_leaves_no_folder(evedrop: Evedrop) -> None:
+    """Two routers, and a place for one: nothing is written, and the next try finds nothing in its way."""
+    done = evedrop(
+        "brief", "eavesdroppers", "--out", "b", "--listen", "tcp/127.0.0.1:7447", "--set", "network.routers=2"
+    )
+    assert done.status == 2
+    assert "add --relay" in done.err
+    assert not (evedrop.folder / "b").exists()
+
+
 def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
     """There is no launcher: the observer tells the others why the run has failed, and they end, whatever they wait for."""
     briefs = written(
