@@ -70,9 +70,12 @@ def _play(brief: Brief, serve: str | None) -> int:
         case "controller":
             from peers.controller import steer as play
         case "observer":
-            from emulator.runs.observer import observe
+            from emulator.runs.heartbeat import Heartbeat
 
-            return observe(brief, serve)
+            with Heartbeat():
+                from emulator.runs.observer import observe
+
+                return observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:

@@ -1,13 +1,12 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
-Its news go to standard output, a JSON object a line: `{"event": "started"}`, then four times a second `{"event":
-"progress", …}`, every second `{"event": "alive"}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
+Its news go to standard output, a JSON object a line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
+times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
 and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -32,11 +31,14 @@ from emulator.network.telemetry import is_held, is_leaving, read_leaving
 from emulator.network.wire import Reader
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
-from emulator.runs.joined import Joiner, Slots
+from emulator.runs.heartbeat import tell
+from emulator.runs.held import HeldFolder
+from emulator.runs.joined import Joiner
 from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
+from emulator.runs.rows import DigestRows, write_rows
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
@@ -50,7 +52,6 @@ if TYPE_CHECKING:
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
-_BEAT_SECONDS = 1.0
 _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 
@@ -78,6 +79,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     viewer = None if stand is None else observation.show(stand)
     status, how = 0, "complete"
     try:
+        observation.hold()
         write_resolved(observation.folder, scenario)
         with observation.writer():
             try:
@@ -86,8 +88,9 @@ def observe(brief: Brief, serve: str | None = None) -> int:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
             finally:
                 tell("finishing")
+            observation.settle(how)
     except OSError as error:
-        status, how = RunError.exit_status, _unwritten(error)
+        status, how = RunError.exit_status, unwritten(error)
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
@@ -99,9 +102,16 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     return status
 
 
-def _unwritten(error: OSError) -> str:
+def unwritten(error: OSError) -> str:
     """What a summary and a message say of results that could not be written."""
-    return f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again"
+    if isinstance(error, FileNotFoundError):
+        return (
+            f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
+        )
+    return (
+        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; what was "
+        "measured before can be looked at"
+    )
 
 
 def _end_orphaned() -> None:
@@ -111,12 +121,6 @@ def _end_orphaned() -> None:
     os._exit(RunError.exit_status)
 
 
-def tell(event: str, **news: Any) -> None:
-    """A line to the launcher; nobody has to listen."""
-    with suppress(BrokenPipeError):
-        print(json.dumps({"event": event, **news}, ensure_ascii=False), flush=True)  # noqa: T201 - the launcher reads it
-
-
 class Observation:
     """One run as the observer sees it. Final."""
 
@@ -124,7 +128,9 @@ class Observation:
         self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
         """by_hand: whether nobody has launched the others who would end them."""
-        self.folder = Path(brief.part["results"])
+        self._place = Path(brief.part["results"])
+        self._held: HeldFolder | None = None
+        self._final: dict[str, Any] | None = None
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
@@ -134,6 +140,7 @@ class Observation:
         loop = None if table is None or plant is None else (plant.inputs, table.period)
         measures = plant is not None and plant.output_matrix is not None
         self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
+        self._digest_rows = DigestRows(self._joiner.digests, scenario.first_trial)
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -143,12 +150,21 @@ class Observation:
         self._live: str | None = brief.part["live"]
         self._showing: Showing | None = None
         self._writer: ResultsWriter
-        self._started = self._ended = self._told = self._beaten = time.monotonic()
+        self._started = self._ended = self._told = time.monotonic()
         self._suspects: list[str] = []
         self._recovery: Recovery
         self._outages: list[Mapping[str, Any]] = []
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
+
+    @property
+    def folder(self) -> Path:
+        """The results folder, also if it was renamed. Raises FileNotFoundError if it was removed."""
+        return self._place if self._held is None else self._held.now
+
+    def hold(self) -> None:
+        """Keep hold of the results folder from now on. Raises OSError if there is none."""
+        self._held = HeldFolder(self._place)
 
     def show(self, stand: Stand) -> Viewer:
         """A viewer for browsers, which the run will be streamed to."""
@@ -164,8 +180,8 @@ class Observation:
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
-        with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
-            conductor = Conductor(session, self._scenario.digested, stop, self._beat, self._scenario.relayed)
+        with Session(self._brief, meanwhile=stop.check) as session:
+            conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
@@ -188,6 +204,7 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
+                    self._writer.checkpoint(self._at, self._so_far)
             except EvedropError as error:
                 self._suspects = conductor.missing if isinstance(error, RunError) else []
                 if self._by_hand:  # a launcher ends them itself
@@ -197,15 +214,9 @@ class Observation:
                 self._dismiss(conductor)
                 self._recovery.give_up(self._joiner.done)
                 self._outages = self._recovery.account()
-                self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
             tell("over")
             conductor.end(patience)
-
-    def _wait(self, stop: Stop) -> None:
-        """What is done while there is no router yet."""
-        stop.check()
-        self._beat()
 
     @property
     def _control(self) -> Control:
@@ -246,7 +257,8 @@ class Observation:
 
     def _dismiss(self, conductor: Conductor) -> None:
         """The run is over: nobody can get at it, and whoever waits is told."""
-        remove_control(self.folder)
+        with suppress(FileNotFoundError):
+            remove_control(self.folder)
         self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
         while not conductor.questions.empty():
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
@@ -293,6 +305,7 @@ class Observation:
             return
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
+        self._digest_rows.write(self._writer)
         if self._recording is not None:
             self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
         conductor.report(self._joiner.done)
@@ -332,13 +345,6 @@ class Observation:
         self._steering.left(name, k)
         self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
 
-    def _beat(self) -> None:
-        """Show the launcher that we live, when there is nothing else to tell."""
-        now = time.monotonic()
-        if now - self._beaten >= _BEAT_SECONDS:
-            self._beaten = now
-            tell("alive")
-
     def _progress(self, scored: Mapping[str, Scored]) -> None:
         now = time.monotonic()
         if now - self._told < _PROGRESS_SECONDS:
@@ -349,37 +355,48 @@ class Observation:
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
         tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
 
+    @property
+    def _at(self) -> str:
+        """How far the run came."""
+        return f"slot {self._joiner.done}"
+
+    def _so_far(self) -> dict[str, Any]:
+        """The summary of a run that goes on."""
+        self._ended = time.monotonic()
+        return self._summary("")
+
+    def _summary(self, how: str) -> dict[str, Any]:
+        """The summary by now; a shard leaves its score for the run's."""
+        folder = self.folder
+        if self._brief.part["shard"]:
+            leave(self._keeper.totals, folder)
+        digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
+        replay = replay_of(folder, self._scenario)
+        ending = Ending(self._ended - self._started, how, replay, events=self._events, outages=self._outages)
+        return summary_of(self._scenario, self._keeper.totals, digests, ending)
+
+    def settle(self, how: str) -> None:
+        """Have all that was measured on disk, its summary too. Raises OSError if it cannot be written."""
+        self._digest_rows.write(self._writer)
+        self._final = self._summary(how)
+        self._writer.settle(self._at, self._final)
+
     def finish(self, status: int, how: str) -> tuple[int, str]:
         """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
         safe = self._recording.close() if self._recording is not None else True
-        if self._brief.part["shard"]:
-            with suppress(OSError):  # of a full disk, which the summary says
-                leave(self._keeper.totals, self.folder)
-        digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
-        replay = replay_of(self.folder, self._scenario)
-        ending = Ending(self._ended - self._started, how, replay, events=self._events, outages=self._outages)
-        summary = summary_of(self._scenario, self._keeper.totals, digests, ending)
-        if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
-            status = RunError.exit_status
-            summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
-        if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
-            status = 1
         try:
+            summary = {**(self._final or self._summary(how)), "ended": how}
+            if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
+                status = RunError.exit_status
+                summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+            if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
+                status = 1
+            how = str(summary["ended"])
             write_summary(self.folder, summary)
         except OSError as error:
-            status = RunError.exit_status
-            summary["ended"] = _unwritten(error)
+            status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
+        tell("ended", status=status, how=how, suspects=self._suspects, view=view)
         if not safe:
             os._exit(status)
-        return status, str(summary["ended"])
-
-
-def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
-    """All rows of some slots."""
-    for name, one in scored.items():
-        writer.slot_rows(slots.first, name, one.sums, one.expected)
-    writer.input_rows(slots, first_trial)
-    writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
-    writer.journal_rows(slots)
+        return status, how
