@@ -251,11 +251,13 @@ class Children:
 
     def story(self, first: Exit | None, ending: News | None) -> str:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
-        suspects = list(ending.get("suspects", [])) if ending is not None else []
+        suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
-        if first is None or (first.process == OBSERVER and first.status > 0):
+        if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
-        if first is not None:
+        if accused and why:
+            named, head = [name for name in accused if name in self._processes], why
+        elif first is not None:
             named, head = [first.process], f"{first.process} {first.manner}"
             words = reversed(self._log(first.process))
             why = next((line for line in words if line.startswith(_COMPLAINT)), "")
@@ -264,8 +266,9 @@ class Children:
         else:
             named, head = [], f"the run failed: {why}"
         at_fault = _sender(why)
-        if at_fault is not None and at_fault in self._processes and at_fault not in named:
-            named, head = [at_fault, *named], f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        if at_fault is not None and at_fault in self._processes and (at_fault not in named or accused):
+            named = list(dict.fromkeys([at_fault, *named]))
+            head = f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
