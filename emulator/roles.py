@@ -6,6 +6,8 @@ Every import of weight waits for the command that needs it, so that a peer start
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import signal
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -36,6 +38,7 @@ def process(options: argparse.Namespace) -> int:
     from emulator.brief import read_brief
     from emulator.modules import look_in
 
+    os.umask(0o077)  # whatever it writes is of the run, and nobody else's business
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
     if getattr(options, "out", None) is not None:
@@ -72,7 +75,7 @@ def _play(brief: Brief, serve: str | None) -> int:
         case "observer":
             from emulator.runs.heartbeat import Heartbeat
 
-            with Heartbeat():
+            with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
                 from emulator.runs.observer import observe
 
                 return observe(brief, serve)

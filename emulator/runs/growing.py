@@ -25,6 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from emulator.runs.folder import make_private, private_opener, write_private
 from emulator.runs.tables import NULLABLE
 
 UNFINISHED = "unfinished"
@@ -152,7 +153,7 @@ class Unfinished:
     def __init__(self, folder: Path) -> None:
         """Make it in a results folder. Raises OSError if that cannot be done."""
         place = folder / UNFINISHED
-        place.mkdir(mode=0o700)
+        make_private(place, exist_ok=False)
         self._descriptor = os.open(place, os.O_RDONLY)
         with contextlib.suppress(OSError):  # of a file system without locks, where a run that goes on looks killed
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -214,9 +215,7 @@ def last_round(folder: Path) -> Round:
 def write_figures(folder: Path, text: str) -> None:
     """Write the summary of what was measured so far, whole at any moment."""
     place = folder / UNFINISHED
-    descriptor = os.open(place / f"{_SUMMARY}.new", os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        file.write(text)
+    write_private(place / f"{_SUMMARY}.new", text)
     os.replace(place / f"{_SUMMARY}.new", place / _SUMMARY)
 
 
@@ -284,9 +283,8 @@ def finish(folder: Path) -> None:
 
 def _write_parquet(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> None:
     names = [one.name for one in schema if pa.types.is_dictionary(one.type)]
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with (
-        os.fdopen(descriptor, "wb") as file,
+        open(path, "wb", opener=private_opener) as file,
         pq.ParquetWriter(file, schema, compression="zstd", compression_level=1, use_dictionary=names) as writer,
     ):
         for group in _groups(batches):

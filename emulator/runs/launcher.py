@@ -19,7 +19,7 @@ from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import SILENCE_SECONDS, Children, Exit, News
-from emulator.runs.folder import new_folder
+from emulator.runs.folder import make_private, new_folder
 from emulator.runs.held import HeldFolder
 from emulator.runs.ports import Places, loopback_places
 from emulator.runs.private import private_folder
@@ -88,7 +88,7 @@ def launch_one(
     shard: whether others carry further trials.
     """
     with private_folder() as private, contextlib.closing(HeldFolder(new_folder(folder))) as held:
-        (folder / "logs").mkdir()
+        make_private(folder / "logs")
         viewer = None
         try:
             briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None, shard))

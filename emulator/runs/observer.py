@@ -2,14 +2,14 @@
 
 Its news go to standard output, a JSON object a line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
 times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
-and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole.
+and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole. An observer that was started by
+hand then prints the table and the verdict that `evedrop run` prints.
 """
 
 from __future__ import annotations
 
 import os
 import signal
-import sys
 import time
 import traceback
 from collections.abc import Mapping
@@ -23,6 +23,7 @@ from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.model.digest import Blocks
 from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
@@ -38,12 +39,14 @@ from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
-from emulator.runs.rows import DigestRows, write_rows
+from emulator.runs.rows import DigestRows, extent_of, write_rows
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
+from emulator.runs.summary_file import unwritten
+from emulator.runs.verification import Verifier
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
@@ -94,24 +97,10 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
-    status, how = observation.finish(status, how)
+    status = observation.finish(status, how)
     if viewer is not None:
         viewer.stop()
-    if by_hand and status not in {0, 1}:
-        print(f"evedrop: {how}", file=sys.stderr)  # noqa: T201 - nobody else says it
     return status
-
-
-def unwritten(error: OSError) -> str:
-    """What a summary and a message say of results that could not be written."""
-    if isinstance(error, FileNotFoundError):
-        return (
-            f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
-        )
-    return (
-        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; what was "
-        "measured before can be looked at"
-    )
 
 
 def _end_orphaned() -> None:
@@ -134,12 +123,13 @@ class Observation:
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
-        self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        table, plant = scenario.controller, scenario.driven
-        loop = None if table is None or plant is None else (plant.inputs, table.period)
-        measures = plant is not None and plant.output_matrix is not None
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
+        blocks = {name: Blocks(scenario.slots, scenario.cuts(name)) for name in scenario.digested}
+        table = scenario.controller
+        self._extent = extent_of(scenario, brief.flow.batch)
+        self._verifier = Verifier(blocks, scenario.record_trials, scenario.first_trial)
+        period = None if table is None else table.period
+        self._joiner = Joiner(self._extent, windows, blocks, period, self._verifier.report)
         self._digest_rows = DigestRows(self._joiner.digests, scenario.first_trial)
         self._confirmations = confirmations
         self._steering: Steering
@@ -152,6 +142,8 @@ class Observation:
         self._writer: ResultsWriter
         self._started = self._ended = self._told = time.monotonic()
         self._suspects: list[str] = []
+        self._accused: tuple[str, ...] = ()
+        """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
         self._outages: list[Mapping[str, Any]] = []
         self._due: dict[str, Due] = {}
@@ -207,6 +199,7 @@ class Observation:
                     self._writer.checkpoint(self._at, self._so_far)
             except EvedropError as error:
                 self._suspects = conductor.missing if isinstance(error, RunError) else []
+                self._accused = error.at_fault if isinstance(error, RunError) else ()
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
@@ -303,6 +296,7 @@ class Observation:
         slots = self._joiner.take()
         if slots is None:
             return
+        self._verifier.joined(slots)
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         self._digest_rows.write(self._writer)
@@ -333,7 +327,7 @@ class Observation:
 
     def _leave(self, name: str, message: Reader) -> None:
         """Report for a receiver from now on, until it is back."""
-        k, left = read_leaving(message, self._shape)
+        k, left = read_leaving(message, self._extent)
         away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
         if away is None:
             raise message.malformed(f"a leave before slot {k}", "one where an event makes the receiver leave")
@@ -342,6 +336,7 @@ class Observation:
         def put(payload: bytes) -> None:
             self._joiner.report(name, Reader(key, payload))
 
+        self._verifier.left(name, k, left)
         self._steering.left(name, k)
         self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
 
@@ -371,8 +366,8 @@ class Observation:
         if self._brief.part["shard"]:
             leave(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
-        replay = replay_of(folder, self._scenario)
-        ending = Ending(self._ended - self._started, how, replay, events=self._events, outages=self._outages)
+        replay, wall = replay_of(folder, self._scenario), self._ended - self._started
+        ending = Ending(wall, how, replay, events=self._events, outages=self._outages, accused=self._accused)
         return summary_of(self._scenario, self._keeper.totals, digests, ending)
 
     def settle(self, how: str) -> None:
@@ -381,8 +376,8 @@ class Observation:
         self._final = self._summary(how)
         self._writer.settle(self._at, self._final)
 
-    def finish(self, status: int, how: str) -> tuple[int, str]:
-        """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
+    def finish(self, status: int, how: str) -> int:
+        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
         safe = self._recording.close() if self._recording is not None else True
         try:
             summary = {**(self._final or self._summary(how)), "ended": how}
@@ -396,7 +391,13 @@ class Observation:
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell("ended", status=status, how=how, suspects=self._suspects, view=view)
+        accused = list(self._accused)
+        tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
+        if self._by_hand:
+            from emulator.runs.closing import print_ending  # noqa: PLC0415 - a launched observer has no use for it
+
+            with suppress(FileNotFoundError):
+                print_ending(self.folder, status, how)
         if not safe:
             os._exit(status)
-        return status, how
+        return status

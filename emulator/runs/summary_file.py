@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from emulator.runs.folder import write_private
 from emulator.runs.growing import forget
 
 
@@ -21,7 +22,7 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json, which ends a results folder; infinite and undefined numbers as strings, which JSON lacks."""
     unfinished = folder / "summary.json.new"
     try:
-        unfinished.write_text(summary_text(summary), encoding="utf-8")
+        write_private(unfinished, summary_text(summary))
         os.replace(unfinished, folder / "summary.json")
     except OSError:
         with contextlib.suppress(OSError):
@@ -44,3 +45,15 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return str(value)
     return value
+
+
+def unwritten(error: OSError) -> str:
+    """What a summary and a message say of results that could not be written."""
+    if isinstance(error, FileNotFoundError):
+        return (
+            f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
+        )
+    return (
+        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; what was "
+        "measured before can be looked at"
+    )

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.errors import Interrupted, RunError, ScenarioError, UsageError
-from emulator.runs.folder import new_folder
+from emulator.runs.folder import new_folder, private_file, private_pictures, write_private
 from emulator.runs.montecarlo import Merger, Plan, check_mode, results_of, said_of, teller
 from emulator.runs.scorekeeper import Ending
 from emulator.runs.signals import stop_on_signals
@@ -104,9 +104,8 @@ def sweep_over(
         told = teller(tell, total)
         everything = list(itertools.chain(*tasks))
         with said_of(folder):
-            (folder / "sweep.json").write_text(
-                json.dumps(description, indent=1, ensure_ascii=False, default=str) + "\n", encoding="utf-8"
-            )
+            text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
+            write_private(folder / "sweep.json", text + "\n")
             with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
                 written = time.monotonic()
                 try:
@@ -137,7 +136,7 @@ def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
     """Write the table of the points so far, whole at any moment."""
     table = pa.Table.from_pylist(rows)
     unfinished = folder / "sweep.parquet.new"
-    pq.write_table(table, unfinished)
+    pq.write_table(table, private_file(unfinished))
     os.replace(unfinished, folder / "sweep.parquet")
     return table
 
@@ -145,11 +144,11 @@ def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
 def _draw(folder: Path, table: pa.Table, grid: Grid) -> None:
     from emulator.view.sweeps import draw  # noqa: PLC0415 - matplotlib takes half a second
 
-    draw(folder / "sweep", table, tuple(grid))
+    draw(private_pictures(folder / "sweep"), table, tuple(grid))
     if HOUSE_FIGURES[0] in table.column_names:
         from emulator.view.household_sweep import draw as draw_household  # noqa: PLC0415 - as above
 
-        draw_household(folder / "household", table, next(iter(grid)))
+        draw_household(private_pictures(folder / "household"), table, next(iter(grid)))
 
 
 def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:
