@@ -5,6 +5,7 @@ Source: docs/results.md.
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -166,6 +167,8 @@ class ResultsWriter:
         self._streams["slots"] = self._stream("slots", self._restarts)
 
     def _round(self) -> None:
+        if self._broken:  # what would come after a part of a batch could not be read
+            raise OSError(errno.EIO, "an earlier part could not be written")
         self._broken = True  # unless all goes well
         self._unfinished.round(self._at, self._slots, self._streams)
         self._broken = False
