@@ -83,7 +83,7 @@ def test_delays_are_read(tmp_path: Path) -> None:
         ("walk.csv", "a,b\n1,0\n", None, "column", 'is missing; walk.csv has a, b; expected column = "a"'),
         ("walk.csv", "1\n0\n", "a", "column", '"a" is no column of walk.csv; there are no names'),
         ("walk.csv", "1,0\n0,1\n", None, "file", "has 2 columns without names; expected one column, or a line of"),
-        ("walk.csv", b"\xff\xfe1", None, "file", "cannot be read ('utf-8' codec"),
+        ("walk.csv", b"\xff\xfe1", None, "file", "cannot be read (it is not text in UTF-8"),
         ("walk.csv", b"1\n" * 21, None, "file", "has more than 20 outcomes; expected at most so many"),
         ("walk.parquet", "1\n0\n", None, "file", "cannot be read ("),
         ("walk.parquet", None, None, "file", "cannot be read ("),

@@ -49,8 +49,10 @@ class Closed:
 
     @cached_property
     def limit(self) -> float:
-        """Trace of the limit; inf if it is unbounded."""
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to work out."""
         if self.chain is not None:
+            if len(self.chain.start) * self.process.n**2 > theory.LARGEST_OPERATOR:
+                return float("nan")
             return float(np.trace(self.chain.limit(self.process)))
         if self.acknowledged[1] > 0.0:
             return float("inf")
@@ -85,6 +87,8 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
     kind = closed_form(scenario.encoding.scheme, reader)
     threshold = scenario.encoding.parameters.get("threshold", 1)
+    if kind in ("scheduled", "selective") and threshold > theory.LARGEST_OPERATOR:
+        return None
     # Unless acknowledgements are forged the user never misses a reference, and what it does with a slot tells more.
     told = receiver != LEGITIMATE or table.attack == "forge"
     if kind == "reference" and told and not ReferenceCode(process).decorrelates:

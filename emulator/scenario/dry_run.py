@@ -19,6 +19,7 @@ from emulator.model.links import LOSS_MODELS, loss_of
 from emulator.model.schemes import SCHEMES, scheme_of
 from emulator.modules import names_in
 from emulator.network.access import LEGITIMATE
+from emulator.scenario.table import model_mistakes
 from emulator.scenario.tables import Scenario
 from emulator.scenario.words import as_toml
 from emulator.streams import Batch
@@ -75,7 +76,21 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
         link = scenario.link(receiver)
         yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
     for i, event in enumerate(scenario.event):
-        yield from _settings_mistakes(f"event.{i}.set", event.set or {}, problem)
+        # What is wrong with the models of an event shows across tables, and is told there.
+        if event.set is not None and not _model_mistakes(event.set):
+            yield from _settings_mistakes(f"event.{i}.set", event.set, problem)
+
+
+def _model_mistakes(settings: Mapping[str, Any]) -> bool:
+    """Whether a loss or delay model cannot be made as it is described."""
+    for name, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS)):
+        found = settings.get(name)
+        if found is not None and not isinstance(found, Mapping):
+            return True
+        given = {entry: value for entry, value in (found or {}).items() if entry != "unit"}
+        if found is not None and model_mistakes(name, given, models):
+            return True
+    return False
 
 
 def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:

@@ -44,6 +44,8 @@ from emulator.scenario.tables import (
 from emulator.scenario.words import as_toml, listed, no_entry
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # whether there is a theory does not depend on it
+_ROOTS: Mapping[str, type[BaseModel]] = {LinkTable.__name__: LinkTable}
+"""Tables that are checked by themselves, by the name that an error has of them; any other error is of a scenario."""
 _EXPECTED: Mapping[str, str] = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -66,13 +68,13 @@ def sentences(error: ValidationError) -> list[str]:
             inner: list[Found] = detail["ctx"]["mistakes"]
             lines += [f"{path}.{name}: {what}" if path else f"{name}: {what}" for name, what in inner]
         else:
-            lines.append(f"{path}: {_sentence(detail)}")
+            lines.append(f"{path}: {_sentence(detail, _ROOTS.get(error.title, Scenario))}")
     return lines
 
 
-def _sentence(detail: ErrorDetails) -> str:
+def _sentence(detail: ErrorDetails, root: type[BaseModel]) -> str:
     kind, found, context = detail["type"], detail["input"], detail.get("ctx", {})
-    table, field = _field(detail["loc"])
+    table, field = _field(detail["loc"], root)
     name = str(detail["loc"][-1]) if detail["loc"] else ""
     example = f", such as {as_toml(field.examples[0])}" if field is not None and field.examples else ""
     if kind == "missing":
@@ -95,9 +97,9 @@ def _sentence(detail: ErrorDetails) -> str:
     return f"is {as_toml(found)}; expected {expected}{example}"
 
 
-def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
-    """The table an error is in, and the field's description if it is a field."""
-    table: type[BaseModel] | None = Scenario
+def _field(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel] | None, Any]:
+    """The table an error is in, and the field's description if it is a field; root: the table that was checked."""
+    table: type[BaseModel] | None = root
     field = None
     inner: Mapping[str, type[BaseModel]] = {
         "process": ProcessTable,
@@ -151,6 +153,11 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)
+    if scenario is not None and not found:
+        try:
+            _ = scenario.timeline
+        except ValidationError as error:
+            found += [f"event: several of them together leave a link that is none: {line}" for line in sentences(error)]
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     sound = scenario if not found else None
