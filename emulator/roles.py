@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from emulator.brief import Brief
 
 
+_MOST_TOLD = 5  # mistakes of a scenario in a brief, which nobody wrote by hand
+
+
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
@@ -50,6 +53,7 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: Brief, serve: str | None) -> int:
     """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    from emulator.brief_use import expect_usable
     from emulator.model.registry import NotRegistered
 
     if brief.identity is not None:
@@ -70,12 +74,20 @@ def _play(brief: Brief, serve: str | None) -> int:
         case "controller":
             from peers.controller import steer as play
         case "observer":
-            from emulator.runs.observer import observe
+            from pydantic import ValidationError
 
-            return observe(brief, serve)
+            from emulator.runs.observer import observe
+            from emulator.scenario.mistakes import sentences
+
+            try:
+                return observe(brief, serve)
+            except ValidationError as error:
+                lines = "; ".join(sentences(error)[:_MOST_TOLD])
+                raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:
+        expect_usable(brief)
         play(brief)
     except NotRegistered as error:
         raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error

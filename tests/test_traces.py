@@ -146,7 +146,7 @@ def mistakes(folder: Path, loss: dict[str, Any], **more: Any) -> list[str]:
         ({"file": "walk.csv", "outcomes": "1"}, "file: is there beside outcomes; expected one of them"),
         ({"file": "walk.csv", "once": "no"}, 'once: is "no"; expected true or false'),
         ({"file": "walk.csv", "twice": True}, "twice: is no parameter of trace; expected"),
-        ({"file": "."}, "is no file; expected a CSV"),
+        ({"file": "."}, "cannot be read (it is a folder); expected a CSV"),
         ({"outcomes": "10110", "once": True}, "outcomes: has 5 outcomes and is read once; expected slots, which is 6, or"),
         ({"file": "walk.csv", "once": True}, "file: has 4 outcomes and is read once; expected slots, which is 6, or more"),
     ],

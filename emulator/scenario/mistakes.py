@@ -14,6 +14,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from emulator.files import Unreadable, contents
 from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.horizon import horizon
 from emulator.model.link import Course
@@ -34,6 +35,7 @@ from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
+    MOST_SECRET_BYTES,
     SECRET_BYTES,
     AcknowledgementsTable,
     EavesdropperTable,
@@ -90,9 +92,11 @@ def _sentence(detail: ErrorDetails, root: type[BaseModel]) -> str:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {as_toml(found)}; expected a number {bound}{example}"
-    if kind in {"too_long", "too_short"}:
-        limit = f"more than {context['max_length']}" if kind == "too_long" else f"fewer than {context['min_length']}"
-        return f"has {limit} entries; expected {'at most' if kind == 'too_long' else 'at least'} so many"
+    if kind in {"too_long", "too_short", "string_too_long"}:
+        things = "characters" if kind == "string_too_long" else "entries"
+        few = kind == "too_short"
+        limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
+        return f"has {limit} {things}; expected {'at least' if few else 'at most'} so many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(found)}; expected {expected}{example}"
 
@@ -258,10 +262,9 @@ def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
 def _secret_mistakes(file: str) -> list[str]:
     """Why a file cannot hold a secret."""
     try:
-        size = len(Path(file).read_bytes())
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        return [f"secret_file: {file} cannot be read ({why}); expected a file of {SECRET_BYTES} or more random bytes"]
+        size = len(contents(Path(file), MOST_SECRET_BYTES))
+    except Unreadable as error:
+        return [f"secret_file: {file} cannot be read ({error}); expected a file of {SECRET_BYTES} or more random bytes"]
     if size < SECRET_BYTES:
         return [f"secret_file: {file} has {size} bytes; expected {SECRET_BYTES} or more, random ones"]
     return []

@@ -16,6 +16,7 @@ _LARGEST_BITS = 4096  # of a whole number; a seed has 256
 _LONGEST_NAME = 200
 _PLAIN = {"\n", "\t"}
 _MOST_TOLD = 20
+MOST_EAVESDROPPERS = 64
 
 
 def unusable(tables: Any) -> Iterator[str]:
@@ -28,6 +29,11 @@ def unusable(tables: Any) -> Iterator[str]:
 
 
 def _unusable(tables: Any) -> Iterator[str]:
+    eavesdroppers = tables.get("eavesdroppers")
+    if isinstance(eavesdroppers, dict) and len(eavesdroppers) > MOST_EAVESDROPPERS:
+        # Each would be looked at, and each told what it lacks.
+        yield f"eavesdroppers: has {len(eavesdroppers)} entries; expected at most {MOST_EAVESDROPPERS}"
+        return
     # A stack of our own: dotted keys can nest tables deeper than Python's calls can follow.
     waiting: list[tuple[tuple[str, ...], Any]] = [((), tables)]
     while waiting:
