@@ -20,6 +20,7 @@ from emulator.brief import Brief
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
+from emulator.runs.folder import private_opener
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -130,7 +131,8 @@ class Children:
             environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
-            with (self._logs / f"{brief.process}.log").open("ab" if again else "wb") as log:
+            log_file = self._logs / f"{brief.process}.log"
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = subprocess.Popen(
                     [sys.executable, "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
@@ -138,6 +140,7 @@ class Children:
                     stderr=log,
                     start_new_session=True,
                     env=environment,
+                    umask=0o077,
                 )
         except OSError as error:
             raise RunError(
@@ -248,11 +251,13 @@ class Children:
 
     def story(self, first: Exit | None, ending: News | None) -> str:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
-        suspects = list(ending.get("suspects", [])) if ending is not None else []
+        suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
-        if first is None or (first.process == OBSERVER and first.status > 0):
+        if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
-        if first is not None:
+        if accused and why:
+            named, head = [name for name in accused if name in self._processes], why
+        elif first is not None:
             named, head = [first.process], f"{first.process} {first.manner}"
             words = reversed(self._log(first.process))
             why = next((line for line in words if line.startswith(_COMPLAINT)), "")
@@ -261,8 +266,9 @@ class Children:
         else:
             named, head = [], f"the run failed: {why}"
         at_fault = _sender(why)
-        if at_fault is not None and at_fault in self._processes and at_fault not in named:
-            named, head = [at_fault, *named], f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        if at_fault is not None and at_fault in self._processes and (at_fault not in named or accused):
+            named = list(dict.fromkeys([at_fault, *named]))
+            head = f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:

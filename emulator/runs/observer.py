@@ -25,11 +25,12 @@ from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError, UsageError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.model.digest import Blocks
 from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Question, Session
-from emulator.network.telemetry import is_held, is_leaving, read_leaving
+from emulator.network.telemetry import Extent, is_held, is_leaving, read_leaving
 from emulator.network.wire import Reader
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
@@ -43,6 +44,7 @@ from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
+from emulator.runs.verification import Verifier
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
@@ -138,12 +140,13 @@ class Observation:
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
-        self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        table, plant = scenario.controller, scenario.driven
-        loop = None if table is None or plant is None else (plant.inputs, table.period)
-        measures = plant is not None and plant.output_matrix is not None
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
+        blocks = {name: Blocks(scenario.slots, scenario.cuts(name)) for name in scenario.digested}
+        table = scenario.controller
+        self._extent = _extent_of(scenario, brief.flow.batch)
+        self._verifier = Verifier(blocks, scenario.record_trials, scenario.first_trial)
+        period = None if table is None else table.period
+        self._joiner = Joiner(self._extent, windows, blocks, period, self._verifier.report)
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -155,6 +158,8 @@ class Observation:
         self._writer: ResultsWriter
         self._started = self._ended = self._told = self._beaten = time.monotonic()
         self._suspects: list[str] = []
+        self._accused: tuple[str, ...] = ()
+        """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
         self._outages: list[Mapping[str, Any]] = []
         self._due: dict[str, Due] = {}
@@ -200,6 +205,7 @@ class Observation:
                     self._recovery.look(self._joiner.done)
             except EvedropError as error:
                 self._suspects = conductor.missing if isinstance(error, RunError) else []
+                self._accused = error.at_fault if isinstance(error, RunError) else ()
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
@@ -301,6 +307,7 @@ class Observation:
         slots = self._joiner.take()
         if slots is None:
             return
+        self._verifier.joined(slots)
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         if self._recording is not None:
@@ -330,7 +337,7 @@ class Observation:
 
     def _leave(self, name: str, message: Reader) -> None:
         """Report for a receiver from now on, until it is back."""
-        k, left = read_leaving(message, self._shape)
+        k, left = read_leaving(message, self._extent)
         away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
         if away is None:
             raise message.malformed(f"a leave before slot {k}", "one where an event makes the receiver leave")
@@ -339,6 +346,7 @@ class Observation:
         def put(payload: bytes) -> None:
             self._joiner.report(name, Reader(key, payload))
 
+        self._verifier.left(name, k, left)
         self._steering.left(name, k)
         self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
 
@@ -367,7 +375,8 @@ class Observation:
                 leave(self._keeper.totals, self.folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay = replay_of(self.folder, self._scenario)
-        ending = Ending(self._ended - self._started, how, replay, events=self._events, outages=self._outages)
+        wall = self._ended - self._started
+        ending = Ending(wall, how, replay, events=self._events, outages=self._outages, accused=self._accused)
         summary = summary_of(self._scenario, self._keeper.totals, digests, ending)
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status
@@ -380,12 +389,27 @@ class Observation:
             status = RunError.exit_status
             summary["ended"] = _unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
+        accused = list(self._accused)
+        tell("ended", status=status, how=summary["ended"], suspects=self._suspects, accused=accused, view=view)
         if self._by_hand:
             _print_ending(self.folder, status, str(summary["ended"]))
         if not safe:
             os._exit(status)
         return status
+
+
+def _extent_of(scenario: Scenario, batch: int) -> Extent:
+    """What messages of a run are held to."""
+    plant = scenario.driven
+    return Extent(
+        scenario.slots,
+        batch,
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        0 if plant is None or scenario.controller is None else plant.inputs,
+        plant is not None and plant.output_matrix is not None,
+    )
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:

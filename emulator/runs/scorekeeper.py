@@ -22,6 +22,7 @@ from emulator.plant_data import disturbances_text
 from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
 from emulator.runs.filtering import true_errors
+from emulator.runs.folder import write_private
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
@@ -29,6 +30,7 @@ from emulator.runs.loop_tally import Acted
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.totals import Totals
 from emulator.runs.verdict import Secrecy, secrecy
+from emulator.runs.verification import verification_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
@@ -103,6 +105,8 @@ class Ending:
     """As the summary has them."""
     outages: Sequence[Mapping[str, Any]] = ()
     """The same."""
+    accused: tuple[str, ...] = ()
+    """The processes that the run has ended with because of what they did."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -147,6 +151,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         "links": links,
         "events": list(ending.events),
         "outages": list(ending.outages),
+        "verification": verification_of(scenario, ending.accused) if ending.mode == "live" else None,
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
         "controller": None
@@ -225,7 +230,7 @@ def write_resolved(folder: Path, scenario: Scenario) -> None:
         }
     for name, text in texts.items():
         unfinished = folder / f"{name}.new"
-        unfinished.write_text(text, encoding="utf-8")
+        write_private(unfinished, text)
         os.replace(unfinished, folder / name)
 
 

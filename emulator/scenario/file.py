@@ -23,6 +23,7 @@ from emulator.files import Unreadable, is_folder, is_there, shown, text_of
 from emulator.model.registry import place_of
 from emulator.modules import named_in
 from emulator.scenario.disturbances import disturbances_beside, disturbances_read
+from emulator.scenario.drawn import with_faults
 from emulator.scenario.dry_run import dry_run, foreign
 from emulator.scenario.filter_noise import filter_noise_read
 from emulator.scenario.mistakes import across_tables, sentences
@@ -150,6 +151,12 @@ def checked(
     broken = dry_run(scenario)
     # A class that breaks in a dry run breaks again when it is asked about itself: that is not told twice.
     mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
+    if scenario.nemesis is not None:
+        tables, found = with_faults(tables, scenario, sentences)
+        mistakes += found
+        if not mistakes:
+            scenario = Scenario.model_validate(tables)
+            mistakes = _across(tables, beyond_horizon, scenario)
     if mistakes:
         raise ScenarioError(source, mistakes)
     return scenario
