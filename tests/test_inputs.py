@@ -125,7 +125,7 @@ def special(folder: Path, kind: str) -> Path:
     elif kind == "device":
         path.symlink_to("/dev/zero")
     elif kind == "long":
-        return folder / ("a" * 5000)
+        return folder / ("a" * 300)
     return path
 
 
