@@ -27,10 +27,15 @@ _WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
 def expect_usable(brief: Brief) -> None:
-    """Raise BriefError where a process cannot work with what its brief says, and for a key that it lacks.
+    """Raise BriefError where a process cannot work with what its brief says: a key, a class or a number that is not there."""
+    try:
+        _expect_usable(brief)
+    except NotRegistered as error:
+        name = str(error.name).encode("unicode_escape").decode()
+        raise BriefError(f"it names {name}{error.why or ', which is no class here'}") from error
 
-    Raises NotRegistered for a class that is not here.
-    """
+
+def _expect_usable(brief: Brief) -> None:
     match brief.role:
         case "router":
             _expect_links(brief)
