@@ -21,13 +21,14 @@ from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
 from emulator.runs.folder import private_opener
+from emulator.runs.held import HeldFolder
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
 ROUTER_RESTARTS = 3  # of a router that a signal ended: the run goes on with the new one
-_BEGIN_SECONDS = 10.0  # for the observer to begin to write what there is
+SILENCE_SECONDS = 30.0  # after which an observer that says nothing is given up: its heartbeat is a second
+_BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there is
 _GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
-_FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
 _ROUTER_LOST = "has had no connection with the router"
@@ -74,9 +75,9 @@ class Exit:
 class Children:
     """The processes of a run. Final; on leaving the block all are gone."""
 
-    def __init__(self, logs: Path, private: Path, lock_step: bool = False) -> None:
-        """lock_step: the processes wait for each other in every slot, or every few."""
-        self._logs = logs
+    def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
+        """folder: of the results; lock_step: the processes wait for each other in every slot, or every few."""
+        self._folder = folder
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -132,7 +133,7 @@ class Children:
             environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
-            log_file = self._logs / f"{brief.process}.log"
+            log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = subprocess.Popen(
                     [sys.executable, "-m", "emulator", brief.role, str(path)],
@@ -219,11 +220,14 @@ class Children:
             path.unlink(missing_ok=True)
 
     def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
-        """Have the observer end, at once or after so many seconds; its last news if it came to it."""
+        """Have the observer end, at once or after so many seconds; its last news if it came to it.
+
+        Once it has begun to finish it may take its time, as long as it says that it lives.
+        """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
         ending: News | None = None
-        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS):
+        while self.silent_seconds < SILENCE_SECONDS and (self._finishing or time.monotonic() - begun < _BEGIN_SECONDS):
             news = self.news(0.05)
             if isinstance(news, Exit):
                 if news.process == OBSERVER:
@@ -300,7 +304,7 @@ class Children:
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""
         try:
-            text = _COLOUR.sub("", (self._logs / f"{name}.log").read_text(errors="replace"))
+            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text(errors="replace"))
         except OSError as error:
             return [f"(cannot be read: {error.strerror})"]
         return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]
