@@ -15,7 +15,7 @@ from emulator.files import Unreadable, text_of
 
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
 _MOST_BYTES = 2**28  # as of every scenario
-_OF_RESULTS = ("summary.json", "slots.parquet")  # the second is there from the start of a run
+_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last while a run goes on
 
 
 def is_scenario(path: Path) -> bool:

@@ -6,6 +6,7 @@ Every import of weight waits for the command that needs it, so that a peer start
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 from dataclasses import replace
@@ -76,16 +77,10 @@ def _play(brief: Brief, serve: str | None) -> int:
         case "controller":
             from peers.controller import steer as play
         case "observer":
-            from pydantic import ValidationError
+            from emulator.runs.heartbeat import Heartbeat
 
-            from emulator.runs.observer import observe
-            from emulator.scenario.mistakes import sentences
-
-            try:
-                return observe(brief, serve)
-            except ValidationError as error:
-                lines = "; ".join(sentences(error)[:_MOST_TOLD])
-                raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
+            with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
+                return _observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:
@@ -94,6 +89,19 @@ def _play(brief: Brief, serve: str | None) -> int:
     except NotRegistered as error:
         raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
     return 0
+
+
+def _observe(brief: Brief, serve: str | None) -> int:
+    from pydantic import ValidationError
+
+    from emulator.runs.observer import observe
+    from emulator.scenario.mistakes import sentences
+
+    try:
+        return observe(brief, serve)
+    except ValidationError as error:
+        lines = "; ".join(sentences(error)[:_MOST_TOLD])
+        raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
 
 
 def health(options: argparse.Namespace) -> int:
