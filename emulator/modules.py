@@ -27,11 +27,12 @@ def names_in(tables: Any) -> Iterator[str]:
         for entry, inner in tables.items():
             if entry in _ENTRIES and isinstance(inner, str):
                 yield inner
-            else:
+            elif isinstance(inner, (Mapping, list, tuple)):
                 yield from names_in(inner)
     elif isinstance(tables, (list, tuple)):
         for inner in tables:
-            yield from names_in(inner)
+            if isinstance(inner, (dict, Mapping, list, tuple)):
+                yield from names_in(inner)
 
 
 def named_in(tables: Any) -> Iterator[str]:

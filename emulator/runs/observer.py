@@ -200,7 +200,7 @@ class Observation:
                     self._recovery.look(self._joiner.done)
                     self._save()
             except EvedropError as error:
-                self._suspects = conductor.missing if isinstance(error, RunError) else []
+                self._suspects = conductor.missing
                 self._accused = error.at_fault if isinstance(error, RunError) else ()
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))

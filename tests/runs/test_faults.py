@@ -256,15 +256,15 @@ class Stillness:
         return self._looks
 
 
-@pytest.mark.long
-def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop) -> None:
-    """When its connection is lost and does not come back for as long as the scenario waits, it is named."""
+@pytest.mark.parametrize("name", [pytest.param("naive", marks=pytest.mark.long), "router"])
+def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) -> None:
+    """When its connection is lost and does not come back for as long as the scenario waits, it is named, not its victims."""
     live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "longest_outage=2")
     live.running()
-    live.kill("naive", signal.SIGSTOP)
+    live.kill(name, signal.SIGSTOP)
     done = live.end()
     assert done.status == 3
-    assert done.err.startswith("evedrop: naive gave no sign of life any more: hung, stopped or cut off")
+    assert done.err.startswith(f"evedrop: {name} gave no sign of life any more: hung, stopped or cut off")
     live.nothing_left()
     tables_whole(live)
 
