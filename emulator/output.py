@@ -17,7 +17,7 @@ OUTPUT = "standard output"
 def say(text: str) -> None:
     """Write a line to standard error, unless its terminal is gone."""
     with contextlib.suppress(OSError, AttributeError):
-        print(f"evedrop: {text}", file=sys.stderr)
+        sys.stderr.write(f"evedrop: {text}\n")
 
 
 @contextlib.contextmanager

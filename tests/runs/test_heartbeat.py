@@ -28,9 +28,14 @@ if sys.orig_argv[-1].endswith('/observer.json'):
 elif not sys.orig_argv[-1].endswith('.json'):
     import emulator.runs.children as children
     import emulator.runs.launcher as launcher
-    children.SILENCE_SECONDS = launcher.SILENCE_SECONDS = {silence}
+    honest = children.Children.news
+    def news(self, seconds):
+        if self.started:
+            children.SILENCE_SECONDS = launcher.SILENCE_SECONDS = {silence}
+        return honest(self, seconds)
+    children.Children.news = news
 """
-"""How long an observer takes to make Parquet files, and after how long a silence its launcher gives it up."""
+"""How long an observer takes to make Parquet files, and after how long a silence in a run its launcher gives it up."""
 
 
 def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str) -> Live:
