@@ -259,7 +259,7 @@ class Children:
         suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
         lost = next((name for name in (RELAY, ROUTER) if name in suspects), None)
-        if lost is not None and first is not None and self._lost_router(first.process):
+        if lost is not None and first is not None and self.lost_router(first.process):
             first, suspects = None, [lost]  # whoever is not reached any more is at fault, not whoever gave up first
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
@@ -289,7 +289,7 @@ class Children:
                 if name != OBSERVER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                if status and not ({ROUTER, RELAY} & set(suspects) and self._lost_router(name)):
+                if status and not ({ROUTER, RELAY} & set(suspects) and self.lost_router(name)):
                     return Exit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return Exit(suspects[0], 0)
@@ -297,7 +297,7 @@ class Children:
                 return None
             time.sleep(0.01)
 
-    def _lost_router(self, name: str) -> bool:
+    def lost_router(self, name: str) -> bool:
         """Whether a process ended because it could not reach its router any more."""
         return any(_ROUTER_LOST in line for line in self._log(name))
 
