@@ -271,6 +271,17 @@ def test_one_name_is_one_module(evedrop: Evedrop) -> None:
     assert evedrop.process("check", "there/s.toml").status == 0
 
 
+@pytest.mark.parametrize("name", ["json", "wave", "zenoh"])
+@pytest.mark.parametrize("entry", ["encoding.scheme", "eavesdroppers.eve.strategy"])
+def test_a_module_called_like_an_installed_one_is_refused(name: str, entry: str, evedrop: Evedrop) -> None:
+    """Nothing in a folder of modules stands in place of Python's or a library's."""
+    (evedrop.folder / f"{name}.py").write_text(f"{HEAD}\n\nclass Mine(Plain):\n    pass\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO)
+    done = evedrop("check", "mine.toml", "--set", f"{entry}={name}:Mine")
+    assert done.status == 2
+    assert re.search(f"has a module {name} .*another one of this name is (loaded already|installed)", done.err)
+
+
 def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -> None:
     """The scenario is refused without the table, with what to write, and runs with it."""
     body = "from emulator.model.schemes.acknowledged import Acknowledged\n\n\nclass Mine(Acknowledged):\n    pass\n"
