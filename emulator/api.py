@@ -65,7 +65,7 @@ def run(
     ended = launch(made, folder, view, listen, tell)
     if ended.viewer is not None:
         ended.viewer.stop()
-    return load_results(folder)
+    return load_results(ended.folder)
 
 
 def montecarlo(

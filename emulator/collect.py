@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
-_OF_RESULTS = ("summary.json", "slots.parquet")  # the second is there from the start of a run
+_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last while a run goes on
 
 
 def is_scenario(path: Path) -> bool:

@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import json
 import sys
+import tempfile
 import time
 from collections import Counter
 from pathlib import Path
@@ -81,9 +82,9 @@ def run(options: argparse.Namespace) -> int:
             ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
         except (RunError, Interrupted):
             with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
-                _print_results(folder, options.json)
+                _print_results(line.moved or folder, options.json)
             raise
-    _print_results(folder, options.json)
+    _print_results(ended.folder, options.json)
     if ended.viewer is not None:
         _keep_open(ended.viewer)
     return ended.status
@@ -143,9 +144,9 @@ def montecarlo(options: argparse.Namespace) -> int:
             status = simulate(scenario, folder, line.tell, plan)
         except Interrupted:
             with contextlib.suppress(OSError):  # as above
-                _print_results(folder, options.json)
+                _print_results(line.moved or folder, options.json)
             raise
-    _print_results(folder, options.json)
+    _print_results(line.moved or folder, options.json)
     return status
 
 
@@ -253,27 +254,30 @@ def view(options: argparse.Namespace) -> int:
 
         print_results(options.run)
         return 0
+    from emulator.runs.results import load_results
     from emulator.runs.viewer import Stand, open_run
 
     stand = None if options.serve is None else Stand.of(options.serve)
-    recording = options.run / "recording.rrd"
-    if recording.is_file() and not (options.run / "summary.json").is_file():
-        raise UsageError(
-            f"{options.run} has no summary.json yet: its run goes on, or was killed; look at it when it is over"
-        )
-    if not recording.is_file():
-        from emulator.view.replay import replay
+    results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
+    if results is not None:
+        print(f"evedrop: {results.remark}", file=sys.stderr)
+    with tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+        recording = options.run / "recording.rrd"
+        if results is not None or not recording.is_file():
+            from emulator.view.replay import replay
+        if results is not None:  # that of a run that goes on is not ours to write, and that of a killed one has no end
+            recording = replay(options.run, Path(temporary) / "recording.rrd")
+        elif not recording.is_file():
+            recording = replay(options.run)
+        if options.picture is None:
+            viewer = open_run(options.run, options.view, stand, recording)
+            print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
+            _hold(viewer)
+            return 0
+        from emulator.view.picture import picture
 
-        recording = replay(options.run)
-    if options.picture is None:
-        viewer = open_run(options.run, options.view, stand)
-        print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
-        _hold(viewer)
-        return 0
-    from emulator.view.picture import picture
-
-    for complaint in picture(recording, options.picture, slot=options.slot):
-        print(complaint, file=sys.stderr)
+        for complaint in picture(recording, options.picture, slot=options.slot):
+            print(complaint, file=sys.stderr)
     return 0
 
 
@@ -282,8 +286,11 @@ def diff(options: argparse.Namespace) -> int:
     from emulator.runs.diff import difference
     from emulator.runs.results import load_results
 
-    found = difference(*(load_results(run) for run in options.runs))
+    runs = [load_results(run) for run in options.runs]
+    found = difference(*runs)
     print(found.text)
+    for remark in filter(None, (run.remark for run in runs)):
+        print(remark)
     return 0 if found.same else 1
 
 

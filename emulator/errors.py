@@ -8,7 +8,9 @@ EvedropError                    exit status
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
-│   └── Gap                     3   a slot is missing, doubled or out of order
+│   ├── Gap                     3   a slot is missing, doubled or out of order
+│   ├── Contradiction           3   what a process says does not fit what it, or another one, has said
+│   └── Silence                 3   a process is on the network and does nothing
 └── Interrupted               130   the user ended the run; results so far are written
 """
 
@@ -63,26 +65,49 @@ class BriefError(EvedropError):
 class RunError(EvedropError):
     """A process failed, or a packet is unaccounted for."""
 
+    at_fault: tuple[str, ...] = ()
+    """The processes that the error is about, if it says which."""
+
 
 class MalformedMessage(RunError):
-    """A message that breaks the protocol of docs/protocol.md."""
+    """A message that breaks the protocol of docs/protocol.md; `at_fault` names its sender, the only one who may write its key."""
 
-    def __init__(self, key: str, found: str, expected: str, payload: bytes) -> None:
+    def __init__(self, key: str, found: str, expected: str, payload: bytes, sender: str = "") -> None:
         shown = payload[:48].hex(" ") + (" …" if len(payload) > 48 else "")
         super().__init__(
             f"malformed message on {key}: {found}; expected {expected}. "
-            f"Its {len(payload)} bytes: {shown}. Check that its sender speaks docs/protocol.md"
+            f"Its {len(payload)} bytes: {shown}. Check that {sender or 'its sender'} speaks docs/protocol.md"
         )
+        self.at_fault = (sender,) if sender else ()
 
 
 class Gap(RunError):
     """A slot that is missing, doubled or out of order: the transport lost what the link did not."""
 
-    def __init__(self, key: str, expected: int, found: int) -> None:
+    def __init__(self, key: str, expected: int, found: int, sender: str = "") -> None:
         super().__init__(
             f"gap on {key}: slot {found} arrived where slot {expected} was due. No link loses whole messages, "
-            "so a process or the transport did; look at the logs of the sender and of the router"
+            f"so a process or the transport did; look at the logs of {sender or 'the sender'} and of the router"
         )
+        self.at_fault = (sender,) if sender else ()
+
+
+class Contradiction(RunError):
+    """What a process says does not fit what it has said before, or what another process says of the same slots."""
+
+    def __init__(self, process: str, what: str, against: str | None = None) -> None:
+        """against: the other process; None if the process contradicts itself."""
+        self.at_fault = (process,) if against is None else (process, against)
+        look = f"logs/{process}.log" if against is None else f"logs/{process}.log and logs/{against}.log"
+        super().__init__(f"{process} contradicts {against or 'itself'}: {what}; look at {look}")
+
+
+class Silence(RunError):
+    """Processes that are on the network and do nothing, while all others wait for them."""
+
+    def __init__(self, processes: tuple[str, ...], what: str) -> None:
+        self.at_fault = processes
+        super().__init__(f"{' and '.join(processes)}: {what}")
 
 
 class Interrupted(EvedropError):

@@ -6,6 +6,7 @@ Every import of weight waits for the command that needs it, so that a peer start
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 from dataclasses import replace
@@ -72,9 +73,12 @@ def _play(brief: Brief, serve: str | None) -> int:
         case "controller":
             from peers.controller import steer as play
         case "observer":
-            from emulator.runs.observer import observe
+            from emulator.runs.heartbeat import Heartbeat
 
-            return observe(brief, serve)
+            with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
+                from emulator.runs.observer import observe
+
+                return observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:

@@ -74,7 +74,7 @@ def follow(
                     answers.had(found, message)
                 due.missed(k, found)
                 continue
-            arrival = read_delivery(message, k, shape, brief.model.header)
+            arrival = read_delivery(message, k, shape, brief.model.header, window)
             answers.before(k, arrival)
             belief = follower.take(k, arrival)
             answers.after(k, belief)

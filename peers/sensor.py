@@ -46,7 +46,7 @@ class Window:
         """Return when slot k may be sent."""
         while k >= self._limit:
             name, payload = self._news.get()
-            self._done[name] = max(self._done[name], read_progress(self._keys[name], payload))
+            self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
             self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:

@@ -105,6 +105,23 @@ def reader_of(key: str) -> str:
     return readers.get(kind, name)
 
 
+def writer_of(key: str) -> str:
+    """The only process that may write a key; empty for what is no key of a run."""
+    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
+    if kind == "ack":
+        return LEGITIMATE if name == "sent" else ROUTER
+    writers = {
+        "uplink": SENSOR,
+        "downlink": ROUTER,
+        "journal": ROUTER,
+        "control": OPERATOR if name == OBSERVER else OBSERVER,
+        "estimate": LEGITIMATE,
+        "state": SENSOR,
+        "input": CONTROLLER,
+    }
+    return writers.get(kind, name)
+
+
 @dataclass(frozen=True)
 class Grant:
     """What one user may do; everything else is denied."""

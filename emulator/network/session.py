@@ -27,6 +27,7 @@ from emulator.errors import BriefError, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
 from emulator.network.access import OBSERVER, Keys, reader_of
 from emulator.network.connecting import Door, connected, endpoint_of
+from emulator.network.heartbeat import Heartbeat
 from emulator.network.resending import Kept
 from emulator.network.wire import Reader
 
@@ -185,6 +186,8 @@ class Session:
         if self._lifeline is not None:
             self._session.info.declare_transport_events_listener(self._lifeline.changed)
         self._by_hand = not brief.ends_with_stdin
+        # A router has nobody to connect to: it is its network.
+        self._heartbeat = Heartbeat((lambda: True) if brief.role in ("router", "relay") else self.linked)
         self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
@@ -195,6 +198,7 @@ class Session:
     ) -> None:
         if self._lifeline is not None:
             self._lifeline.release()
+        self._heartbeat.stop()
         self._session.close()  # type: ignore[no-untyped-call]
 
     def inbox(self, key: str) -> Inbox:
@@ -289,6 +293,7 @@ class Session:
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self._token = self._session.liveliness().declare_token(self.keys.alive(self._process))
+        self._heartbeat.start()
 
     def _unread(self) -> list[str]:
         """The keys that have no reader."""

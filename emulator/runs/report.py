@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -40,6 +41,8 @@ class ProgressLine:
         self.console = Console(stderr=True, highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
+        self.moved: Path | None = None
+        """Where the results folder is, if it was renamed."""
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -83,6 +86,11 @@ class ProgressLine:
             )
         elif kind == "reconnected" and not self._quiet:
             self.console.print(outage_line(news), soft_wrap=True)
+        elif kind == "moved":
+            self.moved = Path(news["folder"])
+            self.console.print(
+                f"the results folder was renamed while the run went on; it is {self.moved}", soft_wrap=True
+            )
         elif kind == "ended" and news.get("view"):
             self.console.print(f"the view stopped early: {news['view']}")
 

@@ -110,7 +110,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)])
     try:
-        _run(made, folder, manner)
+        folder = _run(made, folder, manner)
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
     except RunError as error:
@@ -119,11 +119,12 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, seed=made.seed, folder=folder)
 
 
-def _run(scenario: Scenario, folder: Path, manner: Manner) -> None:
+def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
+    """Run a scenario into a folder; where the results are."""
     if manner.in_memory:
         simulate(scenario, folder, _silent, Plan(workers=manner.workers))
-    else:
-        launch(scenario, folder, "off", None, _silent)
+        return folder
+    return launch(scenario, folder, "off", None, _silent).folder
 
 
 def _silent(news: Mapping[str, Any]) -> None:

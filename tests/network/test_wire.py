@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from emulator.errors import EvedropError, Gap, MalformedMessage, RunError
 from emulator.model.account import COUNTED_BURSTS, Account
+from emulator.model.digest import Blocks
 from emulator.model.links.link import REASONS
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
@@ -25,6 +26,11 @@ from emulator.runs.joined import Joiner
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)
 SIZES = st.integers(1, 19)
+
+
+def extent(n: int, trials: int, recorded: int = 1) -> telemetry.Extent:
+    """What messages of a run of many slots are held to."""
+    return telemetry.Extent(2**41, 5, n, trials, recorded)
 
 
 @settings(deadline=None)
@@ -99,7 +105,7 @@ def test_leaving(data: st.DataObject, k: int, n: int, trials: int) -> None:
     P = data.draw(arrays(float, (n, n, trials), elements=FINITE))
     message = Reader("t", telemetry.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
     assert telemetry.is_leaving(message)
-    found, belief = telemetry.read_leaving(message, (n, trials))
+    found, belief = telemetry.read_leaving(message, extent(n, trials))
     assert (found, belief.x_hat.tobytes(), belief.P.tobytes()) == (k, x_hat.tobytes(), P.tobytes())
     assert not belief.action.any()
 
@@ -110,32 +116,37 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     """Truth reads back."""
     x = data.draw(arrays(float, (count, n, trials), elements=FINITE))
     nu = data.draw(arrays(bool, (count, trials)))
-    found = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, (n, trials))
+    found = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, extent(n, trials))
     assert (found.first, found.count, found.x.tobytes()) == (k, count, x.tobytes())
     assert np.array_equal(found.nu, nu)
 
 
 @settings(deadline=None)
-@given(st.data(), SLOTS, st.integers(1, 3), SIZES, st.integers(1, 5))
+@given(st.data(), st.integers(0, 4000), st.integers(1, 3), SIZES, st.integers(1, 5))
 def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) -> None:
-    """A report reads back, with any number of blocks' digests."""
+    """A report reads back, with the digests of the blocks that end in it."""
     recorded = data.draw(st.integers(1, trials))
+    slots, window = k + count + data.draw(st.integers(0, 2)), data.draw(st.integers(0, 9))
+    blocks = Blocks(slots, data.draw(st.sets(st.integers(k, k + count), max_size=2)))
+    late = data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials), elements=st.integers(0, window))))
     report = telemetry.Report(
         k,
         data.draw(arrays(float, (count, n, trials), elements=FINITE)),
         data.draw(arrays(np.uint8, (count, trials), elements=st.integers(0, 3))),
         data.draw(arrays(float, (count, n, n, recorded), elements=FINITE)),
         data.draw(arrays(float, (count, 2), elements=FINITE)),
-        data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials)))),
-        {b: data.draw(arrays(np.uint8, (trials, 32))) for b in data.draw(st.sets(st.integers(0, 2**24), max_size=2))},
+        late,
+        {block: data.draw(arrays(np.uint8, (trials, 32))) for block in blocks.ended(k, k + count)},
+        None if late is None else late // 2,
     )
-    found = telemetry.read_report(Reader("r", report.pack()), k, (n, trials), recorded)
+    of_run = replace(extent(n, trials, recorded), slots=slots)
+    found = telemetry.read_report(Reader("r", report.pack()), k, of_run, blocks, window)
     for name in ("x_hat", "action", "P", "trace"):
         assert getattr(found, name).tobytes() == getattr(report, name).tobytes()
     assert {b: d.tobytes() for b, d in found.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
     assert found.count == count
-    assert (found.late is None) == (report.late is None)
-    assert found.late is None or np.array_equal(found.late, report.late)
+    for name in ("late", "late_used"):
+        assert np.array_equal(getattr(found, name), getattr(report, name))
 
 
 def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Account:
@@ -152,17 +163,23 @@ def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Accoun
 def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
     """A journal reads back, receiver by receiver, reason by reason."""
     windows = {"legitimate": 0, "eve": 3, "mallory": 1000}
-    links = {
-        name: Account(
-            data.draw(arrays(bool, (count, trials))),
-            {reason: data.draw(arrays(np.uint32, count)) for reason in REASONS},
-            data.draw(arrays(np.uint16, (count, trials))) if window else None,
-            data.draw(arrays(np.uint32, 64)),
-            data.draw(arrays(np.uint32, window + 2, fill=st.just(0))),
+    links = {}
+    for name, window in windows.items():
+        delivered = data.draw(arrays(bool, (count, trials)))
+        most = (trials - delivered.sum(axis=1)).astype(np.uint32)
+        unsent = data.draw(arrays(np.uint32, count, elements=st.integers(0, trials))) % (most + 1)
+        lost = {reason: np.zeros(count, np.uint32) for reason in REASONS}
+        lost[data.draw(st.sampled_from(REASONS))] = most - unsent
+        links[name] = Account(
+            delivered,
+            lost,
+            data.draw(arrays(np.uint16, (count, trials), elements=st.integers(0, window))) if window else None,
+            data.draw(arrays(np.uint32, 64, elements=st.integers(0, count * trials))),
+            np.array([delivered.sum(), *[0] * (window + 1)], np.uint32),
+            unsent,
         )
-        for name, window in windows.items()
-    }
-    found = telemetry.read_journal(Reader("j", telemetry.Journal(k, count, links).pack()), k, windows, trials)
+    raw = telemetry.Journal(k, count, links).pack()
+    found = telemetry.read_journal(Reader("j", raw), k, windows, extent(1, trials))
     assert (found.first, found.count, set(found.links)) == (k, count, set(links))
     for name, link in links.items():
         for column in ("delivered", "bursts", "delays"):
@@ -178,7 +195,7 @@ READERS = {
     "packet": lambda raw: packets.read_uplink(Reader("key", raw), 0, (2, 3)),
     "mark": lambda raw: packets.is_hold(Reader("key", raw)) and Reader("key", raw).slot(0),
     "delivery": lambda raw: packets.read_delivery(Reader("key", raw), 0, (2, 3)),
-    "progress": lambda raw: wire.read_progress("key", raw),
+    "progress": lambda raw: wire.read_progress("key", raw, 9),
     "control": lambda raw: Reader("key", raw).text("do"),
     "go": lambda raw: (Reader("key", raw).names("absent"), Reader("key", raw).integer("until")),
     "change": lambda raw: (
@@ -186,10 +203,10 @@ READERS = {
         Reader("key", raw).map("settings"),
         Reader("key", raw).flag("cut"),
     ),
-    "truth": lambda raw: telemetry.read_truth(Reader("key", raw), 0, (2, 3)),
-    "report": lambda raw: telemetry.read_report(Reader("key", raw), 0, (2, 3), 1),
-    "leaving": lambda raw: telemetry.read_leaving(Reader("key", raw), (2, 3)),
-    "journal": lambda raw: telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, 3),
+    "truth": lambda raw: telemetry.read_truth(Reader("key", raw), 0, extent(2, 3)),
+    "report": lambda raw: telemetry.read_report(Reader("key", raw), 0, extent(2, 3), Blocks(9, [2]), 1),
+    "leaving": lambda raw: telemetry.read_leaving(Reader("key", raw), extent(2, 3)),
+    "journal": lambda raw: telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3)),
 }
 FIELDS = ("k", "c", "z", "x", "nu", "gamma", "late", "x_hat", "action", "P", "trace", "digests", "links", "do", "absent",
           "until", "link", "settings", "cut", "hold")  # fmt: skip
@@ -243,7 +260,7 @@ def test_unknown_actions_are_refused(value: int) -> None:
         0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2)), None, {}
     )
     with pytest.raises(MalformedMessage, match=f"action {value}; expected actions from 0 to 3"):
-        telemetry.read_report(Reader("key", report.pack()), 0, (1, 1), 1)
+        telemetry.read_report(Reader("key", report.pack()), 0, extent(1, 1), Blocks(9))
 
 
 def test_a_journal_without_a_receiver_is_refused() -> None:
@@ -277,7 +294,7 @@ TELEMETRY = {
 @pytest.mark.parametrize("what", TELEMETRY)
 def test_observer_notices_gaps_and_doubles(what: str, second: int) -> None:
     """Truth, report or journal that does not begin where the last one ended is a gap."""
-    joiner = Joiner({"a": 0}, (1, 3), 1)
+    joiner = Joiner(extent(1, 3), {"a": 0}, {"a": Blocks(9)})
     take = {
         "truth": lambda raw: joiner.truth(Reader("key", raw)),
         "report": lambda raw: joiner.report("a", Reader("key", raw)),

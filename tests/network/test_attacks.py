@@ -1,0 +1,115 @@
+"""Processes that break in, lie or say nothing: each attack against a real run, which ends with the attacker's name.
+
+A rogue is a real process of the run, with its own brief and credentials, in which one thing is done otherwise.
+"""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.conftest import Evedrop, Live
+from tests.rogue import with_rogue
+
+SMALL = ("--slots", "600", "--trials", "3")
+
+
+def refused(live: Live, name: str) -> str:
+    """Check that a run failed because of a process, and that what it left can be read; what was said of it."""
+    done = live.end()
+    assert done.status == 3, done.err
+    live.nothing_left()
+    summary = live.results.summary
+    assert name in done.err.splitlines()[0]
+    assert f"logs/{name}.log" in done.err
+    assert summary["ended"] in done.err
+    assert summary["peers"]["smart"]["digest"] is None
+    return done.err
+
+
+LIES = {
+    "x_hat = 7, P = 0, no digests": (
+        "change(lambda self: dict(x_hat=self.x_hat * 0.0 + 7.0, P=self.P * 0.0, trace=self.trace * 0.0,"
+        " digests={block: one * 0 for block, one in self.digests.items()}))",
+        r"smart contradicts itself: its digest of slots 0 to 255 of trial 0 is (00){32}, and what it reported of these slots "
+        r"gives [0-9a-f]{64}; look at logs/smart.log",
+    ),
+    "one packet of one unrecorded trial": (
+        "import numpy as np\n"
+        "def one(self):\n"
+        "    action = self.action.copy()\n"
+        "    if self.first <= 77 < self.first + len(action):\n"
+        "        action[77 - self.first, 2] = 0 if action[77 - self.first, 2] else 3\n"
+        "    return dict(action=action)\n"
+        "change(one)",
+        r"smart contradicts router: of slot 77, trial 2, it says that it received (nothing|the packet) [(]action [03][)], and "
+        r"the journal that it was (not )?delivered; look at logs/smart.log and logs/router.log",
+    ),
+    "a wrong digest at the end": (
+        "change(lambda self: dict(digests={block: one + (block > 256) for block, one in self.digests.items()}))",
+        "smart contradicts itself: its digest of slots 512 to 599 of trial 0",
+    ),
+    "a better covariance than it has": (
+        "change(lambda self: dict(P=self.P * 0.5, trace=self.trace * [0.5, 0.25]))",
+        "smart contradicts itself: its digest of slots 0 to 255 of trial 0",
+    ),
+    "packets that it denies": (
+        "change(lambda self: dict(action=self.action * 0, digests={k: one for k, one in self.digests.items()}))",
+        "smart contradicts",
+    ),
+}
+"""What a receiver claims → how, and what is said of it."""
+FEW = ("x_hat = 7, P = 0, no digests", "one packet of one unrecorded trial")
+
+
+@pytest.mark.parametrize("what", [one if one in FEW else pytest.param(one, marks=pytest.mark.long) for one in LIES])
+def test_a_receiver_that_lies_is_found_out(evedrop: Evedrop, what: str) -> None:
+    """Whatever a receiver claims, against its own reports or against the journal, the run ends with its name and both values."""
+    does, said = LIES[what]
+    live = evedrop.live("eavesdroppers", *SMALL, env=with_rogue(evedrop, "smart", does))
+    found = refused(live, "smart")
+    assert re.search(said, found), found
+    checked = live.results.summary["verification"]
+    assert checked["smart"]["verified"] == []
+    assert "received_fraction" in checked["naive"]["verified"]
+
+
+@pytest.mark.parametrize(
+    ("does", "said"),
+    [
+        ("dict(digests={2**63: np.zeros((3, 32), np.uint8)})", "digests of block 9223372036854775808"),
+        pytest.param("dict(x_hat=self.x_hat[:, :, :2])", "x_hat of", marks=pytest.mark.long),
+        pytest.param(
+            "dict(x_hat=np.zeros((10**6, 3, 1)), action=np.zeros((10**6, 3), np.uint8))",
+            "c = 1000000; expected an integer c from 1 to",
+            marks=pytest.mark.long,
+        ),
+    ],
+    ids=["block of no run", "another shape", "more slots than the run has"],
+)
+def test_a_report_that_no_run_has_is_refused(evedrop: Evedrop, does: str, said: str) -> None:
+    """Blocks, slots and shapes of no run end it as soon as they are read, with key, sender and values; no table is broken."""
+    rogue = with_rogue(evedrop, "smart", f"import numpy as np\nchange(lambda self: {does})")
+    found = refused(evedrop.live("eavesdroppers", *SMALL, env=rogue), "smart")
+    assert found.startswith("evedrop: smart broke the protocol: malformed message on evedrop/"), found
+    assert "telemetry/smart: " in found
+    assert re.search(said, found), found
+    assert "Check that smart speaks docs/protocol.md" in found
+
+
+def test_what_is_verified_and_what_is_not(evedrop: Evedrop) -> None:
+    """The summary says of how many trials the digests were computed again, and which figures rest on a receiver's own word."""
+    done = evedrop(
+        "run", "eavesdroppers", "--slots", "40", "--trials", "4", "--record-trials", "3", "--view", "off", "--json"
+    )
+    some = {
+        "recomputed_trials": 3,
+        "verified": ["mean_squared_error", "received_fraction"],
+        "own_word": ["used_fraction", "mean_trace_covariance", "digest"],
+    }
+    assert done.summary["verification"] == dict.fromkeys(done.summary["peers"], some)
+    done = evedrop("run", "eavesdroppers", "--slots", "40", "--view", "off", "--json")
+    assert done.summary["verification"]["smart"]["own_word"] == ["used_fraction"]
+    in_memory = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "4", "--json")
+    assert in_memory.summary["verification"] is None
