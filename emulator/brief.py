@@ -32,7 +32,7 @@ _PARTS: Mapping[str, tuple[str, ...]] = {
     "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
     "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
-    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity", "shard"),
+    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity", "shard", "classes"),
 }
 ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 

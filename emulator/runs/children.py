@@ -136,7 +136,7 @@ class Children:
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "emulator", brief.role, str(path)],
+                    [sys.executable, "-P", "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE if conducts else log,
                     stderr=log,

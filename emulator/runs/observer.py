@@ -23,7 +23,9 @@ from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.model.answers import NoAnswer
 from emulator.model.digest import Blocks
+from emulator.model.eavesdroppers import ANSWERS
 from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
@@ -72,6 +74,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
+    ANSWERS.learn(brief.part["classes"])  # so that the classes themselves need not run here
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario, confirmations, by_hand)
     if by_hand:
@@ -94,6 +97,8 @@ def observe(brief: Brief, serve: str | None = None) -> int:
             observation.settle(how)
     except OSError as error:
         status, how = RunError.exit_status, unwritten(error)
+    except NoAnswer as error:  # of a class that the operator's change of a link has a question for
+        status, how = RunError.exit_status, f"an eavesdropper's class could not say what theory expects of it: {error}"
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"

@@ -27,6 +27,7 @@ from emulator.model.process import Floats, ProcessNoise, Trajectory
 from emulator.model.receiver import Codes, Flags, Receiver, trace_of
 from emulator.model.schemes import scheme_of
 from emulator.model.theory import misled_covariances
+from emulator.modules import look_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.runs.acknowledging import Acknowledging
 from emulator.runs.attendance import Attendance
@@ -92,6 +93,8 @@ class Simulation:
         self._batch = Batch(scenario.slots, len(trials), trials.start)
         self._process = scenario.process.process
         self._keys = StreamKeys.of(scenario)
+        if scenario.modules is not None:
+            look_in(scenario.modules)
         self._scheme = scheme_of(self._process, scenario.encoding.spec)
         secret = self._keys.secret(self._scheme.secret_streams)
         self._shared = self._scheme.shared(secret, self._batch)
@@ -110,7 +113,7 @@ class Simulation:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
-        return STRATEGIES[table.strategy](knowledge, self._batch)
+        return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:
         """All slots, some tens or hundreds at a time."""
