@@ -17,6 +17,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from emulator.brief import Brief
+from emulator.entry import INTERRUPTED
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
@@ -69,6 +70,8 @@ class Exit:
         """As a sentence goes on after the process's name."""
         if self.status < 0:
             return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
@@ -163,7 +166,8 @@ class Children:
 
     def restart_router(self, ended: Exit) -> bool:
         """Start a router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
         self._killed.add(self._processes[ended.process].pid)

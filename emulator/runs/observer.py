@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
+from emulator.entry import heeded
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
 from emulator.model.answers import NoAnswer
@@ -68,7 +69,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     """
     stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     by_hand = not brief.ends_with_stdin
     if not by_hand:
