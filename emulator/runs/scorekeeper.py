@@ -7,7 +7,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,6 +103,8 @@ class Ending:
     """As the summary has them."""
     outages: Sequence[Mapping[str, Any]] = ()
     """The same."""
+    misdelivered: Mapping[str, int] = field(default_factory=dict)
+    """The same."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -147,6 +149,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         "links": links,
         "events": list(ending.events),
         "outages": list(ending.outages),
+        "misdelivered": dict(ending.misdelivered),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
         "controller": None
