@@ -51,6 +51,6 @@ for process in router sensor legitimate observer; do
 done
 give "$1" eavesdropper-1
 give "$2" eavesdropper-2
-mkdir "/runs/$name"
+mkdir -m 700 "/runs/$name"
 chown "$owner" "/runs/$name"
 echo "$scenario: eavesdropper-1 is $1, eavesdropper-2 is $2; results go to runs/$name"

@@ -274,7 +274,11 @@ def _live(parser: argparse.ArgumentParser) -> None:
 
 def _finished_view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it into a file instead; needs no screen")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--picture", type=Path, metavar="FILE.png", help="draw it into a file instead; needs no screen"
+    )
+    instead.add_argument("--table", action="store_true", help="print its table and verdict again instead")
     parser.add_argument("--slot", type=int, metavar="K", help="the moment to draw; default the last")
 
 

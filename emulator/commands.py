@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import shlex
 import sys
 import time
 from collections import Counter
@@ -102,32 +101,11 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
 
 
 def _print_results(folder: Path, as_json: bool) -> None:
-    from emulator.runs.report import print_summary
-    from emulator.runs.results import load_results
+    """Print the closing report of a run, if there are results."""
+    from emulator.runs.closing import print_results
 
-    try:
-        summary = load_results(folder).summary
-    except UsageError:
-        return
-    if as_json:
-        print(json.dumps(summary, ensure_ascii=False))
-    else:
-        print_summary(summary, str(folder), None if summary["mode"] == "live" else _replay(folder))
-
-
-def _replay(folder: Path) -> str | None:
-    """The command that runs a scenario out of a results folder live, one trial of it; None if none can."""
-    from emulator.scenario import load
-
-    try:
-        scenario = load(folder)
-    except UsageError:  # float64 cannot follow the states of so many slots
-        return None
-    recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
-    recorded += " --set shards=1" if scenario.shards > 1 else ""
-    # A quantile over trials can be expected of many alone.
-    expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
-    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"
+    with contextlib.suppress(UsageError):
+        print_results(folder, as_json)
 
 
 def _keep_open(viewer: Viewer) -> None:
@@ -269,7 +247,12 @@ def figures(options: argparse.Namespace) -> int:
 
 
 def view(options: argparse.Namespace) -> int:
-    """Open a finished run, or draw it."""
+    """Open a finished run, draw it, or print its closing report again."""
+    if options.table:
+        from emulator.runs.closing import print_results
+
+        print_results(options.run)
+        return 0
     from emulator.runs.viewer import Stand, open_run
 
     stand = None if options.serve is None else Stand.of(options.serve)

@@ -6,6 +6,7 @@ Every import of weight waits for the command that needs it, so that a peer start
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -36,6 +37,7 @@ def process(options: argparse.Namespace) -> int:
     from emulator.brief import read_brief
     from emulator.modules import look_in
 
+    os.umask(0o077)  # whatever it writes is of the run, and nobody else's business
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     brief = read_brief(options.brief, options.role)
     if getattr(options, "out", None) is not None:

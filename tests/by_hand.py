@@ -75,7 +75,11 @@ class ByHand:
         assert lines is not None
         with lines:
             for line in lines:
-                self._done.append(json.loads(line).get("done", 0))
+                news = json.loads(line)
+                self._done.append(news.get("done", 0))
+                if news["event"] == "ended":
+                    break
+            lines.read()  # the table, for people
 
     def log(self, name: str) -> Path:
         """What a process wrote."""

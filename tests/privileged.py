@@ -56,7 +56,9 @@ def tried(*command: str | Path, what: str, **options: Any) -> str:
     """What a command says on its standard output. Raises CannotRun if it fails: that is not what we test."""
     try:
         return run(*command, **options).stdout
-    except (AssertionError, OSError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired as error:
+        raise CannotRun(f"{what}: did not end within {error.timeout:g} s") from error
+    except (AssertionError, OSError) as error:
         raise CannotRun(f"{what}: {str(error)[-2000:]}") from error
 
 
@@ -78,5 +80,8 @@ def _install(missing: list[str]) -> None:
     # A daemon of the machine's own is neither needed nor ours to start.
     quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "RUNLEVEL": "1"}
     tried("apt-get", "update", "-q", what="apt-get update", env=quiet)
-    command = ("apt-get", "install", "-q", "-y", "--no-install-recommends", *missing)
-    tried(*command, what=f"apt-get install {' '.join(missing)}", env=quiet)
+    names = " ".join(missing)
+    install = ("apt-get", "install", "-q", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120")
+    tried(*install, "--download-only", *missing, what=f"the download of {names}", env=quiet)
+    # What was downloaded is installed without a limit: killed in the middle, dpkg would need repair.
+    tried(*install, *missing, what=f"apt-get install {names}", env=quiet, timeout=None)

@@ -52,6 +52,18 @@ def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
     }  # fmt: skip
 
 
+def test_the_closing_report_can_be_printed_again(evedrop: Evedrop) -> None:
+    """`view --table` of a live run and of a study prints what they ended with; a broken summary is refused."""
+    for words in (("run", "--view", "off"), ("montecarlo", "--trials", "12")):
+        done = evedrop(words[0], "eavesdroppers", "--slots", "40", *words[1:], "--out", words[0])
+        again = evedrop("view", words[0], "--table")
+        assert (again.status, again.err) == (0, "")
+        assert again.out == done.out
+    summary = evedrop.folder / "run" / "summary.json"
+    summary.write_text(summary.read_text().replace('"slots_per_second"', '"other"'))
+    refused(evedrop("view", "run", "--table"), "summary.json is not a run summary of this version")
+
+
 @pytest.mark.parametrize(("command", "below", "status"), [("run", "1e-9", 1), ("montecarlo", "0.01", 0)])
 def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str, below: str, status: int) -> None:
     """Standard output is the summary of summary.json; standard error is silent; the status tells of expectations."""

@@ -17,6 +17,7 @@ from emulator.model.schemes import scheme_of
 from emulator.modules import named_in
 from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 from emulator.runs.acknowledging import chart_of, way_back_of
+from emulator.runs.folder import new_folder
 from emulator.runs.loop_briefs import LoopBriefs
 from emulator.runs.ports import Places, places_at
 from emulator.runs.routers import Routers, identities_of
@@ -267,9 +268,7 @@ def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path
         )
     made = briefs_of(scenario, places, Observation(results, True, None), ends_with_stdin=False, patience=patience)
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        if any(folder.iterdir()):
-            raise UsageError(f"{folder} is not empty; give another --out, or empty it")
+        new_folder(folder)
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

@@ -20,6 +20,7 @@ from emulator.brief import Brief
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
+from emulator.runs.folder import private_opener
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -130,7 +131,8 @@ class Children:
             environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
-            with (self._logs / f"{brief.process}.log").open("ab" if again else "wb") as log:
+            log_file = self._logs / f"{brief.process}.log"
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = subprocess.Popen(
                     [sys.executable, "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
@@ -138,6 +140,7 @@ class Children:
                     stderr=log,
                     start_new_session=True,
                     env=environment,
+                    umask=0o077,
                 )
         except OSError as error:
             raise RunError(

@@ -29,7 +29,7 @@ from emulator.model.schemes import scheme_of
 from emulator.model.theory import state_covariances
 from emulator.network.access import LEGITIMATE
 from emulator.runs.expectation import Expectation, expectations_of
-from emulator.runs.folder import new_folder
+from emulator.runs.folder import make_private, new_folder, private_pictures, write_private
 from emulator.runs.histogram import LEVELS
 from emulator.runs.matchups import Group, Match, Matchups
 from emulator.runs.montecarlo import Merger, News, Plan, results_of, said_of, teller
@@ -433,9 +433,9 @@ def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger
     from emulator.view.comparison import draw  # noqa: PLC0415 - matplotlib takes half a second
 
     with said_of(folder):
-        (folder / "compare.json").write_text(found.as_json() + "\n", encoding="utf-8")
+        write_private(folder / "compare.json", found.as_json() + "\n")
         scenarios = folder / "scenarios"
-        scenarios.mkdir()
+        make_private(scenarios)
         for group, _ in played:
-            (scenarios / f"{group.name}.toml").write_text(resolved(group.scenario), encoding="utf-8")
-        draw(folder / "compare", found)
+            write_private(scenarios / f"{group.name}.toml", resolved(group.scenario))
+        draw(private_pictures(folder / "compare"), found)

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from emulator.runs.folder import private_file
 from emulator.runs.results import NULLABLE
 
 _BYTES = 4 * 2**20
@@ -40,7 +41,7 @@ class Gathered(ABC):
         schema = pq.read_schema(table)
         rows = [_Rows(source, schema, self) for source in sources]
         unfinished = table.with_suffix(".new")
-        with pq.ParquetWriter(unfinished, schema, compression="zstd", compression_level=1) as writer:
+        with pq.ParquetWriter(private_file(unfinished), schema, compression="zstd", compression_level=1) as writer:
             for first in count(0, self.slots_at_once):
                 parts = [one.below(first + self.slots_at_once) for one in rows]
                 if not any(part.num_rows for part in parts):

@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from emulator.errors import UsageError
 from emulator.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
+from emulator.runs.folder import make_private
 from emulator.runs.gathered_tables import Gathered, Journals, Recorded, Statistics
 from emulator.runs.judge import replay_of
 from emulator.runs.results import ResultsWriter, load_results, write_summary
@@ -136,7 +137,7 @@ def _summaries(shards: Sequence[Shard]) -> Iterator[tuple[Shard, Mapping[str, An
 def _tidy(folder: Path, shards: Sequence[Shard]) -> None:
     """Keep the logs of the shards, and the recording of the first; the rest is in the run's own tables."""
     for shard in shards:
-        (folder / "logs").mkdir(exist_ok=True)
+        make_private(folder / "logs")
         with suppress(FileNotFoundError):
             os.replace(shard.folder / "logs", folder / "logs" / shard.name)
     with suppress(FileNotFoundError):

@@ -18,7 +18,7 @@ from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.children import Children, Exit, News
-from emulator.runs.folder import new_folder
+from emulator.runs.folder import make_private, new_folder
 from emulator.runs.ports import Places, loopback_places
 from emulator.runs.private import private_folder
 from emulator.runs.signals import stop_on_signals
@@ -84,7 +84,7 @@ def launch_one(
     """
     with private_folder() as private:
         new_folder(folder)
-        (folder / "logs").mkdir()
+        make_private(folder / "logs")
         viewer = None
         try:
             briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None, shard))

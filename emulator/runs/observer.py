@@ -2,7 +2,8 @@
 
 Its news go to standard output, a JSON object a line: `{"event": "started"}`, then four times a second `{"event":
 "progress", …}`, every second `{"event": "alive"}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
-and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole.
+and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole. An observer that was started by
+hand then prints the table and the verdict that `evedrop run` prints.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
-from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
+from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError, UsageError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
 from emulator.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from emulator.network.declared import Question
@@ -92,12 +93,21 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
-    status, how = observation.finish(status, how)
+    status = observation.finish(status, how)
     if viewer is not None:
         viewer.stop()
-    if by_hand and status not in {0, 1}:
-        print(f"evedrop: {how}", file=sys.stderr)  # noqa: T201 - nobody else says it
     return status
+
+
+def _print_ending(folder: Path, status: int, how: str) -> None:
+    """Print what `evedrop run` prints at its end: the table, the verdict, and why the run failed. Nobody has to listen."""
+    from emulator.runs.closing import print_results  # noqa: PLC0415 - a launched observer has no use for it
+
+    with suppress(UsageError, OSError):
+        print_results(folder)
+        sys.stdout.flush()
+    if status not in {0, 1}:
+        print(f"evedrop: {how}", file=sys.stderr, flush=True)  # noqa: T201 - nobody else says it
 
 
 def _unwritten(error: OSError) -> str:
@@ -356,8 +366,8 @@ class Observation:
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
         tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
 
-    def finish(self, status: int, how: str) -> tuple[int, str]:
-        """Close the view, write the summary, tell the launcher; the exit status of the run, and how it ended."""
+    def finish(self, status: int, how: str) -> int:
+        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
         safe = self._recording.close() if self._recording is not None else True
         if self._brief.part["shard"]:
             with suppress(OSError):  # of a full disk, which the summary says
@@ -385,9 +395,11 @@ class Observation:
             summary["ended"] = _unwritten(error)
         view = self._recording.failure if self._recording is not None else None
         tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
+        if self._by_hand:
+            _print_ending(self.folder, status, str(summary["ended"]))
         if not safe:
             os._exit(status)
-        return status, str(summary["ended"])
+        return status
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:

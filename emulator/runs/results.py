@@ -26,6 +26,7 @@ from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
 from emulator.network.access import CONTROLLER
 from emulator.network.wire import packed_flags
+from emulator.runs.folder import private_file, write_private
 from emulator.runs.histogram import LEVELS
 from emulator.runs.input_table import input_columns, inputs_schema, inputs_schema_in
 from emulator.runs.joined import Slots
@@ -110,7 +111,9 @@ class _Table:
 
     def __init__(self, path: Path, schema: pa.Schema, names: Mapping[str, tuple[str, ...]]) -> None:
         """names: what the codes of each dictionary column stand for."""
-        self._writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1, use_dictionary=[*names])
+        self._writer = pq.ParquetWriter(
+            private_file(path), schema, compression="zstd", compression_level=1, use_dictionary=[*names]
+        )
         self._schema = schema
         self._names = {column: pa.array(words) for column, words in names.items()}
         self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
@@ -325,7 +328,7 @@ def seen_actions(action: Codes, nu: Flags) -> Codes:
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json; infinite and undefined numbers as strings, which JSON lacks."""
     unfinished = folder / "summary.json.new"
-    unfinished.write_text(json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_private(unfinished, json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n")
     os.replace(unfinished, folder / "summary.json")
 
 

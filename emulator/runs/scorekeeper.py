@@ -22,6 +22,7 @@ from emulator.plant_data import disturbances_text
 from emulator.runs.channel import channel_of
 from emulator.runs.expectation import expectations_of
 from emulator.runs.filtering import true_errors
+from emulator.runs.folder import write_private
 from emulator.runs.histogram import LEVELS
 from emulator.runs.joined import Slots
 from emulator.runs.judge import Evidence
@@ -228,7 +229,7 @@ def write_resolved(folder: Path, scenario: Scenario) -> None:
         }
     for name, text in texts.items():
         unfinished = folder / f"{name}.new"
-        unfinished.write_text(text, encoding="utf-8")
+        write_private(unfinished, text)
         os.replace(unfinished, folder / name)
 
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.errors import Interrupted, RunError, ScenarioError, UsageError
-from emulator.runs.folder import new_folder
+from emulator.runs.folder import new_folder, private_file, private_pictures, write_private
 from emulator.runs.montecarlo import Merger, Plan, check_mode, results_of, said_of, teller
 from emulator.runs.scorekeeper import Ending
 from emulator.runs.signals import stop_on_signals
@@ -118,13 +118,14 @@ def sweep_over(
     from emulator.view.sweeps import draw  # noqa: PLC0415 - matplotlib takes half a second
 
     with said_of(folder):
-        pq.write_table(table, folder / "sweep.parquet")
-        (folder / "sweep.json").write_text(json.dumps(description, indent=1, ensure_ascii=False, default=str) + "\n")
-        draw(folder / "sweep", table, tuple(grid))
+        pq.write_table(table, private_file(folder / "sweep.parquet"))
+        text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
+        write_private(folder / "sweep.json", text + "\n")
+        draw(private_pictures(folder / "sweep"), table, tuple(grid))
         if HOUSE_FIGURES[0] in table.column_names:
             from emulator.view.household_sweep import draw as draw_household  # noqa: PLC0415 - as above
 
-            draw_household(folder / "household", table, next(iter(grid)))
+            draw_household(private_pictures(folder / "household"), table, next(iter(grid)))
     if failure is not None:
         raise failure
     if done < len(scenarios):

@@ -16,6 +16,7 @@ from typing import Any
 from emulator.api import default_folder
 from emulator.collect import scenarios_in
 from emulator.errors import RunError, ScenarioError, UsageError
+from emulator.runs.folder import make_private
 from emulator.runs.judge import told
 from emulator.runs.launcher import launch
 from emulator.runs.montecarlo import Plan, simulate
@@ -134,7 +135,7 @@ def _claimed(wanted: Path) -> Path:
     for number in itertools.count(1):
         folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
         try:
-            folder.mkdir(parents=True)
+            make_private(folder, exist_ok=False)
         except FileExistsError:
             continue
         except OSError as error:

@@ -21,6 +21,7 @@ from urllib.parse import quote
 
 from emulator.errors import UsageError
 from emulator.runs.environment import viewer_environment
+from emulator.runs.folder import make_private, private_opener
 from emulator.runs.ports import free_port
 
 _HOST = "127.0.0.1"
@@ -248,7 +249,7 @@ def _listens(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
 def _log(logs: Path) -> IO[bytes]:
     """The log file, or a nameless one if a finished run's folder may not be written to."""
     try:
-        logs.mkdir(parents=True, exist_ok=True)
-        return (logs / "viewer.log").open("a+b")
+        make_private(logs)
+        return open(logs / "viewer.log", "a+b", opener=private_opener)
     except OSError:
         return tempfile.TemporaryFile()

@@ -21,6 +21,7 @@ from emulator.errors import ScenarioError, UsageError
 from emulator.model.registry import place_of
 from emulator.modules import named_in
 from emulator.scenario.disturbances import disturbances_beside, disturbances_read
+from emulator.scenario.drawn import with_faults
 from emulator.scenario.dry_run import dry_run, foreign
 from emulator.scenario.filter_noise import filter_noise_read
 from emulator.scenario.mistakes import across_tables, sentences
@@ -128,6 +129,12 @@ def checked(
     except ValidationError as error:
         raise ScenarioError(source, [*sentences(error), *recordings, *_across(tables, beyond_horizon, None)]) from error
     mistakes = recordings + (dry_run(scenario) or _across(tables, beyond_horizon, scenario))
+    if scenario.nemesis is not None:
+        tables, found = with_faults(tables, scenario, sentences)
+        mistakes += found
+        if not mistakes:
+            scenario = Scenario.model_validate(tables)
+            mistakes = _across(tables, beyond_horizon, scenario)
     if mistakes:
         raise ScenarioError(source, mistakes)
     return scenario

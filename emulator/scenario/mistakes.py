@@ -30,6 +30,7 @@ from emulator.scenario.expect import Around, ExpectTable
 from emulator.scenario.filter_noise import filter_mistakes
 from emulator.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from emulator.scenario.link_table import CorrelationTable, LinkTable
+from emulator.scenario.nemesis import NEMESIS, NemesisTable, nemesis_mistakes
 from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
@@ -113,6 +114,7 @@ def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
         "plant": PlantTable,
         "controller": ControllerTable,
         "household": HouseholdTable,
+        NEMESIS: NemesisTable,
     }
     for i, part in enumerate(location):
         if table is not None and part in table.model_fields:
@@ -151,6 +153,8 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
     links = _links(tables)
     found += link_mistakes(tables, links)
     found += event_mistakes(tables, links, sentences)
+    if isinstance(tables.get("eavesdroppers", {}), dict):
+        found += nemesis_mistakes(tables, (LEGITIMATE, *tables.get("eavesdroppers", {})))
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     sound = scenario if not found else None

@@ -25,6 +25,7 @@ from emulator.scenario.events import EventTable
 from emulator.scenario.expect import ExpectTable
 from emulator.scenario.household import HouseholdTable
 from emulator.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
+from emulator.scenario.nemesis import NemesisTable
 from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
 from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import (
@@ -238,6 +239,9 @@ class Scenario(Table):
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
     )
+    nemesis: Annotated[
+        NemesisTable | None, Field(examples=[{"faults": ["kill", "cut"], "every": 200, "lasting": 50}])
+    ] = None
     expect: Annotated[
         list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
     ] = Field(default_factory=list)

@@ -17,6 +17,7 @@ import numpy as np
 import rerun as rr
 
 from emulator.model.receiver import Flags
+from emulator.runs.folder import private_file
 from emulator.view.blueprint import layout
 from emulator.view.columns import Batch, Columns, lines, log_styles, opening
 from emulator.view.events import Event, introduction
@@ -55,7 +56,7 @@ class Recording:
         self._changed = threading.Condition()
         self._file = _stream(scene)
         try:
-            self._file.save(path, default_blueprint=layout(scene))
+            self._file.save(private_file(path), default_blueprint=layout(scene))
             log_styles(self._file, scene)
         except Exception as error:
             self._give_up(str(error))

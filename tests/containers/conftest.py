@@ -5,18 +5,20 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.containers.machine import BASE, PACKAGES, Docker, base, checkout, take_away_leftovers
+from tests.containers.base import base
+from tests.containers.machine import BASE, PACKAGES, Docker, checkout, take_away_leftovers
 from tests.containers.project import Project, projects
+from tests.folders import temporary_folder
 from tests.privileged import CannotRun, prepare, run, skip
 
 _TIMES = pytest.StashKey[dict[str, float]]()
+_FETCH_SECONDS = 600.0
 
 
 @pytest.fixture(scope="session")
@@ -24,8 +26,7 @@ def docker(request: pytest.FixtureRequest) -> Iterator[Docker]:
     """A daemon that has the image `evedrop`."""
     times: dict[str, float] = {}
     request.config.stash[_TIMES] = times
-    with tempfile.TemporaryDirectory(prefix="evedrop-docker-") as made:
-        folder = Path(made)
+    with temporary_folder("evedrop-docker-") as folder:
         try:
             prepare(PACKAGES)
             take_away_leftovers()
@@ -57,7 +58,11 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
     )
     try:
         daemon("import", str(base(folder)), BASE)
-        said, _ = fetching.communicate()
+        said, _ = fetching.communicate(timeout=_FETCH_SECONDS)
+    except subprocess.TimeoutExpired as error:
+        raise CannotRun(
+            f"the packages of constraints.txt were not fetched within {_FETCH_SECONDS:g} s of the base image"
+        ) from error
     finally:
         fetching.kill()
         fetching.wait()

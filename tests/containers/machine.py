@@ -10,19 +10,18 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import platform
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from tests.conftest import wait_until
-from tests.privileged import CannotRun, run, tried
+from tests.containers.base import ROOT
+from tests.folders import remove
+from tests.privileged import CannotRun, run
 
-ROOT = Path(__file__).parents[2]
 PACKAGES = {"dockerd": "docker.io", "docker-compose": "docker-compose", "debootstrap": "debootstrap", "ip": "iproute2"}
 """Command → the Debian package that has it."""
 BASE = "evedrop-base"
@@ -34,52 +33,6 @@ if [ "$(awk '/^MemAvailable/ {print $2}' /proc/meminfo)" -gt 10000000 ]; then mo
 exec "$@"
 """
 """The first command of the namespaces. Where there is room, images are in memory: that is faster, and gone at once."""
-
-
-def mirror() -> tuple[str, str]:
-    """Where this machine has Debian from: the address of the mirror, and the name of the release. Raises CannotRun."""
-    release = platform.freedesktop_os_release().get("VERSION_CODENAME", "")
-    pattern = ("indextargets", "--format", "$(CODENAME) $(COMPONENT) $(REPO_URI)", "Created-By: Packages")
-    lines = tried("apt-get", *pattern, what="apt-get indextargets").splitlines()
-    if not lines:
-        tried("apt-get", "update", "-q", what="apt-get update")
-        lines = tried("apt-get", *pattern, what="apt-get indextargets").splitlines()
-    for line in lines:
-        codename, component, address = line.split(maxsplit=2)
-        if (codename, component) == (release, "main"):
-            return address, release
-    raise CannotRun(f"apt knows no mirror of {release}")
-
-
-def base(folder: Path) -> Path:
-    """A file system with Python from Debian's own packages, as a tar, kept in build/. Raises CannotRun if it cannot be made."""
-    address, release = mirror()
-    kept = ROOT / "build" / f"test-base-{release}-{platform.machine()}.tar"
-    if not kept.exists():
-        kept.parent.mkdir(exist_ok=True)
-        half = kept.with_name(f"{kept.name}-{os.getpid()}")
-        try:
-            shutil.move(_bootstrapped(folder, address, release), half)
-            half.replace(kept)
-        finally:
-            half.unlink(missing_ok=True)
-    return kept
-
-
-def _bootstrapped(folder: Path, address: str, release: str) -> Path:
-    system, tar = folder / "system", folder / "system.tar"
-    tried(
-        *("debootstrap", "--variant=minbase", "--include=python3,python3-venv", release, system, address),
-        what="debootstrap",
-    )
-    left_out = ("var/cache/apt", "var/lib/apt/lists", "usr/share/doc", "usr/share/locale")
-    run("tar", "-C", system, *(f"--exclude=./{one}/*" for one in left_out), "-cf", tar, ".")
-    version = run("chroot", system, "python3", "--version").stdout.split()[1].split(".")[:2]
-    shutil.rmtree(system)
-    if version != list(map(str, sys.version_info[:2])):
-        # pip chooses packages by the Python it runs in.
-        raise CannotRun(f"Debian's Python is {'.'.join(version)}, and not {sys.version_info[0]}.{sys.version_info[1]}")
-    return tar
 
 
 def checkout(folder: Path) -> Path:
@@ -110,7 +63,8 @@ class Docker:
                 [
                     # However the tests end, it ends with them.
                     *("setpriv", "--pdeathsig", "KILL"),
-                    *("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "sh", "-c", _INIT, str(data)),
+                    *("unshare", "--net", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child"),
+                    *("sh", "-c", _INIT, str(data)),
                     *("dockerd", "--data-root", str(data), "--exec-root", str(folder / "exec")),
                     *("--host", self.address, "--pidfile", str(folder / "docker.pid"), "--bridge", "none"),
                     # By systemd's means it would ask for control groups of process ids that are not those it has here.
@@ -155,7 +109,7 @@ class Docker:
                 os.kill(int(pid), signal.SIGKILL)
         self._process.kill()
         self._process.wait()
-        shutil.rmtree(self.folder / "data", ignore_errors=True)
+        remove(self.folder / "data")
         wait_until(lambda: _removed(self._group), "no control group left")
 
 

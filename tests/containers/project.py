@@ -14,7 +14,8 @@ from typing import Any
 
 from emulator.runs.results import Results, load_results
 from tests.conftest import wait_until
-from tests.containers.machine import ROOT, Docker
+from tests.containers.base import ROOT
+from tests.containers.machine import Docker
 from tests.privileged import run
 
 ROLES = ("router", "sensor", "legitimate", "eavesdropper-1", "eavesdropper-2", "observer")

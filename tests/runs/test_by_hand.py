@@ -6,6 +6,7 @@ Addresses of loopback stand for hosts.
 from __future__ import annotations
 
 import json
+import re
 import signal
 import socket
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 from emulator.errors import UsageError
 from emulator.runs.ports import Meeting, free_port, meeting_at
 from emulator.runs.results import load_results
-from tests.conftest import Done, Evedrop, Live, wait_until
+from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 
 ROLES = ("router", "relay", "sensor", "legitimate", "observer")
 SOON = 5.0
@@ -38,6 +39,21 @@ def begun(evedrop: Evedrop, name: str, path: str, *options: str, **how: Any) -> 
 def digests(path: Path) -> dict[str, str]:
     """Receiver → its digest."""
     return {name: one["digest"] for name, one in load_results(path).summary["peers"].items()}
+
+
+def closing(done: Done) -> list[str]:
+    """What an observer printed after its news, but for the folder's name and how fast it was."""
+    news = [line for line in done.out.splitlines() if line.startswith("{")]
+    lines = done.out.splitlines()
+    assert lines[: len(news)] == news
+    assert json.loads(news[-1])["event"] == "ended"
+    return comparable(lines[len(news) :])
+
+
+def comparable(lines: list[str]) -> list[str]:
+    """The lines of a closing report but for the folder's name and how fast the run was."""
+    assert lines[-1].startswith("results: ")
+    return [re.sub(r"[\d,]+ slots/s", "", line).rstrip() for line in lines[:-1]]
 
 
 TLS = ("--listen", "tls/0.0.0.0:{port}", "--connect", "tls/127.0.0.2:{port}")
@@ -82,6 +98,38 @@ def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards:
     assert {name: done.err for name, done in ended.items()} == dict.fromkeys(briefs, "")
     assert evedrop("montecarlo", "eavesdroppers", "--slots", "200", "--trials", "1", "--out", "memory").status in {0, 1}
     assert digests(hosts[1] / "results") == digests(evedrop.folder / "memory")
+
+
+@pytest.mark.parametrize(
+    "below", [pytest.param(1.0, marks=pytest.mark.long, id="held"), pytest.param(0.0, id="failed")]
+)
+def test_by_hand_the_observer_prints_and_ends_as_run_does(below: float, evedrop: Evedrop) -> None:
+    """The table and the verdict of `evedrop run`, and its exit status, be it that an expectation failed."""
+    expect = f"expect=[{{figure='legitimate.mean_squared_error', below={below}}}]"
+    launched = evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--set", expect, "--out", "launched")
+    assert launched.status == (0 if below else 1)
+    briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
+    running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
+    ended = {name: live.end() for name, live in running.items()}
+    assert ended["observer"].status == launched.status, ended["observer"].err
+    assert {done.status for name, done in ended.items() if name != "observer"} == {0}
+    found, expected = closing(ended["observer"]), comparable(launched.out.replace("launched", "results").splitlines())
+    assert found == expected
+    assert any("relative secrecy" in line for line in found)
+
+
+@pytest.mark.long
+def test_a_reader_that_leaves_early_changes_no_exit_status(evedrop: Evedrop) -> None:
+    """Of an observer whose output nobody reads any more, the status is still that of the run."""
+    expect = "expect=[{figure='smart.mean_squared_error', below=0}]"
+    briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
+    running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
+    with running.pop("observer").process as observer:
+        assert observer.stdout is not None
+        observer.stdout.readline()
+        observer.stdout.close()
+        assert observer.wait(LIMIT) == 1
+    assert {live.end().status for live in running.values()} == {0}
 
 
 def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
@@ -220,6 +268,7 @@ def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
     done = lives["observer"].end()
     assert done.status == 3
     assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
+    assert closing(done)[0] == "smart did not appear within 15 s; start it, or look at its log; the results so far:"
     assert load_results(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
     said = {name: live.end() for name, live in lives.items() if name != "observer"}
     assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)
@@ -236,6 +285,7 @@ def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
     lives["observer"].process.send_signal(signal.SIGINT)
     ended = {name: live.end() for name, live in lives.items()}
     assert ended["observer"].status == 130
+    assert closing(ended["observer"])[0] == "interrupted; the results so far:"
     assert load_results(evedrop.folder / "results").summary["ended"] == "interrupted"
     others = {name: done for name, done in ended.items() if name != "observer"}
     assert {name: (done.status, done.err) for name, done in others.items()} == {

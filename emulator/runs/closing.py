@@ -1,0 +1,43 @@
+"""The closing report of a results folder: printed when a run ends, and again whenever somebody asks for it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+
+from emulator.errors import UsageError
+from emulator.runs.report import print_summary
+from emulator.runs.results import load_results
+from emulator.scenario import load
+
+
+def print_results(folder: Path, as_json: bool = False) -> None:
+    """Print the table and the verdict of a results folder, or its summary as JSON, to standard output.
+
+    Raises UsageError if it is not a results folder.
+    """
+    summary = load_results(folder).summary
+    if as_json:
+        sys.stdout.write(json.dumps(summary, ensure_ascii=False) + "\n")
+        return
+    try:
+        print_summary(summary, str(folder), None if summary["mode"] == "live" else replay_command(folder))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UsageError(
+            f"{folder / 'summary.json'} is not a run summary of this version ({error!r}); run the scenario again"
+        ) from error
+
+
+def replay_command(folder: Path) -> str | None:
+    """The command that runs the scenario of a results folder live, one trial of it; None if it cannot be run live."""
+    try:
+        scenario = load(folder)
+    except UsageError:  # float64 cannot follow the states of so many slots
+        return None
+    recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
+    recorded += " --set shards=1" if scenario.shards > 1 else ""
+    # A quantile over trials can be expected of many alone.
+    expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
+    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"

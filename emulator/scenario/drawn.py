@@ -1,0 +1,196 @@
+"""The events that a nemesis comes to.
+
+Each receiver draws from a stream of its own, so that adding, changing or removing another one moves none of its faults.
+
+Source: docs/scenario.md, nemesis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import count
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from emulator.model.elementary import log
+from emulator.model.link import NEVER
+from emulator.model.process import Floats
+from emulator.network.access import LEGITIMATE
+from emulator.scenario.across import Sentences
+from emulator.scenario.link_table import changed_link
+from emulator.scenario.nemesis import FAULTS, NEMESIS, NemesisTable
+from emulator.scenario.tables import Scenario
+from emulator.scenario.timeline import acts_of
+from emulator.streams import Stream, root_of_seed, stream_key, uniforms
+
+MOST_EVENTS = 10_000
+"""Of a scenario, those of the file included."""
+_LEAVES = ("kill", "pause")
+_BLOCK = 256  # faults that are drawn at once
+
+Span = tuple[int, int]
+"""Slots [from, to)."""
+
+
+def with_faults(
+    tables: Mapping[str, Any], scenario: Scenario, sentences: Sentences
+) -> tuple[dict[str, Any], list[str]]:
+    """The tables with the events of their nemesis in place of it, and what is wrong with it.
+
+    scenario: what the tables are, right by themselves, with a nemesis.
+    """
+    table = scenario.nemesis
+    assert table is not None  # noqa: S101 - asked by the caller
+    found = [*_mistakes(table, scenario, sentences)]
+    nemesis = _Nemesis(table, scenario)
+    room = MOST_EVENTS - len(scenario.event)
+    events = [] if found else [event for _, event in zip(range(room + 1), nemesis.events(), strict=False)]
+    if len(events) > room:
+        found.append(f"{NEMESIS}.every: comes to more than {room} events; expected fewer faults: a larger every")
+    elif not found and nemesis.targets and not nemesis.possible:
+        found.append(f"{NEMESIS}.faults: none of them may happen to any of the targets; expected cut")
+    own = tables.get("event", [])
+    rest = {name: entries for name, entries in tables.items() if name != NEMESIS}
+    return {**rest, "event": [*own, *sorted(events, key=lambda event: int(event["from"]))]}, found
+
+
+def _mistakes(table: NemesisTable, scenario: Scenario, sentences: Sentences) -> Iterator[str]:
+    """What of `set` is wrong for any of the links."""
+    said = set[str]()
+    for name in _targets(table, scenario) if table.set is not None else ():
+        link = scenario.link(name)
+        try:
+            changed = changed_link(link, table.set or {})
+        except ValidationError as error:
+            lines = [f"{NEMESIS}.set.{line}" for line in sentences(error)]
+        else:
+            lines = []
+            if "correlation" in (table.set or {}):
+                lines.append(f"{NEMESIS}.set.correlation: cannot be changed while a run goes on; remove it")
+            if changed.in_seconds and not scenario.slot_seconds:
+                lines.append(
+                    f"{NEMESIS}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
+                )
+            if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
+                lines.append(f"{NEMESIS}.set.loss.model: is another than that of {name}'s link, whose losses are tied")
+        yield from (line for line in lines if line not in said)
+        said.update(lines)
+
+
+def _targets(table: NemesisTable, scenario: Scenario) -> tuple[str, ...]:
+    """The receivers that it may hit, in the order of the scenario."""
+    return tuple(name for name in scenario.receivers if table.targets is None or name in table.targets)
+
+
+class _Nemesis:
+    """A nemesis in its scenario. Final."""
+
+    def __init__(self, table: NemesisTable, scenario: Scenario) -> None:
+        self._table, self._scenario = table, scenario
+        self.targets = _targets(table, scenario)
+        self._until = scenario.slots if table.to is None else table.to
+        self._root = stream_key(root_of_seed(scenario.seed if table.seed is None else table.seed), NEMESIS)
+        self._taken = {name: self._taken_by_file(name) for name in self.targets}
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """All of them: those that concern several receivers at once, then each receiver's own."""
+        if "partition" in self._table.faults:
+            yield from self._partitions()
+        for name in self.targets:
+            yield from self._own(name)
+
+    @property
+    def possible(self) -> bool:
+        """Whether any of the faults may happen to any of the targets."""
+        return "partition" in self._table.faults or any(map(self.kinds, self.targets))
+
+    def kinds(self, name: str) -> list[str]:
+        """What may happen to a receiver by itself, in the order of `FAULTS`."""
+        scenario = self._scenario
+        loop = scenario.controller is not None and (
+            scenario.controller.acts_on == "estimate" or scenario.legitimate.knows_input
+        )
+        barred = {"partition"}
+        if loop and name == LEGITIMATE:  # the loop would stand still
+            barred.update(_LEAVES)
+        if any(event.kind == "set" and name in event.names for event in scenario.event):
+            barred.add("set")
+        return [kind for kind in FAULTS if kind in self._table.faults and kind not in barred]
+
+    def _taken_by_file(self, name: str) -> list[Span]:
+        """When the file's own events cut a receiver off, or have it leave."""
+        opens = {"cut": "heal", "kill": "restart", "pause": "resume"}
+        acts = sorted((act for event in self._scenario.event for act in acts_of(event)), key=lambda act: act.at)
+        spans: list[Span] = []
+        begun: dict[str, int] = {}
+        for act in acts:
+            if name in act.names and act.kind in opens:
+                begun[opens[act.kind]] = act.at
+            elif name in act.names and act.kind in opens.values():
+                spans.append((begun.pop(act.kind, act.at), act.at))
+        return spans + [(start, NEVER) for start in begun.values()]
+
+    def _partitions(self) -> Iterator[dict[str, Any]]:
+        """Each receiver tosses a coin of its own whether it is among those that are cut off."""
+        coins = {name: self._coins(name) for name in self.targets}
+        for start, end, _ in self._spans("partition"):
+            heads = [name for name in self.targets if next(coins[name])]
+            inside = [name for name in heads if self._free(name, start, end)]
+            for name in inside:
+                self._taken[name].append((start, end))
+            if inside:
+                yield {"from": start, "to": end, "partition": inside}
+
+    def _coins(self, name: str) -> Iterator[bool]:
+        for draws in _draws(self._root, f"partition/{name}"):
+            yield from (draws[:, 0] < 0.5).tolist()
+
+    def _own(self, name: str) -> Iterator[dict[str, Any]]:
+        kinds, needed = self.kinds(name), self._scenario.leaks.get(name)
+        for start, end, choice in self._spans(f"receiver/{name}") if kinds else ():
+            kind = kinds[int(choice * len(kinds))]
+            missed = kind in _LEAVES and needed is not None and start <= needed < end
+            if missed or not self._free(name, start, end):
+                continue
+            if kind == "set":
+                yield {"from": start, "to": end, "link": name, "set": self._table.set}
+            elif kind == "kill" and self._table.state is not None:
+                yield {"from": start, "to": end, "kill": name, "state": self._table.state}
+            else:
+                yield {"from": start, "to": end, kind: name}
+
+    def _free(self, name: str, start: int, end: int) -> bool:
+        """Whether a slot or more is between a span and all others of a receiver."""
+        return all(end < other or until < start for other, until in self._taken[name])
+
+    def _spans(self, stream: str) -> Iterator[tuple[int, int, float]]:
+        """When one fault after the other begins and ends, and a number in [0, 1) that says which it is."""
+        before = self._table.start - 1
+        for draws in _draws(self._root, stream):
+            gaps, lengths = (
+                _geometric(draws[:, i], mean).tolist()
+                for i, mean in enumerate((self._table.every, self._table.lasting))
+            )
+            for gap, length, choice in zip(gaps, lengths, draws[:, 2].tolist(), strict=True):
+                start = before + gap
+                if start >= self._until:
+                    return
+                before = min(start + length, self._until)
+                yield start, before, choice
+
+
+def _draws(root: bytes, name: str) -> Iterator[Floats]:
+    """Three uniform numbers in [0, 1) for each fault of a stream, (256, 3) at a time, without end."""
+    stream = Stream(stream_key(root, name), range(1), 3)
+    for first in count(0, _BLOCK):
+        yield uniforms(stream.words(range(first, first + _BLOCK)))[:, 0]
+
+
+def _geometric(u: Floats, mean: float) -> NDArray[np.int64]:
+    """Numbers of slots, 1 or more, geometrically distributed with this mean, from uniform numbers in [0, 1)."""
+    if mean <= 1.0:
+        return np.ones(len(u), np.int64)
+    return 1 + (log(1.0 - u) / log(np.array([1.0 - 1.0 / mean]))).astype(np.int64)
