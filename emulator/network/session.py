@@ -162,7 +162,7 @@ class Session:
         self._process = brief.process
         self.patience = float(brief.patience)
         """Seconds that are waited for the others."""
-        self._dropped = Dropped(brief.process)
+        self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router)
         if config is None or listen is None:
@@ -195,6 +195,10 @@ class Session:
         self._waiting.begin(again=True)
         if self._lifeline is not None:
             self._lifeline.changed(connected)
+
+    def _mistaken(self) -> None:
+        """A message of another key arrived: the connection takes one for the other."""
+        self._connection.renew()
 
     @property
     def dropped(self) -> int:

@@ -8,7 +8,6 @@ hand then prints the table and the verdict that `evedrop run` prints.
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -36,6 +35,7 @@ from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
 from emulator.runs.joined import Joiner, Slots
 from emulator.runs.judge import replay_of
+from emulator.runs.news import set_news_apart, tell
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
@@ -66,6 +66,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    set_news_apart()
     by_hand = not brief.ends_with_stdin
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
@@ -120,12 +121,6 @@ def _end_orphaned() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_ORPHAN_SECONDS)
     os._exit(RunError.exit_status)
-
-
-def tell(event: str, **news: Any) -> None:
-    """A line to the launcher; nobody has to listen."""
-    with suppress(BrokenPipeError):
-        print(json.dumps({"event": event, **news}, ensure_ascii=False), flush=True)  # noqa: T201 - the launcher reads it
 
 
 class Observation:
