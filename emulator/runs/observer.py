@@ -27,15 +27,16 @@ from emulator.launched import launcher_is_gone, when_launcher_is_gone
 from emulator.model.answers import NoAnswer
 from emulator.model.digest import Blocks
 from emulator.model.eavesdroppers import ANSWERS
-from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.network.declared import Question
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
-from emulator.network.session import Question, Session
+from emulator.network.session import Session
 from emulator.network.telemetry import is_held, is_leaving, read_leaving
 from emulator.network.wire import Reader
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
-from emulator.runs.heartbeat import tell
+from emulator.runs.heartbeat import set_news_apart, tell
 from emulator.runs.held import HeldFolder
 from emulator.runs.joined import Joiner
 from emulator.runs.judge import replay_of
@@ -71,6 +72,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    set_news_apart()
     by_hand = not brief.ends_with_stdin
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
@@ -152,6 +154,7 @@ class Observation:
         """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
         self._outages: list[Mapping[str, Any]] = []
+        self._misdelivered: dict[str, int] = {}
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
 
@@ -215,7 +218,12 @@ class Observation:
                 self._outages = self._recovery.account()
                 self._ended = time.monotonic()
             tell("over")
-            conductor.end(patience)
+            try:
+                conductor.end(patience)
+            finally:
+                self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
+                if session.dropped:
+                    self._misdelivered[OBSERVER] = session.dropped
 
     @property
     def _control(self) -> Control:
@@ -373,7 +381,15 @@ class Observation:
             leave(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(folder, self._scenario), self._ended - self._started
-        ending = Ending(wall, how, replay, events=self._events, outages=self._outages, accused=self._accused)
+        ending = Ending(
+            wall,
+            how,
+            replay,
+            events=self._events,
+            outages=self._outages,
+            accused=self._accused,
+            misdelivered=self._misdelivered,
+        )
         return summary_of(self._scenario, self._keeper.totals, digests, ending)
 
     def settle(self, how: str) -> None:
