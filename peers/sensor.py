@@ -107,7 +107,7 @@ class Acknowledgements:
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
-        message = self._due.take(lambda: Reader(self._key, self._inbox.recv().payload.to_bytes()), k)
+        message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
         acknowledged = read_acknowledgement(message, k, self._trials)
         self._encoder.acknowledged(k, acknowledged)
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None

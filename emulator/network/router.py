@@ -212,6 +212,7 @@ def route(brief: Brief) -> None:
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
         present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
+        session.conclude()
         until_all_left(present, session.linked)
 
 
@@ -261,7 +262,7 @@ class Routing:
         self._session.appear()
         while not self._commands.over():
             try:
-                self._take(Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes()))
+                self._take(Reader(self._session.keys.uplink, self._uplink.recv()))
             except Anew:
                 self._stale = True
 

@@ -207,3 +207,18 @@ def read_progress(key: str, payload: bytes, sent: int) -> int:
 def control(command: str, **fields: Any) -> bytes:
     """A command of the conductor: `start`, `end`, `hold`, `change`, `go` or `again`, and what goes with it."""
     return pack({"do": command, **fields})
+
+
+def over(dropped: int) -> bytes:
+    """A process's last message: it ends because it was told to. dropped: messages that it dropped, which named another key."""
+    return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
+
+
+def is_over(message: Reader) -> bool:
+    """Whether a message is a process's last."""
+    return message.has("over")
+
+
+def read_over(message: Reader) -> int:
+    """How many messages the process dropped."""
+    return message.integer("misdelivered", 1) if message.has("misdelivered") else 0

@@ -26,10 +26,11 @@ from emulator.control import Control, remove_control
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError, UsageError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
 from emulator.model.digest import Blocks
-from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
+from emulator.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.network.declared import Question
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
-from emulator.network.session import Question, Session
+from emulator.network.session import Session
 from emulator.network.telemetry import Extent, is_held, is_leaving, read_leaving
 from emulator.network.wire import Reader
 from emulator.runs.conductor import Conductor, Stop
@@ -162,6 +163,7 @@ class Observation:
         """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
         self._outages: list[Mapping[str, Any]] = []
+        self._misdelivered: dict[str, int] = {}
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
 
@@ -216,7 +218,12 @@ class Observation:
                 self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
             tell("over")
-            conductor.end(patience)
+            try:
+                conductor.end(patience)
+            finally:
+                self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
+                if session.dropped:
+                    self._misdelivered[OBSERVER] = session.dropped
 
     def _wait(self, stop: Stop) -> None:
         """What is done while there is no router yet."""
@@ -375,8 +382,15 @@ class Observation:
                 leave(self._keeper.totals, self.folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay = replay_of(self.folder, self._scenario)
-        wall = self._ended - self._started
-        ending = Ending(wall, how, replay, events=self._events, outages=self._outages, accused=self._accused)
+        ending = Ending(
+            self._ended - self._started,
+            how,
+            replay,
+            events=self._events,
+            outages=self._outages,
+            misdelivered=self._misdelivered,
+            accused=self._accused,
+        )
         summary = summary_of(self._scenario, self._keeper.totals, digests, ending)
         if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
             status = RunError.exit_status

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any, Self
 
 import msgpack
@@ -99,12 +98,11 @@ class FakeInbox:
     def __init__(self, queue: SimpleQueue[bytes]) -> None:
         self._queue = queue
 
-    def recv(self) -> Any:
+    def recv(self) -> bytes:
         """The next message."""
-        payload = self._queue.get(timeout=LIMIT)
-        return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+        return self._queue.get(timeout=LIMIT)
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[bytes]:
         while not self._queue.empty():
             yield self.recv()
 
