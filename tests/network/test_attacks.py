@@ -6,6 +6,8 @@ A rogue is a real process of the run, with its own brief and credentials, in whi
 from __future__ import annotations
 
 import re
+import signal
+import subprocess
 
 import pytest
 
@@ -113,3 +115,68 @@ def test_what_is_verified_and_what_is_not(evedrop: Evedrop) -> None:
     assert done.summary["verification"]["smart"]["own_word"] == ["used_fraction"]
     in_memory = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "4", "--json")
     assert in_memory.summary["verification"] is None
+
+
+HANG = """
+import threading
+def hang(): threading.Event().wait()
+"""
+RECEIVER = """
+from emulator.network.reporting import BeliefReporter
+def add(self, k, *rest, honest=BeliefReporter.add): hang() if k == SLOT else honest(self, k, *rest)
+BeliefReporter.add = add
+"""
+SENSOR = """
+import peers.sensor as sensor
+def sent(k, z, honest=sensor.uplink, **rest): return hang() if k == SLOT else honest(k, z, **rest)
+sensor.uplink = sent
+"""
+ROUTER = """
+import emulator.network.router as router
+def read(message, k, shape, honest=router.read_uplink): return hang() if k == SLOT else honest(message, k, shape)
+router.read_uplink = read
+"""
+CONTROLLER = """
+import peers.controller as controller
+def told(k, u, failed, honest=controller.decided): return hang() if k >= SLOT else honest(k, u, failed)
+controller.decided = told
+"""
+SILENT = {
+    "a receiver in the middle": ("eavesdroppers", "smart", RECEIVER.replace("SLOT", "300")),
+    "a receiver from the first slot on": ("eavesdroppers", "smart", RECEIVER.replace("SLOT", "0")),
+    "the legitimate estimator, whose acknowledgements are waited for": (
+        "acknowledged", "legitimate", RECEIVER.replace("SLOT", "20")
+    ),
+    "the sensor": ("eavesdroppers", "sensor", SENSOR.replace("SLOT", "300")),
+    "the router": ("eavesdroppers", "router", ROUTER.replace("SLOT", "300")),
+    "the controller": ("microgrid", "controller", CONTROLLER.replace("SLOT", "120")),
+}  # fmt: skip
+"""Who is silent → in which scenario, its name, and how."""
+
+
+@pytest.mark.parametrize(
+    "what", [one if one == "a receiver in the middle" else pytest.param(one, marks=pytest.mark.long) for one in SILENT]
+)
+def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str) -> None:
+    """It keeps its connection and its token, and its loop stands still: the run ends, and says who it was that all waited for."""
+    scenario, name, does = SILENT[what]
+    rogue = with_rogue(evedrop, name, HANG + does)
+    live = evedrop.live(scenario, "--pace", "0", "--set", "longest_outage=2", env=rogue)
+    done = live.end()
+    assert done.status == 3, done.err
+    assert done.err.startswith(f"evedrop: {name}: alive, and silent for "), done.err
+    assert f"logs/{name}.log" in done.err
+    live.nothing_left()
+
+
+@pytest.mark.long
+def test_an_operator_may_pause_for_longer_than_an_outage(evedrop: Evedrop) -> None:
+    """Nobody is silent in a run that is held."""
+    live = evedrop.live("eavesdroppers", "--pace", "0.001", "--slots", "20000", "--set", "longest_outage=2")
+    live.running()
+    assert evedrop("pause", "run").status == 0
+    with pytest.raises(subprocess.TimeoutExpired):
+        live.process.wait(12.0)
+    assert evedrop("resume", "run").status == 0
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
