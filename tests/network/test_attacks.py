@@ -11,6 +11,11 @@ import subprocess
 
 import pytest
 
+from emulator.errors import MalformedMessage
+from emulator.network.wire import Reader, read_refusal, refusal
+from emulator.runs.ports import free_port
+from emulator.scenario import load
+from tests.by_hand import by_hand
 from tests.conftest import Evedrop, Live
 from tests.rogue import with_rogue
 
@@ -180,3 +185,56 @@ def test_an_operator_may_pause_for_longer_than_an_outage(evedrop: Evedrop) -> No
     assert evedrop("resume", "run").status == 0
     live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130
+
+
+PROGRESS = {
+    "no message": ("b''", "not msgpack"),
+    "beyond what was sent": ("pack({'k': 10**9})", r"k = 1000000000; expected an integer k from 0 to \d+"),
+}
+"""What a receiver says of its progress → how, and what is said of it."""
+
+
+@pytest.mark.parametrize("what", ["beyond what was sent", pytest.param("no message", marks=pytest.mark.long)])
+def test_malformed_progress_is_its_senders(evedrop: Evedrop, what: str) -> None:
+    """The sensor refuses it, and the run ends with the name of the receiver that sent it, not with the sensor's."""
+    does, said = PROGRESS[what]
+    rogue = with_rogue(evedrop, "naive", f"reporting.progress = lambda k: {does}")
+    done = evedrop.live("eavesdroppers", "--slots", "100000", env=rogue).end()
+    assert done.status == 3
+    first = done.err.splitlines()[0]
+    assert re.match(
+        rf"evedrop: naive broke the protocol: malformed message on evedrop/\w+/progress/naive: {said}", first
+    ), first
+    assert "logs/naive.log" in done.err
+
+
+def test_the_sender_is_named_where_everybody_is_started_by_hand(
+    evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sensor, on another host perhaps, tells the observer what it refuses before it ends, so the sender is named."""
+    rogue = with_rogue(evedrop, "naive", "reporting.progress = lambda k: pack({'k': 10**9})")
+    monkeypatch.setenv("PYTHONPATH", rogue["PYTHONPATH"])
+    scenario = load("eavesdroppers", {"slots": 100_000})
+    with by_hand(scenario, evedrop.folder, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        assert run.statuses()["observer"] == 3
+        said = run.summary["ended"]
+    assert re.match(
+        r"malformed message on evedrop/\w+/progress/naive: k = 1000000000; .*Check that naive speaks", said
+    ), said
+    assert said.endswith("(refused by sensor)")
+
+
+def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
+    """A refusal must be of a key that the process reads, in its own run; and what it says is shown without control characters."""
+    reader = Reader("evedrop/r1/telemetry/naive", refusal("evedrop/r1/uplink", "x"))
+    with pytest.raises(MalformedMessage, match="a key that naive reads"):
+        read_refusal(reader, "naive")
+    reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r2/progress/naive", "x"))
+    with pytest.raises(MalformedMessage, match="a key that sensor reads"):
+        read_refusal(reader, "sensor")
+    reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r1/progress/naive", "\x1b[2Jx\n"))
+    found = read_refusal(reader, "sensor")
+    assert found.at_fault == ("naive",)
+    assert str(found) == "malformed message on evedrop/r1/progress/naive: ?[2Jx? (refused by sensor)"
