@@ -51,6 +51,7 @@ def follow(
         session.ready()
         k = brief.first
         while k < brief.slots:
+            session.place.slot = k
             message = Reader(downlink, deliveries.recv())
             found = message.integer("k")
             if is_hold(message):

@@ -15,14 +15,14 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 import zenoh
 
 from emulator.brief import Brief, Identity
-from emulator.errors import BriefError, MalformedMessage, RunError
+from emulator.errors import BriefError, Gap, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
 from emulator.network.access import OBSERVER, ROUTER, Keys, reader_of
 from emulator.network.connecting import Door, Waiting, connected, endpoint_of
@@ -32,7 +32,8 @@ from emulator.network.envelope import Dropped
 from emulator.network.heartbeat import Heartbeat
 from emulator.network.lifeline import Lifeline
 from emulator.network.resending import Kept
-from emulator.network.wire import Reader, over
+from emulator.network.whereabouts import Place
+from emulator.network.wire import Reader, over, refusal
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
@@ -163,6 +164,8 @@ class Session:
         self._process = brief.process
         self.patience = float(brief.patience)
         """Seconds that are waited for the others."""
+        self.place = Place()
+        """Where this process is, to be kept up to date as it works."""
         self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router)
@@ -189,10 +192,26 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, MalformedMessage | Gap):
+            self._complain(error)
         if self._lifeline is not None:
             self._lifeline.release()
         self._heartbeat.stop()
         self._connection.close()
+
+    def _complain(self, error: MalformedMessage | Gap) -> None:
+        """Tell the observer, which ends the run, what cannot be read and why; wait a moment for it to do so."""
+        outlet = self._reporting
+        if outlet is not None and outlet.matched:
+            outlet(refusal(error.key, str(error)))
+            with suppress(Empty):
+                self._commands.get(timeout=_HEARD_SECONDS)
+
+    @property
+    def _reporting(self) -> Outlet | None:
+        """Where this process reports to the observer, if it does."""
+        key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
+        return self._outlets.get(key)
 
     def _changed(self, connected: bool) -> None:
         """The connection was lost or is back."""
@@ -211,7 +230,7 @@ class Session:
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key, to be read in order with `recv`."""
-        return self._connection.add(Inbox(key, self._dropped))
+        return self._connection.add(Inbox(key, self._dropped, self.place))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
@@ -295,6 +314,9 @@ class Session:
 
     def appear(self) -> None:
         """Show that this process is there."""
+        outlet = self._reporting
+        if outlet is not None:
+            self.place.answer(outlet)
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self._connection.appear(self.keys.alive(self._process))
@@ -305,9 +327,9 @@ class Session:
 
         The relay, which reports nothing, withdraws its token instead.
         """
-        key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
-        if key in self._outlets:
-            self._outlets[key](over(self.dropped))
+        outlet = self._reporting
+        if outlet is not None:
+            outlet(over(self.dropped))
         else:
             self._connection.disappear()
 
@@ -334,6 +356,9 @@ class Session:
                 sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
                 sys.stderr.flush()
                 os._exit(RunError.exit_status)
+            if command.text("do") == "where":
+                self.place.ask()
+                return
             if self._kept and command.text("do") == "again":
                 command.integer("n"), command.integer("k")
                 self._rounds.put(command)
@@ -342,8 +367,9 @@ class Session:
 
     def wait_for(self, command: str) -> None:
         """Wait for one command of the conductor: `start` or `end`."""
-        while self.command().text("do") != command:
-            pass
+        with self.place.waiting(self._control):
+            while self.command().text("do") != command:
+                pass
         if command == "end":
             self.conclude()
 

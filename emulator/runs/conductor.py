@@ -135,6 +135,12 @@ class Conductor:
         """Tell one process what to do."""
         self._commands[name](control(do, **fields))
 
+    def ask(self, what: str) -> None:
+        """Ask everybody who is there and reports for something."""
+        for name in self.keys:
+            if self._present[name]:
+                self.command(name, what)
+
     def report(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""
         self._progress(progress(done))

@@ -33,7 +33,8 @@ from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Session
 from emulator.network.telemetry import is_held, is_leaving, read_leaving
-from emulator.network.wire import Reader
+from emulator.network.whereabouts import is_whereabouts, read_whereabouts
+from emulator.network.wire import Reader, is_refusal, read_refusal
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
 from emulator.runs.heartbeat import set_news_apart, tell
@@ -43,14 +44,15 @@ from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
-from emulator.runs.rows import DigestRows, extent_of, write_rows
+from emulator.runs.rows import DigestRows, write_rows
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
+from emulator.runs.stall import Stall, patience_of
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
 from emulator.runs.summary_file import unwritten
-from emulator.runs.verification import Verifier
+from emulator.runs.verification import Verifier, extent_of
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
@@ -153,6 +155,7 @@ class Observation:
         self._accused: tuple[str, ...] = ()
         """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
+        self._stall: Stall
         self._outages: list[Mapping[str, Any]] = []
         self._misdelivered: dict[str, int] = {}
         self._due: dict[str, Due] = {}
@@ -192,6 +195,9 @@ class Observation:
             patience = self._brief.flow.longest_outage
             self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
+            batch = self._brief.flow.batch
+            limit = patience_of(patience, self._scenario.pace, batch)
+            self._stall = Stall(limit, batch, lambda: conductor.ask("where"))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -206,6 +212,7 @@ class Observation:
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
                     self._writer.checkpoint(self._at, self._so_far)
+                    self._look(conductor)
             except EvedropError as error:
                 self._suspects = conductor.missing
                 self._accused = error.at_fault if isinstance(error, RunError) else ()
@@ -224,6 +231,15 @@ class Observation:
                 self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
                 if session.dropped:
                     self._misdelivered[OBSERVER] = session.dropped
+
+    def _look(self, conductor: Conductor) -> None:
+        """See whether a process that is there keeps the run waiting."""
+        done, at = self._joiner.done, self._steering.at
+        held = at is not None and done >= at
+        present = set(self._scenario.digested) - conductor.absent
+        beside = (CONTROLLER,) if done < self._scenario.slots else ()
+        missing = bool(conductor.missing)
+        self._stall.look(done, lambda: self._joiner.places(present), beside, held=held, missing=missing)
 
     @property
     def _control(self) -> Control:
@@ -291,6 +307,11 @@ class Observation:
 
     def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
         message = Reader(conductor.keys[source], payload)
+        if is_refusal(message):
+            raise read_refusal(message, source)
+        if is_whereabouts(message):
+            self._stall.take(source, read_whereabouts(message, self._scenario.slots))
+            return
         if not self._news(source, message):
             return
         if source == ROUTER:

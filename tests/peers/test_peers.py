@@ -22,6 +22,7 @@ from emulator.network import packets, telemetry, wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
 from emulator.network.resending import Kept
+from emulator.network.whereabouts import Place
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
@@ -113,6 +114,7 @@ class FakeSession:
     def __init__(self, stage: Stage, keys: Keys) -> None:
         self._stage = stage
         self.keys = keys
+        self.place = Place()
 
     def __enter__(self) -> Self:
         return self
