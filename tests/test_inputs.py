@@ -414,7 +414,7 @@ def test_a_command_that_fails_leaves_no_empty_folder(evedrop: Evedrop) -> None:
     assert done.status == 2
     assert list((evedrop.folder / "runs").iterdir()) == []
     (evedrop.folder / "here").write_text("")
-    with pytest.raises(UsageError, match="cannot be made"):
+    with pytest.raises(UsageError, match="cannot be written"):
         claimed(evedrop.folder / "here" / "run")
 
 

@@ -55,7 +55,7 @@ def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Pat
 
 
 def _unusable(folder: Path, why: str) -> UsageError:
-    return UsageError(f"{shown(folder)} cannot be made ({why}); give another folder for the results")
+    return UsageError(f"{shown(folder)} cannot be written ({why}); give another --out")
 
 
 _FOLDER_MODE, _FILE_MODE = 0o700, 0o600
