@@ -17,6 +17,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from emulator.brief import Brief
+from emulator.entry import INTERRUPTED
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
@@ -70,6 +71,8 @@ class Exit:
         """As a sentence goes on after the process's name."""
         if self.status < 0:
             return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
@@ -137,7 +140,7 @@ class Children:
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "emulator", brief.role, str(path)],
+                    [sys.executable, "-P", "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE if conducts else log,
                     stderr=log,
@@ -164,7 +167,8 @@ class Children:
 
     def restart_router(self, ended: Exit) -> bool:
         """Start a router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
         self._killed.add(self._processes[ended.process].pid)
