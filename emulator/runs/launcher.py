@@ -30,6 +30,9 @@ from emulator.scenario import Scenario
 
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
+_AFTERTHOUGHT_SECONDS = (
+    0.5  # a signal that ended a child may be about to reach us: a terminal that closes hangs up on all
+)
 
 
 @dataclass(frozen=True)
