@@ -260,6 +260,7 @@ PARTS: Mapping[str, Check] = {
             "operator": text,
             "operator_identity": maybe(_IDENTITY),
             "shard": flag,
+            "classes": anything,
         },
         strict=False,
     ),

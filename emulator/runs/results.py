@@ -142,13 +142,14 @@ class ResultsWriter:
         if began >= self._figures_due:
             before()
         self._round()
+        self._round_due = time.monotonic() + _ROUND_SECONDS
         if began >= self._figures_due:
+            self._figures_due = self._round_due
             self.write_figures(figures())
             # The first time theory is imported, which says nothing about the next.
             took = time.monotonic() - began if self._figures_before else 0.0
             self._figures_before = True
             self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
-        self._round_due = time.monotonic() + _ROUND_SECONDS
 
     def settle(self, at: str, figures: Mapping[str, Any]) -> None:
         """Have everything on disk, with the last figures: nothing more will come. Raises OSError as above."""

@@ -55,7 +55,7 @@ class _Crew:
         """One scenario, by a process that a Ctrl-C in the terminal does not reach: we pass it on."""
         task = json.dumps([scenario, asdict(self._manner)], default=str)
         process = subprocess.Popen(
-            [sys.executable, "-c", _WORK, task],
+            [sys.executable, "-P", "-c", _WORK, task],
             stdin=subprocess.PIPE,  # closed when we are gone
             stdout=subprocess.PIPE,
             text=True,
