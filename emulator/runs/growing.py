@@ -231,7 +231,7 @@ def batches_of(folder: Path, name: str) -> Iterator[pa.RecordBatch]:
         return
     with (
         contextlib.suppress(OSError, pa.ArrowException, StopIteration),
-        pa.memory_map(str(folder / UNFINISHED / file)) as source,
+        pa.OSFile(str(folder / UNFINISHED / file)) as source,
         pa.ipc.open_stream(source) as reader,
     ):
         while rows > 0:
@@ -246,7 +246,7 @@ def schema_of(folder: Path, name: str) -> pa.Schema | None:
     if not file:
         return None
     try:
-        with pa.memory_map(str(folder / UNFINISHED / file)) as source, pa.ipc.open_stream(source) as reader:
+        with pa.OSFile(str(folder / UNFINISHED / file)) as source, pa.ipc.open_stream(source) as reader:
             return reader.schema
     except (OSError, pa.ArrowException):
         return None
