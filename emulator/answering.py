@@ -103,7 +103,7 @@ def _dry_run(
     del kind  # is what the strategy is, or what it reads as
     from emulator.conformance.eavesdroppers import EavesdropperChecks, Listening  # noqa: PLC0415 - asked last
     from emulator.conformance.problems import Problem  # noqa: PLC0415 - the same
-    from emulator.conformance.rules import Broken  # noqa: PLC0415 - the same
+    from emulator.conformance.rules import how_broken  # noqa: PLC0415 - the same
     from emulator.model.schemes import SCHEMES, scheme_of  # noqa: PLC0415 - the same
 
     A, Q, initial_covariance, singular_noise = process
@@ -115,11 +115,7 @@ def _dry_run(
         lambda process: scheme_of(process, scheme),
         SCHEMES[scheme["scheme"]],
     )
-    try:
-        EavesdropperChecks(listening).shapes(Problem(model, Batch(*batch)))
-    except Broken as error:
-        return str(error)
-    return None
+    return how_broken(EavesdropperChecks(listening).shapes, Problem(model, Batch(*batch)))
 
 
 _ASKED: Mapping[str, Callable[..., Any]] = {

@@ -12,6 +12,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 
 from emulator import commands, operate, roles
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
+from emulator.files import shown
 
 Command = Callable[[argparse.Namespace], int]
 T = TypeVar("T")
@@ -39,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     command: Command = options.command
     try:
+        _check_names(options)
         with _named_output():
             status = command(options)
             if sys.stdout is not None:  # a shell may have closed it
@@ -61,6 +63,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return RunError.exit_status
         print(f"evedrop: {error.filename}: {error.strerror}; free some room, or look at its rights", file=sys.stderr)
         return UsageError.exit_status
+
+
+def _check_names(options: argparse.Namespace) -> None:
+    """Raise UsageError for names of files that no result and no message could repeat."""
+    try:
+        here = str(Path.cwd())
+    except OSError:
+        return
+    texts = [text for value in vars(options).values() for text in (value if isinstance(value, list) else [value])]
+    for text in [here, *texts]:
+        if isinstance(text, (str, Path)) and shown(text) != str(text):
+            what = "the current folder" if text is here else "it"
+            raise UsageError(
+                f"{shown(text)}: {what} is not named in UTF-8, as results and messages are; use another name"
+            )
 
 
 @contextlib.contextmanager

@@ -71,20 +71,20 @@ def demo(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
-    from emulator.api import default_folder
+    from emulator.runs.folder import results_folder
     from emulator.runs.launcher import launch
     from emulator.runs.report import ProgressLine
 
     scenario = loaded(options)
-    folder = options.out or default_folder(options.scenario)
-    with ProgressLine(scenario.slots, "slots", options.json) as line:
-        try:
-            ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
-        except (RunError, Interrupted):
-            with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
-                _print_results(line.moved or folder, options.json)
-            raise
-    _print_results(ended.folder, options.json)
+    with results_folder(options.out, options.scenario) as folder:
+        with ProgressLine(scenario.slots, "slots", options.json) as line:
+            try:
+                ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
+            except (RunError, Interrupted):
+                with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
+                    _print_results(line.moved or folder, options.json)
+                raise
+        _print_results(ended.folder, options.json)
     if ended.viewer is not None:
         _keep_open(ended.viewer)
     return ended.status
@@ -131,22 +131,22 @@ def _hold(viewer: Viewer) -> None:
 
 def montecarlo(options: argparse.Namespace) -> int:
     """Run the trials of a scenario in memory."""
-    from emulator.api import default_folder
+    from emulator.runs.folder import results_folder
     from emulator.runs.montecarlo import simulate
     from emulator.runs.report import ProgressLine
 
     options.trials = 1000 if options.trials is None else options.trials
     plan = _plan(options)
     scenario = loaded(options, beyond_horizon=options.mode != "exact")
-    folder = options.out or default_folder(options.scenario)
-    with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
-        try:
-            status = simulate(scenario, folder, line.tell, plan)
-        except Interrupted:
-            with contextlib.suppress(OSError):  # as above
-                _print_results(line.moved or folder, options.json)
-            raise
-    _print_results(line.moved or folder, options.json)
+    with results_folder(options.out, options.scenario) as folder:
+        with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
+            try:
+                status = simulate(scenario, folder, line.tell, plan)
+            except Interrupted:
+                with contextlib.suppress(OSError):  # as above
+                    _print_results(line.moved or folder, options.json)
+                raise
+        _print_results(line.moved or folder, options.json)
     return status
 
 
@@ -159,15 +159,17 @@ def _plan(options: argparse.Namespace) -> Plan:
 
 def sweep(options: argparse.Namespace) -> int:
     """Run Monte Carlo over a grid."""
-    from emulator.api import default_folder
+    from emulator.runs.folder import results_folder
     from emulator.runs.report import ProgressLine, print_sweep
     from emulator.runs.sweep import grid_of, sweep_over
 
     options.trials = 1000 if options.trials is None else options.trials
     grid = grid_of(options.over)
     plan = _plan(options)
-    folder = options.out or default_folder(f"{Path(options.scenario).stem}-sweep")
-    with ProgressLine(0, "trial-slots", options.json) as line:
+    with (
+        results_folder(options.out, f"{Path(options.scenario).stem}-sweep") as folder,
+        ProgressLine(0, "trial-slots", options.json) as line,
+    ):
         table = sweep_over(options.scenario, _changes(options), grid, folder, line.tell, plan)
     if options.json:
         print(json.dumps(table.to_pylist(), ensure_ascii=False))
@@ -179,8 +181,8 @@ def sweep(options: argparse.Namespace) -> int:
 def compare(options: argparse.Namespace) -> int:
     """Compare schemes and adversaries."""
     from emulator.api import compare as compare_all
-    from emulator.api import default_folder
     from emulator.runs.compare_report import print_comparison
+    from emulator.runs.folder import results_folder
     from emulator.runs.montecarlo import Plan
     from emulator.runs.report import ProgressLine
     from emulator.scenario import value_of
@@ -194,8 +196,10 @@ def compare(options: argparse.Namespace) -> int:
                 f"--with {text}: expected SCHEME.PARAMETER=VALUE, such as innovation.state_probability=0.7"
             )
         parameters[key] = value_of(value)
-    folder = options.out or default_folder(f"compare-{Path(options.scenario).name}")
-    with ProgressLine(0, "trial-slots", options.json) as line:
+    with (
+        results_folder(options.out, f"compare-{Path(options.scenario).name}") as folder,
+        ProgressLine(0, "trial-slots", options.json) as line,
+    ):
         found = compare_all(
             options.scenario,
             schemes=_names(options.schemes),

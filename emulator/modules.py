@@ -32,11 +32,12 @@ def names_in(tables: Any, entries: tuple[str, ...] = _ENTRIES) -> Iterator[str]:
         for entry, inner in tables.items():
             if entry in entries and isinstance(inner, str):
                 yield inner
-            else:
+            elif isinstance(inner, (Mapping, list, tuple)):
                 yield from names_in(inner, entries)
     elif isinstance(tables, (list, tuple)):
         for inner in tables:
-            yield from names_in(inner, entries)
+            if isinstance(inner, (dict, Mapping, list, tuple)):
+                yield from names_in(inner, entries)
 
 
 def named_in(tables: Any) -> Iterator[str]:

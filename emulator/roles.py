@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from emulator.brief import Brief
 
 
+_MOST_TOLD = 5  # mistakes of a scenario in a brief, which nobody wrote by hand
+
+
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs."""
     from emulator.runs.briefs import write_briefs
@@ -53,6 +56,7 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: Brief, serve: str | None) -> int:
     """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    from emulator.brief_use import expect_usable
     from emulator.model.registry import NotRegistered
 
     if brief.identity is not None:
@@ -76,16 +80,28 @@ def _play(brief: Brief, serve: str | None) -> int:
             from emulator.runs.heartbeat import Heartbeat
 
             with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
-                from emulator.runs.observer import observe
-
-                return observe(brief, serve)
+                return _observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:
+        expect_usable(brief)
         play(brief)
     except NotRegistered as error:
         raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
     return 0
+
+
+def _observe(brief: Brief, serve: str | None) -> int:
+    from pydantic import ValidationError
+
+    from emulator.runs.observer import observe
+    from emulator.scenario.mistakes import sentences
+
+    try:
+        return observe(brief, serve)
+    except ValidationError as error:
+        lines = "; ".join(sentences(error)[:_MOST_TOLD])
+        raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
 
 
 def health(options: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 
 from emulator.brief import Brief, Flow, Model
 from emulator.errors import UsageError
+from emulator.files import Unreadable, contents
 from emulator.model.account import COUNTED_BURSTS
 from emulator.model.answers import NoAnswer
 from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
@@ -23,6 +24,7 @@ from emulator.runs.loop_briefs import LoopBriefs
 from emulator.runs.ports import Places, places_at
 from emulator.runs.routers import Routers, identities_of
 from emulator.scenario import Scenario
+from emulator.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
 from emulator.streams import root_of_seed, stream_key
 
 _WINDOW_BYTES = 64 * 2**20
@@ -45,14 +47,14 @@ class StreamKeys:
         if scenario.secret_file is None:
             return cls(root, stream_key(root, "secret"))
         try:
-            secret = Path(scenario.secret_file).read_bytes()
-        except OSError as error:
+            secret = contents(Path(scenario.secret_file), MOST_SECRET_BYTES)
+        except Unreadable as error:
             raise UsageError(
-                f"--secret {scenario.secret_file}: {error.strerror}; give a file of 32 or more bytes"
+                f"--secret {scenario.secret_file} cannot be read ({error}); give a file of {SECRET_BYTES} or more bytes"
             ) from error
-        if len(secret) < 32:
+        if len(secret) < SECRET_BYTES:
             raise UsageError(
-                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected 32 or more, random ones"
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more, random ones"
             )
         return cls(root, stream_key(secret, "secret"))
 

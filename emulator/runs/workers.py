@@ -16,7 +16,7 @@ from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
-from emulator.errors import RunError, UsageError
+from emulator.errors import EvedropError, RunError, UsageError
 from emulator.model.registry import place_of
 from emulator.runs.environment import own_environment
 from emulator.runs.trials import BatchResult, Task, carry_out
@@ -37,11 +37,16 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
             return
         try:
             result = carry_out(task, tell, stopped)
+        except EvedropError:
+            raise
         except Exception as error:
             # An error of ours shows where it comes from; one of somebody's class says what that is.
             if isinstance(error, OSError) or not foreign(task.scenario):
                 raise
-            raise RunError(f"a trial failed: {place_of(error)}; run `evedrop check` on the class it is in") from error
+            raise RunError(
+                f"one of the trials {task.start} to {task.stop - 1} failed: {place_of(error)}; run `evedrop check` on the "
+                "class it is in"
+            ) from error
         yield result
 
 
@@ -163,8 +168,10 @@ def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
         return carry_out(task, tell, stopped)
     except OSError:
         raise
+    except EvedropError as error:
+        return str(error)
     except Exception as error:
-        return place_of(error)
+        return f"trials {task.start} to {task.stop - 1}: {place_of(error)}"
 
 
 @contextlib.contextmanager
@@ -222,6 +229,8 @@ def on_cluster(tasks: list[Task], client: Any, tell: Tell, stopped: Stopped) -> 
 def _result(future: Any) -> BatchResult:
     try:
         result: BatchResult = future.result()
+    except RunError as error:
+        raise RunError(f"a worker failed: {error}") from error
     except Exception as error:
         raise RunError(
             f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "

@@ -37,9 +37,11 @@ from emulator.scenario.table import (
     registered,
 )
 from emulator.scenario.timeline import Timeline
+from emulator.scenario.values import MOST_EAVESDROPPERS
 from emulator.scenario.words import as_toml, listed, no_entry
 
 SECRET_BYTES = 32
+MOST_SECRET_BYTES = 2**20
 
 
 class EncodingTable(Table):
@@ -210,7 +212,7 @@ class NetworkTable(Table):
 class Scenario(Table):
     """One scenario, checked."""
 
-    title: Annotated[str, Field(min_length=1, examples=["Two eavesdroppers beside a planar vehicle"])]
+    title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
     slots: Annotated[int, Field(ge=1, le=100_000_000, strict=True, examples=[2000])]
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
@@ -227,7 +229,7 @@ class Scenario(Table):
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
     eavesdroppers: Annotated[
         dict[ProcessName, EavesdropperTable],
-        Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
+        Field(max_length=MOST_EAVESDROPPERS, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
     ] = Field(default_factory=dict)
     plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
