@@ -8,11 +8,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from emulator import commands, operate, roles
+from emulator.entry import program
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.files import shown
+
+__all__ = ["is_role", "main", "program"]  # the last for an installation of an earlier version
 
 Command = Callable[[argparse.Namespace], int]
 T = TypeVar("T")
@@ -23,16 +26,9 @@ _ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
 
-def program() -> NoReturn:
-    """Run the command line, and end."""
-    status = main()
-    if sys.argv[1:2] and sys.argv[1] in _ROLES:
-        # Threads of a process may still be in Zenoh, and an interpreter that ends meanwhile aborts (Python 3.11).
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError, AttributeError):
-                stream.flush()
-        os._exit(status)
-    raise SystemExit(status)
+def is_role(arguments: Sequence[str]) -> bool:
+    """Whether these begin with the name of a process of a run."""
+    return bool(arguments) and arguments[0] in _ROLES
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -48,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except EvedropError as error:
         _finish()
-        print(f"evedrop: {error}", file=sys.stderr)
+        _say(str(error))
         return error.exit_status
     except KeyboardInterrupt:
         _finish()
@@ -59,9 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError) and error.filename == _OUTPUT:
             return 0
         if error.filename is None:
-            print(f"evedrop: {error}; free what the system lacks and try again", file=sys.stderr)
+            _say(f"{error}; free what the system lacks and try again")
             return RunError.exit_status
-        print(f"evedrop: {error.filename}: {error.strerror}; free some room, or look at its rights", file=sys.stderr)
+        _say(f"{error.filename}: {error.strerror}; free some room, or look at its rights")
         return UsageError.exit_status
 
 
@@ -78,6 +74,12 @@ def _check_names(options: argparse.Namespace) -> None:
             raise UsageError(
                 f"{shown(text)}: {what} is not named in UTF-8, as results and messages are; use another name"
             )
+
+
+def _say(text: str) -> None:
+    """Write a line to standard error, unless its terminal is gone."""
+    with contextlib.suppress(OSError, AttributeError):
+        print(f"evedrop: {text}", file=sys.stderr)
 
 
 @contextlib.contextmanager

@@ -259,13 +259,14 @@ def view(options: argparse.Namespace) -> int:
         print_results(options.run)
         return 0
     from emulator.runs.results import load_results
+    from emulator.runs.signals import raise_on_signals
     from emulator.runs.viewer import Stand, open_run
 
     stand = None if options.serve is None else Stand.of(options.serve)
     results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
     if results is not None:
         print(f"evedrop: {results.remark}", file=sys.stderr)
-    with tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+    with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
         recording = options.run / "recording.rrd"
         if results is not None or not recording.is_file():
             from emulator.view.replay import replay

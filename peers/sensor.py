@@ -33,7 +33,7 @@ class Window:
     """
 
     def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: Kept) -> None:
-        self._window, self._sent = window, sent
+        self._window, self._sent, self._place = window, sent, session.place
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
@@ -45,7 +45,10 @@ class Window:
     def wait(self, k: int) -> None:
         """Return when slot k may be sent."""
         while k >= self._limit:
-            name, payload = self._news.get()
+            with self._place.waiting(
+                *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
+            ):
+                name, payload = self._news.get()
             self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
             self._measure()
 
@@ -55,8 +58,13 @@ class Window:
         self._absent = absent
         self._measure()
 
+    @property
+    def _followed(self) -> list[str]:
+        """Everybody who is waited for."""
+        return [name for name in self._done if name not in self._absent]
+
     def _measure(self) -> None:
-        done = min(done for name, done in self._done.items() if name not in self._absent)
+        done = min(self._done[name] for name in self._followed)
         self._limit = done + self._window
         self._sent.forget(done)
 
@@ -86,8 +94,9 @@ class Holds:
         self.reporter.flush(k)
         self._telemetry(k, held(k))
         # It may be told more than once, and of a hold before this one.
-        while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
-            pass
+        with self._session.place.waiting(self._session.keys.control(SENSOR)):
+            while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
+                pass
         self._window.go_on(k, command.names("absent"))
         self._holds = {slot for slot in self._holds if slot > k}
         if command.has("until"):
@@ -107,7 +116,7 @@ class Acknowledgements:
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
-        message = self._due.take(lambda: Reader(self._key, self._inbox.recv().payload.to_bytes()), k)
+        message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
         acknowledged = read_acknowledgement(message, k, self._trials)
         self._encoder.acknowledged(k, acknowledged)
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
@@ -133,6 +142,7 @@ def sense(brief: Brief) -> None:
         session.wait_for("start")
         start = time.monotonic()
         for k in range(brief.slots):
+            session.place.slot = k
             window.wait(k)
             # In real time a hold may be asked for at any moment before the slot is due; of one slot there is one at most.
             while not (wanted := holds.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:

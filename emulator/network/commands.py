@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 
 from emulator.errors import EvedropError
+from emulator.network.access import ROUTER
 from emulator.network.session import Session
 from emulator.network.wire import Reader
 
@@ -78,7 +79,8 @@ class Commands:
     def next(self) -> Reader:
         """The next command of the round at hand, not one of before. Raises Anew as `check` does."""
         while True:
-            order = self._orders.get()
+            with self._session.place.waiting(self._session.keys.control(ROUTER)):
+                order = self._orders.get()
             self.check()
             if order is not None and order[0] == self._heeded:
                 return order[1]

@@ -39,6 +39,7 @@ from emulator.network.packets import (
     packed_header,
     read_acknowledgement,
     read_beside,
+    read_once_more,
     read_uplink,
 )
 from emulator.network.postman import Postman
@@ -174,7 +175,7 @@ class WayBackLink:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
         self._way = WayBack(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
         self._jammer: str | None = spec["jammer"]
-        self._trials = brief.trials
+        self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged
         self._due = Due(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
@@ -195,7 +196,8 @@ class WayBackLink:
 
     def _acknowledged(self, k: int, commands: Commands) -> Flags:
         while True:
-            payload = self.sent.get()
+            with self._place.waiting(self._key):
+                payload = self.sent.get()
             if payload is None:
                 commands.check()
                 continue
@@ -212,6 +214,7 @@ def route(brief: Brief) -> None:
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
         present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
+        session.conclude()
         until_all_left(present, session.linked)
 
 
@@ -261,7 +264,7 @@ class Routing:
         self._session.appear()
         while not self._commands.over():
             try:
-                self._take(Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes()))
+                self._take(Reader(self._session.keys.uplink, self._uplink.recv()))
             except Anew:
                 self._stale = True
 
@@ -324,7 +327,7 @@ class Routing:
             downlink.deliver(k, z, whole, beside, known)
         if self._way_back is not None and not known:
             self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
-        self._k = k + 1
+        self._k = self._session.place.slot = k + 1
 
     def _flush(self) -> None:
         for burst in self._bursts:
@@ -332,14 +335,15 @@ class Routing:
 
     def _once_more(self, message: Reader) -> None:
         """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
-        anew = self._commands.anew(message.integer("n"))
+        number, done, start = read_once_more(message, self._brief.slots)
+        anew = self._commands.anew(number)
         if anew is None:  # it has asked once more since
             self._stale = True
             return
         for name, changes in anew.map("links").items():
             listed = tuple(_change(Reader(anew.key, b"", one)) for one in changes)
             self._courses[name] = replace(self._courses[name], changes=listed)
-        self._begin(message.integer("k"), message.integer("again"))
+        self._begin(start, done)
 
     def _journal(self, end: int) -> None:
         """Journal all slots below `end`; of those that are journaled already, only remember what goes on after them."""

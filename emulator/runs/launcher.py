@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from emulator.control import remove_control
+from emulator.entry import INTERRUPTED
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
@@ -29,6 +30,9 @@ from emulator.scenario import Scenario
 
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
+_AFTERTHOUGHT_SECONDS = (
+    0.5  # a signal that ended a child may be about to reach us: a terminal that closes hangs up on all
+)
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,9 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
         news = children.news(_LOOK_SECONDS)
         ending: News | None = None
         if isinstance(news, Exit):
-            if news.process != OBSERVER and (news.status == 0 or children.restart_router(news)):
+            if _meant_us_too(news, stop) or (
+                news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
+            ):
                 # Who leaves at the end may be faster than the word that it is the end.
                 early = early or ((news, time.monotonic()) if news.status == 0 else None)
                 continue
@@ -202,6 +208,11 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
         raise RunError(children.story(None, ending))
     children.wait_all()
     return int(ending["status"])
+
+
+def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
+    """Whether the signal that ended a child reaches us within a moment: a terminal that closes hangs up on everybody."""
+    return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)
 
 
 def _ended_well(ending: News) -> bool:

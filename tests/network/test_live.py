@@ -22,6 +22,7 @@ from emulator import montecarlo
 from emulator.brief import Brief, read_brief
 from emulator.network import packets, wire
 from emulator.network.access import Keys
+from emulator.network.envelope import enclosed
 from emulator.runs.briefs import StreamKeys
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
@@ -132,7 +133,7 @@ def disturb(eve: Brief, keys: Keys) -> None:
                 continue
             attacker.declare_queryable(key, lambda query: query.reply(query.key_expr, b"\xc1"))
             for payload in (wire.control("end"), wire.progress(10**9), packets.uplink(0, np.zeros((2, 3))), b"\xc1"):
-                attacker.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+                attacker.put(key, enclosed(key, payload), congestion_control=zenoh.CongestionControl.BLOCK)
             attacker.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
             if key.rpartition("/")[2] in PROCESSES and "/alive/" in key:
                 attacker.liveliness().declare_token(key).undeclare()

@@ -20,6 +20,7 @@ from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
 from emulator.network import loop_wire, operator, packets, telemetry, wire
 from emulator.network.access import Keys, Wiring, grants
+from emulator.network.whereabouts import Whereabouts, read_whereabouts
 from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
 TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -175,6 +176,22 @@ def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
     return {"k": journal.first, "c": journal.count, "links": links}
 
 
+def decode_whereabouts(_shape: dict[str, Any], _value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    where = read_whereabouts(wire.Reader(KEY, raw), SLOTS)
+    return {"k": where.slot, "waits": list(where.waits)}
+
+
+def decode_refusal(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it from the sensor, who refuses what an eavesdropper wrote."""
+    message = wire.Reader(KEY, raw)
+    assert wire.is_refusal(message)
+    refusal = wire.read_refusal(message, "sensor")
+    assert refusal.at_fault == ("eve",)
+    assert str(refusal) == f"malformed message on {value['refuses']}: {value['why']} (refused by sensor)"
+    return {name: message.text(name) for name in value}
+
+
 def encode_leaving(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As a receiver makes it."""
     belief = Belief(np.array(value["x_hat"]), np.array(value["P"]), np.zeros(shape["trials"], np.uint8))
@@ -303,6 +320,8 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         decode_decided,
     ),
     "decisions": (encode_decisions, decode_decisions),
+    "whereabouts": (lambda _shape, value: Whereabouts(value["k"], tuple(value["waits"])).pack(), decode_whereabouts),
+    "refusal": (lambda _shape, value: wire.refusal(value["refuses"], value["why"]), decode_refusal),
 }
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any, Self
 
 import msgpack
@@ -23,6 +22,7 @@ from emulator.network import packets, telemetry, wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
 from emulator.network.resending import Kept
+from emulator.network.whereabouts import Place
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
@@ -99,12 +99,11 @@ class FakeInbox:
     def __init__(self, queue: SimpleQueue[bytes]) -> None:
         self._queue = queue
 
-    def recv(self) -> Any:
+    def recv(self) -> bytes:
         """The next message."""
-        payload = self._queue.get(timeout=LIMIT)
-        return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+        return self._queue.get(timeout=LIMIT)
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[bytes]:
         while not self._queue.empty():
             yield self.recv()
 
@@ -115,6 +114,7 @@ class FakeSession:
     def __init__(self, stage: Stage, keys: Keys) -> None:
         self._stage = stage
         self.keys = keys
+        self.place = Place()
 
     def __enter__(self) -> Self:
         return self
