@@ -261,7 +261,6 @@ PARTS: Mapping[str, Check] = {
             "classes": named(named(anything)),
             "operator_identity": maybe(_IDENTITY),
             "shard": flag,
-            "classes": anything,
         },
         strict=False,
     ),
