@@ -26,8 +26,8 @@ _KINDS: Mapping[tuple[str, ...], type] = {
     ("ends_with_stdin",): bool,
 }
 _PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller", "zid"),
-    "relay": ("users", "receivers", "listen", "zid", "controller"),
+    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller", "zid", "limits"),
+    "relay": ("users", "receivers", "listen", "zid", "controller", "limits"),
     "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart", "plant", "controller"),
     "legitimate": ("scheme", "window", "outages", "controller"),
     "eavesdropper": ("strategy", "parameters", "window", "outages"),
@@ -47,6 +47,8 @@ class Flow:
     """Telemetry, journal and progress are sent at least this often."""
     longest_outage: float = 30.0
     """Seconds for which a process may be cut off before that ends the run."""
+    largest_message: int = 2**30
+    """Bytes of the largest message of the run: more is not taken in."""
 
 
 @dataclass(frozen=True)
