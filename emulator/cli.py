@@ -8,10 +8,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from emulator import commands, operate, roles
+from emulator.entry import program
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
+from emulator.files import shown
+
+__all__ = ["is_role", "main", "program"]  # the last for an installation of an earlier version
 
 Command = Callable[[argparse.Namespace], int]
 T = TypeVar("T")
@@ -22,16 +26,9 @@ _ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
 
-def program() -> NoReturn:
-    """Run the command line, and end."""
-    status = main()
-    if sys.argv[1:2] and sys.argv[1] in _ROLES:
-        # Threads of a process may still be in Zenoh, and an interpreter that ends meanwhile aborts (Python 3.11).
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError, AttributeError):
-                stream.flush()
-        os._exit(status)
-    raise SystemExit(status)
+def is_role(arguments: Sequence[str]) -> bool:
+    """Whether these begin with the name of a process of a run."""
+    return bool(arguments) and arguments[0] in _ROLES
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     command: Command = options.command
     try:
+        _check_names(options)
         with _named_output():
             status = command(options)
             if sys.stdout is not None:  # a shell may have closed it
@@ -46,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except EvedropError as error:
         _finish()
-        print(f"evedrop: {error}", file=sys.stderr)
+        _say(str(error))
         return error.exit_status
     except KeyboardInterrupt:
         _finish()
@@ -57,10 +55,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError) and error.filename == _OUTPUT:
             return 0
         if error.filename is None:
-            print(f"evedrop: {error}; free what the system lacks and try again", file=sys.stderr)
+            _say(f"{error}; free what the system lacks and try again")
             return RunError.exit_status
-        print(f"evedrop: {error.filename}: {error.strerror}; free some room, or look at its rights", file=sys.stderr)
+        _say(f"{error.filename}: {error.strerror}; free some room, or look at its rights")
         return UsageError.exit_status
+
+
+def _check_names(options: argparse.Namespace) -> None:
+    """Raise UsageError for names of files that no result and no message could repeat."""
+    try:
+        here = str(Path.cwd())
+    except OSError:
+        return
+    texts = [text for value in vars(options).values() for text in (value if isinstance(value, list) else [value])]
+    for text in [here, *texts]:
+        if isinstance(text, (str, Path)) and shown(text) != str(text):
+            what = "the current folder" if text is here else "it"
+            raise UsageError(
+                f"{shown(text)}: {what} is not named in UTF-8, as results and messages are; use another name"
+            )
+
+
+def _say(text: str) -> None:
+    """Write a line to standard error, unless its terminal is gone."""
+    with contextlib.suppress(OSError, AttributeError):
+        print(f"evedrop: {text}", file=sys.stderr)
 
 
 @contextlib.contextmanager

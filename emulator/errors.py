@@ -17,6 +17,13 @@ EvedropError                    exit status
 
 from __future__ import annotations
 
+MOST_MISTAKES = 100
+"""Of a scenario, in one message: nobody reads more at a time."""
+
+
+LONGEST_LINE = 900
+"""Characters of one mistake of a scenario."""
+
 
 class EvedropError(Exception):
     """Base of every error this project raises on purpose."""
@@ -31,11 +38,13 @@ class UsageError(EvedropError):
 
 
 class ScenarioError(UsageError):
-    """A scenario with mistakes: `mistakes` lists every one, a line each."""
+    """A scenario with mistakes: `mistakes` lists every one, a line each, up to `MOST_MISTAKES`."""
 
     def __init__(self, source: str, mistakes: list[str]) -> None:
         self.source = source
-        self.mistakes = mistakes
+        more = len(mistakes) - MOST_MISTAKES
+        short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
+        self.mistakes = short if more <= 0 else [*short, f"and {more} more"]
         count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
         super().__init__("\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in mistakes)]))
 

@@ -23,6 +23,7 @@ from emulator.network.declared import Declared, Inbox, Watch
 
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ANSWER_SECONDS = 1.0
+_RENEW_SECONDS = 1.0  # between sessions that are given up because they take one key for another
 _POLL_SECONDS = 0.02
 _LINGER_SECONDS = 10.0  # longer than a router needs to find out that a connection is lost
 
@@ -53,6 +54,7 @@ class Connection:
         self._keeper: threading.Thread | None = None
         self.session = first
         """The session of now, which is closed while another one is opened."""
+        self._opened = time.monotonic()
         self.openings = 1
         """How many sessions there have been."""
         if again is not None:
@@ -80,6 +82,11 @@ class Connection:
             if self._token is not None and not self.session.is_closed():
                 with suppress(zenoh.ZError):
                     self._token.undeclare()  # type: ignore[no-untyped-call]
+
+    def renew(self) -> None:
+        """Open another session, since this one takes one key for another; but not one after another."""
+        if self._again is not None and time.monotonic() - self._opened > _RENEW_SECONDS:
+            self._losses.put(self.session)
 
     def close(self) -> None:
         """For good."""
@@ -138,7 +145,7 @@ class Connection:
     def _adopt(self, session: zenoh.Session) -> None:
         """Declare everything on another session, in the order of before; last that this process is there."""
         with self._lock:
-            self.session = session
+            self.session, self._opened = session, time.monotonic()
             self.openings += 1
             self._listen(session)
             for one in self._declared:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Callable
 from typing import final
 
 import msgpack
@@ -47,10 +48,13 @@ def named_in(message: bytes) -> str | None:
 
 @final
 class Dropped:
-    """Counts the messages that a process dropped because they name another key than the one they came on; for several threads."""
+    """Counts the messages that a process dropped because they name another key than the one they came on; for several threads.
 
-    def __init__(self, process: str) -> None:
-        self._process = process
+    mistaken: called when a message names another key at all: then the connection takes one key for another.
+    """
+
+    def __init__(self, process: str, mistaken: Callable[[], None] = lambda: None) -> None:
+        self._process, self._mistaken = process, mistaken
         self._lock = threading.Lock()
         self.count = 0
 
@@ -59,14 +63,16 @@ class Dropped:
         with self._lock:
             self.count += 1
             number = self.count
+        named = named_in(message)
         if number == 10 ** (len(str(number)) - 1):
-            named = named_in(message)
             what = f"names {named}" if named is not None else "names no key"
             sys.stderr.write(
                 f"evedrop: {self._process}: dropped a message that came on {key} and {what} (number {number}); "
                 "if it was needed, it is sent again\n"
             )
             sys.stderr.flush()
+        if named is not None:
+            self._mistaken()
 
     def contents(self, key: str, head: bytes, message: bytes) -> bytes | None:
         """The payload of a message that came on a key with that head; None if it names another key and was dropped."""

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from emulator.brief_entries import KINDS
 from emulator.model.account import COUNTED_BURSTS
 from emulator.model.digest import DIGEST_BYTES
 from emulator.model.links.link import REASONS
@@ -62,7 +63,7 @@ class Sizes:
             "progress": 0,
             "control": _COMMAND_BYTES,
         }
-        return {kind: size + _FRAME_BYTES for kind, size in kinds.items()}
+        return {kind: kinds[kind] + _FRAME_BYTES for kind in KINDS}
 
 
 def low_pass(run: str, kinds: Mapping[str, int]) -> list[dict[str, Any]]:

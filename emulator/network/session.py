@@ -29,6 +29,7 @@ from emulator.network.connecting import Door, Waiting, connected, endpoint_of
 from emulator.network.connection import Connection
 from emulator.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
 from emulator.network.envelope import Dropped
+from emulator.network.heartbeat import Heartbeat
 from emulator.network.lifeline import Lifeline
 from emulator.network.limits import low_pass
 from emulator.network.mailbox import allowance
@@ -175,7 +176,7 @@ class Session:
         self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
         """Bytes that one sender may have waiting to be read."""
         self._room = _WINDOWS * (brief.flow.window + 8)
-        self._dropped = Dropped(brief.process)
+        self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router)
         if config is None or listen is None:
@@ -191,6 +192,8 @@ class Session:
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
+        # A router has nobody to connect to: it is its network.
+        self._heartbeat = Heartbeat((lambda: True) if brief.role in ("router", "relay") else self.linked)
         self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
@@ -203,6 +206,7 @@ class Session:
             self._complain(error)
         if self._lifeline is not None:
             self._lifeline.release()
+        self._heartbeat.stop()
         self._connection.close()
 
     def _complain(self, error: MalformedMessage | Gap) -> None:
@@ -224,6 +228,10 @@ class Session:
         self._waiting.begin(again=True)
         if self._lifeline is not None:
             self._lifeline.changed(connected)
+
+    def _mistaken(self) -> None:
+        """A message of another key arrived: the connection takes one for the other."""
+        self._connection.renew()
 
     @property
     def dropped(self) -> int:
@@ -322,6 +330,7 @@ class Session:
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self._connection.appear(self.keys.alive(self._process))
+        self._heartbeat.start()
 
     def conclude(self) -> None:
         """Confirm that this process ends because it was told to, and say how many messages it has dropped.

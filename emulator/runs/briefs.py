@@ -10,8 +10,10 @@ from typing import Any
 
 from emulator.brief import Brief, Flow, Model
 from emulator.errors import UsageError
+from emulator.files import Unreadable, contents
 from emulator.model.account import COUNTED_BURSTS
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.answers import NoAnswer
+from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
 from emulator.modules import named_in
@@ -23,6 +25,7 @@ from emulator.runs.loop_briefs import LoopBriefs
 from emulator.runs.ports import Places, places_at
 from emulator.runs.routers import Routers, identities_of
 from emulator.scenario import Scenario
+from emulator.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
 from emulator.streams import root_of_seed, stream_key
 
 _WINDOW_BYTES = 64 * 2**20
@@ -45,14 +48,14 @@ class StreamKeys:
         if scenario.secret_file is None:
             return cls(root, stream_key(root, "secret"))
         try:
-            secret = Path(scenario.secret_file).read_bytes()
-        except OSError as error:
+            secret = contents(Path(scenario.secret_file), MOST_SECRET_BYTES)
+        except Unreadable as error:
             raise UsageError(
-                f"--secret {scenario.secret_file}: {error.strerror}; give a file of 32 or more bytes"
+                f"--secret {scenario.secret_file} cannot be read ({error}); give a file of {SECRET_BYTES} or more bytes"
             ) from error
-        if len(secret) < 32:
+        if len(secret) < SECRET_BYTES:
             raise UsageError(
-                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected 32 or more, random ones"
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more, random ones"
             )
         return cls(root, stream_key(secret, "secret"))
 
@@ -255,6 +258,7 @@ def briefs_of(
                 "operator": users[OPERATOR],
                 "shard": observation.shard,
                 "operator_identity": asdict(identities[OPERATOR]) if identities else None,
+                "classes": _answers(scenario),
             },
         ),
     ]
@@ -267,6 +271,24 @@ def briefs_of(
         part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
         made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
     return {one.process: one for one in made}
+
+
+def _answers(scenario: Scenario) -> dict[str, Any]:
+    """What eavesdroppers' classes that are not built in say of themselves: all that the observer will ask."""
+    tables = scenario.eavesdroppers
+    names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
+    foreign = {name for name in names if STRATEGIES.foreign(name)}
+    if foreign:
+        from emulator.runs.expectation import expectations_of  # noqa: PLC0415 - it is long to import, and seldom needed
+
+        for name, expectation in expectations_of(scenario).items():
+            if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:
+                try:
+                    expectation.traces(scenario.slots)
+                    _ = expectation.limit, expectation.infinite_variance
+                except NoAnswer as error:
+                    raise UsageError(f"eavesdroppers.{name}: its class has no theory of itself ({error})") from error
+    return ANSWERS.of(foreign)
 
 
 def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:

@@ -17,19 +17,22 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from emulator.brief import Brief
+from emulator.entry import INTERRUPTED
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
 from emulator.runs.folder import private_opener
+from emulator.runs.held import HeldFolder
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
 ROUTER_RESTARTS = 3  # of a router that a signal ended: the run goes on with the new one
-_BEGIN_SECONDS = 10.0  # for the observer to begin to write what there is
+SILENCE_SECONDS = 30.0  # after which an observer that says nothing is given up: its heartbeat is a second
+_BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there is
 _GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
-_FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
+_ROUTER_LOST = "has had no connection with the router"
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
@@ -67,15 +70,17 @@ class Exit:
         """As a sentence goes on after the process's name."""
         if self.status < 0:
             return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
 class Children:
     """The processes of a run. Final; on leaving the block all are gone."""
 
-    def __init__(self, logs: Path, private: Path, lock_step: bool = False) -> None:
-        """lock_step: the processes wait for each other in every slot, or every few."""
-        self._logs = logs
+    def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
+        """folder: of the results; lock_step: the processes wait for each other in every slot, or every few."""
+        self._folder = folder
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -131,10 +136,10 @@ class Children:
             environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
-            log_file = self._logs / f"{brief.process}.log"
+            log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "emulator", brief.role, str(path)],
+                    [sys.executable, "-P", "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE if conducts else log,
                     stderr=log,
@@ -161,7 +166,8 @@ class Children:
 
     def restart_router(self, ended: Exit) -> bool:
         """Start a router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
         self._killed.add(self._processes[ended.process].pid)
@@ -218,11 +224,14 @@ class Children:
             path.unlink(missing_ok=True)
 
     def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
-        """Have the observer end, at once or after so many seconds; its last news if it came to it."""
+        """Have the observer end, at once or after so many seconds; its last news if it came to it.
+
+        Once it has begun to finish it may take its time, as long as it says that it lives.
+        """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
         ending: News | None = None
-        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS):
+        while self.silent_seconds < SILENCE_SECONDS and (self._finishing or time.monotonic() - begun < _BEGIN_SECONDS):
             news = self.news(0.05)
             if isinstance(news, Exit):
                 if news.process == OBSERVER:
@@ -253,6 +262,9 @@ class Children:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
         suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
+        lost = next((name for name in (RELAY, ROUTER) if name in suspects), None)
+        if lost is not None and first is not None and self.lost_router(first.process):
+            first, suspects = None, [lost]  # whoever is not reached any more is at fault, not whoever gave up first
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
         if accused and why:
@@ -281,7 +293,7 @@ class Children:
                 if name != OBSERVER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                if status:
+                if status and not ({ROUTER, RELAY} & set(suspects) and self.lost_router(name)):
                     return Exit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return Exit(suspects[0], 0)
@@ -289,10 +301,14 @@ class Children:
                 return None
             time.sleep(0.01)
 
+    def lost_router(self, name: str) -> bool:
+        """Whether a process ended because it could not reach its router any more."""
+        return any(_ROUTER_LOST in line for line in self._log(name))
+
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""
         try:
-            text = _COLOUR.sub("", (self._logs / f"{name}.log").read_text(errors="replace"))
+            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text(errors="replace"))
         except OSError as error:
             return [f"(cannot be read: {error.strerror})"]
         return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]

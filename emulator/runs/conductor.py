@@ -48,13 +48,11 @@ class Conductor:
         session: Session,
         reporters: tuple[str, ...],
         stop: Stop,
-        beat: Callable[[], None] = lambda: None,
         relayed: bool = False,
     ) -> None:
         """reporters: who reports besides router and sensor: the receivers, and a controller."""
         self._session = session
         self._stop = stop
-        self._beat = beat
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
         """Whether we are connected to a relay, and not to the router itself."""
@@ -217,7 +215,6 @@ class Conductor:
         return self._session.reaches(self._session.keys.control(name))
 
     def _next(self) -> tuple[str, bytes | bool] | None:
-        self._beat()
         try:
             return self._news.get(timeout=_LOOK_SECONDS)
         except Empty:

@@ -1,17 +1,15 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
-Its news go to standard output, a JSON object a line: `{"event": "started"}`, then four times a second `{"event":
-"progress", …}`, every second `{"event": "alive"}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
+Its news go to standard output, a JSON object a line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
+times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
 and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole. An observer that was started by
 hand then prints the table and the verdict that `evedrop run` prints.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import sys
 import time
 import traceback
 from collections.abc import Mapping
@@ -23,9 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
-from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError, UsageError
+from emulator.entry import heeded
+from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.model.answers import NoAnswer
 from emulator.model.digest import Blocks
+from emulator.model.eavesdroppers import ANSWERS
 from emulator.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from emulator.network.declared import Question
 from emulator.network.operator import Answer, read_request
@@ -36,17 +37,21 @@ from emulator.network.whereabouts import is_whereabouts, read_whereabouts
 from emulator.network.wire import Reader, is_refusal, read_refusal
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
-from emulator.runs.joined import Joiner, Slots
+from emulator.runs.heartbeat import set_news_apart, tell
+from emulator.runs.held import HeldFolder
+from emulator.runs.joined import Joiner
 from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
+from emulator.runs.rows import DigestRows, write_rows
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stall import Stall, patience_of
 from emulator.runs.stand_in import StandIn
 from emulator.runs.steering import Steering
+from emulator.runs.summary_file import unwritten
 from emulator.runs.verification import Verifier, extent_of
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
@@ -56,7 +61,6 @@ if TYPE_CHECKING:
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
-_BEAT_SECONDS = 1.0
 _ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
 
 
@@ -68,12 +72,14 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     """
     stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    set_news_apart()
     by_hand = not brief.ends_with_stdin
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
+    ANSWERS.learn(brief.part["classes"])  # so that the classes themselves need not run here
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario, confirmations, by_hand)
     if by_hand:
@@ -84,6 +90,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     viewer = None if stand is None else observation.show(stand)
     status, how = 0, "complete"
     try:
+        observation.hold()
         write_resolved(observation.folder, scenario)
         with observation.writer():
             try:
@@ -92,8 +99,11 @@ def observe(brief: Brief, serve: str | None = None) -> int:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
             finally:
                 tell("finishing")
+            observation.settle(how)
     except OSError as error:
-        status, how = RunError.exit_status, _unwritten(error)
+        status, how = RunError.exit_status, unwritten(error)
+    except NoAnswer as error:  # of a class that the operator's change of a link has a question for
+        status, how = RunError.exit_status, f"an eavesdropper's class could not say what theory expects of it: {error}"
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
@@ -103,33 +113,11 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     return status
 
 
-def _print_ending(folder: Path, status: int, how: str) -> None:
-    """Print what `evedrop run` prints at its end: the table, the verdict, and why the run failed. Nobody has to listen."""
-    from emulator.runs.closing import print_results  # noqa: PLC0415 - a launched observer has no use for it
-
-    with suppress(UsageError, OSError):
-        print_results(folder)
-        sys.stdout.flush()
-    if status not in {0, 1}:
-        print(f"evedrop: {how}", file=sys.stderr, flush=True)  # noqa: T201 - nobody else says it
-
-
-def _unwritten(error: OSError) -> str:
-    """What a summary and a message say of results that could not be written."""
-    return f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again"
-
-
 def _end_orphaned() -> None:
     """Write what there is, and end."""
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_ORPHAN_SECONDS)
     os._exit(RunError.exit_status)
-
-
-def tell(event: str, **news: Any) -> None:
-    """A line to the launcher; nobody has to listen."""
-    with suppress(BrokenPipeError):
-        print(json.dumps({"event": event, **news}, ensure_ascii=False), flush=True)  # noqa: T201 - the launcher reads it
 
 
 class Observation:
@@ -139,7 +127,9 @@ class Observation:
         self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
         """by_hand: whether nobody has launched the others who would end them."""
-        self.folder = Path(brief.part["results"])
+        self._place = Path(brief.part["results"])
+        self._held: HeldFolder | None = None
+        self._final: dict[str, Any] | None = None
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
@@ -150,6 +140,7 @@ class Observation:
         self._verifier = Verifier(blocks, scenario.record_trials, scenario.first_trial)
         period = None if table is None else table.period
         self._joiner = Joiner(self._extent, windows, blocks, period, self._verifier.report)
+        self._digest_rows = DigestRows(self._joiner.digests, scenario.first_trial)
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -159,7 +150,7 @@ class Observation:
         self._live: str | None = brief.part["live"]
         self._showing: Showing | None = None
         self._writer: ResultsWriter
-        self._started = self._ended = self._told = self._beaten = time.monotonic()
+        self._started = self._ended = self._told = time.monotonic()
         self._suspects: list[str] = []
         self._accused: tuple[str, ...] = ()
         """Processes that the run ends with because of what they did."""
@@ -169,6 +160,15 @@ class Observation:
         self._misdelivered: dict[str, int] = {}
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
+
+    @property
+    def folder(self) -> Path:
+        """The results folder, also if it was renamed. Raises FileNotFoundError if it was removed."""
+        return self._place if self._held is None else self._held.now
+
+    def hold(self) -> None:
+        """Keep hold of the results folder from now on. Raises OSError if there is none."""
+        self._held = HeldFolder(self._place)
 
     def show(self, stand: Stand) -> Viewer:
         """A viewer for browsers, which the run will be streamed to."""
@@ -184,8 +184,8 @@ class Observation:
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
-        with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
-            conductor = Conductor(session, self._scenario.digested, stop, self._beat, self._scenario.relayed)
+        with Session(self._brief, meanwhile=stop.check) as session:
+            conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
@@ -211,9 +211,10 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
+                    self._writer.checkpoint(self._at, self._so_far)
                     self._look(conductor)
             except EvedropError as error:
-                self._suspects = conductor.missing if isinstance(error, RunError) else []
+                self._suspects = conductor.missing
                 self._accused = error.at_fault if isinstance(error, RunError) else ()
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
@@ -222,7 +223,6 @@ class Observation:
                 self._dismiss(conductor)
                 self._recovery.give_up(self._joiner.done)
                 self._outages = self._recovery.account()
-                self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
             tell("over")
             try:
@@ -240,11 +240,6 @@ class Observation:
         beside = (CONTROLLER,) if done < self._scenario.slots else ()
         missing = bool(conductor.missing)
         self._stall.look(done, lambda: self._joiner.places(present), beside, held=held, missing=missing)
-
-    def _wait(self, stop: Stop) -> None:
-        """What is done while there is no router yet."""
-        stop.check()
-        self._beat()
 
     @property
     def _control(self) -> Control:
@@ -285,7 +280,8 @@ class Observation:
 
     def _dismiss(self, conductor: Conductor) -> None:
         """The run is over: nobody can get at it, and whoever waits is told."""
-        remove_control(self.folder)
+        with suppress(FileNotFoundError):
+            remove_control(self.folder)
         self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
         while not conductor.questions.empty():
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
@@ -338,6 +334,7 @@ class Observation:
         self._verifier.joined(slots)
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
+        self._digest_rows.write(self._writer)
         if self._recording is not None:
             self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
         conductor.report(self._joiner.done)
@@ -378,13 +375,6 @@ class Observation:
         self._steering.left(name, k)
         self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
 
-    def _beat(self) -> None:
-        """Show the launcher that we live, when there is nothing else to tell."""
-        now = time.monotonic()
-        if now - self._beaten >= _BEAT_SECONDS:
-            self._beaten = now
-            tell("alive")
-
     def _progress(self, scored: Mapping[str, Scored]) -> None:
         now = time.monotonic()
         if now - self._told < _PROGRESS_SECONDS:
@@ -395,48 +385,62 @@ class Observation:
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
         tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
 
-    def finish(self, status: int, how: str) -> int:
-        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
-        safe = self._recording.close() if self._recording is not None else True
+    @property
+    def _at(self) -> str:
+        """How far the run came."""
+        return f"slot {self._joiner.done}"
+
+    def _so_far(self) -> dict[str, Any]:
+        """The summary of a run that goes on."""
+        self._ended = time.monotonic()
+        return self._summary("")
+
+    def _summary(self, how: str) -> dict[str, Any]:
+        """The summary by now; a shard leaves its score for the run's."""
+        folder = self.folder
         if self._brief.part["shard"]:
-            with suppress(OSError):  # of a full disk, which the summary says
-                leave(self._keeper.totals, self.folder)
+            leave(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
-        replay = replay_of(self.folder, self._scenario)
+        replay, wall = replay_of(folder, self._scenario), self._ended - self._started
         ending = Ending(
-            self._ended - self._started,
+            wall,
             how,
             replay,
             events=self._events,
             outages=self._outages,
-            misdelivered=self._misdelivered,
             accused=self._accused,
+            misdelivered=self._misdelivered,
         )
-        summary = summary_of(self._scenario, self._keeper.totals, digests, ending)
-        if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
-            status = RunError.exit_status
-            summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
-        if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
-            status = 1
+        return summary_of(self._scenario, self._keeper.totals, digests, ending)
+
+    def settle(self, how: str) -> None:
+        """Have all that was measured on disk, its summary too. Raises OSError if it cannot be written."""
+        self._digest_rows.write(self._writer)
+        self._final = self._summary(how)
+        self._writer.settle(self._at, self._final)
+
+    def finish(self, status: int, how: str) -> int:
+        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
+        safe = self._recording.close() if self._recording is not None else True
         try:
+            summary = {**(self._final or self._summary(how)), "ended": how}
+            if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
+                status = RunError.exit_status
+                summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+            if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
+                status = 1
+            how = str(summary["ended"])
             write_summary(self.folder, summary)
         except OSError as error:
-            status = RunError.exit_status
-            summary["ended"] = _unwritten(error)
+            status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
         accused = list(self._accused)
-        tell("ended", status=status, how=summary["ended"], suspects=self._suspects, accused=accused, view=view)
+        tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
         if self._by_hand:
-            _print_ending(self.folder, status, str(summary["ended"]))
+            from emulator.runs.closing import print_ending  # noqa: PLC0415 - a launched observer has no use for it
+
+            with suppress(FileNotFoundError):
+                print_ending(self.folder, status, how)
         if not safe:
             os._exit(status)
         return status
-
-
-def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
-    """All rows of some slots."""
-    for name, one in scored.items():
-        writer.slot_rows(slots.first, name, one.sums, one.expected)
-    writer.input_rows(slots, first_trial)
-    writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
-    writer.journal_rows(slots)

@@ -108,7 +108,7 @@ class Ending:
     accused: tuple[str, ...] = ()
     """The processes that the run has ended with because of what they did."""
     misdelivered: Mapping[str, int] = field(default_factory=dict)
-    """The same."""
+    """Process → messages of other keys that it dropped."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:

@@ -95,10 +95,12 @@ class Campaign:
                 run.launcher.wait()
                 ended = time.monotonic()
                 run.over.wait(0.1)  # for the last news to be read
+                if run.launcher.returncode:
+                    raise SystemExit(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")
                 results = load_results(run.out)
                 wrong = list(unlike(results.summary, reference))
-                assert run.launcher.returncode == 0, run.text("stderr")
-                assert not wrong, wrong
+                if wrong:
+                    raise SystemExit(f"an undisturbed run of {variant.name} is not as in memory: {'; '.join(wrong)}")
                 assert run.started is not None
                 assert run.finished is not None
                 usual = Usual(run.started - run.begun, run.finished - run.started, ended - run.finished)
