@@ -222,8 +222,6 @@ def test_model_is_the_only_thing_all_share() -> None:
 
 
 OPTIONAL = {
-    "first", "patience", "identity", "modules", "header", "singular_noise", "longest_outage", "largest_message", "measurement",
-}
     "first",
     "patience",
     "identity",
