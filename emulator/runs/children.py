@@ -32,6 +32,7 @@ _BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there
 _GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
+_HUBS = frozenset({ROUTER, RELAY, OBSERVER})
 _ROUTER_LOST = "has had no connection with the router"
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
@@ -262,9 +263,9 @@ class Children:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
         suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
-        lost = next((name for name in (RELAY, ROUTER) if name in suspects), None)
-        if lost is not None and first is not None and self.lost_router(first.process):
-            first, suspects = None, [lost]  # whoever is not reached any more is at fault, not whoever gave up first
+        lost = None if first is None else self._lost_by_all(first.process, suspects)
+        if lost is not None:
+            first, suspects = None, [lost]  # it is at fault, and not the process that gave up first
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
         if accused and why:
@@ -293,7 +294,7 @@ class Children:
                 if name != OBSERVER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                if status and not ({ROUTER, RELAY} & set(suspects) and self.lost_router(name)):
+                if status and not ({ROUTER, RELAY} & set(suspects) and self._lost_router(name)):
                     return Exit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return Exit(suspects[0], 0)
@@ -301,9 +302,24 @@ class Children:
                 return None
             time.sleep(0.01)
 
-    def lost_router(self, name: str) -> bool:
+    def _lost_router(self, name: str) -> bool:
         """Whether a process ended because it could not reach its router any more."""
         return any(_ROUTER_LOST in line for line in self._log(name))
+
+    def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
+        """The router that a process gave up, if the observer misses it too, or all others that are connected to it; else None."""
+        if not self._lost_router(name):
+            return None
+        if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
+            return missed
+        place = self._briefs[name].router
+        others = [one for one, brief in self._briefs.items() if brief.router == place and one not in _HUBS]
+        deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
+        while time.monotonic() < deadline:
+            if all(self._lost_router(one) for one in others):
+                return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+            time.sleep(0.05)
+        return None
 
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""

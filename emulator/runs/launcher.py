@@ -30,7 +30,6 @@ from emulator.scenario import Scenario
 
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
-_LEASE_SECONDS = 6.0  # within which all notice that a router is silent: the lease of a connection, and some more
 _AFTERTHOUGHT_SECONDS = (
     0.5  # a signal that ended a child may be about to reach us: a terminal that closes hangs up on all
 )
@@ -195,8 +194,7 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
                 continue
             if news.process != OBSERVER:
                 # An observer that has just ended may still say so; one that goes on would wait for who will not come back.
-                # One that misses its router may have noticed sooner than the observer, which must say whether it misses it too.
-                ending = children.conclude(tell, _LEASE_SECONDS if children.lost_router(news.process) else 0.0)
+                ending = children.conclude(tell)
             if ending is None or not _ended_well(ending):
                 raise RunError(children.story(news, ending))
         elif news is not None:
