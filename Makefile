@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-long test-hosts test-compose lint setup clean
+.PHONY: demo test test-long test-hosts test-compose test-faults lint setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -23,6 +23,13 @@ test-hosts: $(READY)
 # As root: docker-compose.yml brought up by a Docker daemon of its own. Where that cannot be, it says so and fails nothing.
 test-compose: $(READY)
 	$(BIN)/python -m pytest -m containers tests/containers
+
+# Disturbs live runs at random, by number: the same SEED is the same case. SEED alone repeats that one case, and COUNT is how
+# many from SEED on. As root a small disk can be filled as well.
+SEED ?=
+COUNT ?= $(if $(SEED),1,60)
+test-faults: $(READY)
+	$(BIN)/python -m tests.faults.campaign --seed $(or $(SEED),1) --count $(COUNT)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -53,4 +53,8 @@ give "$1" eavesdropper-1
 give "$2" eavesdropper-2
 mkdir -m 700 "/runs/$name"
 chown "$owner" "/runs/$name"
-echo "$scenario: eavesdropper-1 is $1, eavesdropper-2 is $2; results go to runs/$name"
+# Docker makes ./runs as root where it was not there, and then nobody else could start a run in this folder.
+if [ "$(stat -c %u /runs)" = 0 ]; then
+  chown "$owner" /runs
+fi
+echo "$scenario: eavesdropper-1 is $1, eavesdropper-2 is $2; results go to runs/$name, readable for user $owner alone"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from emulator.model.link_law import law_of
 from emulator.model.outcomes import GENIE_SCHEMES
 from emulator.model.schemes import SCHEMES
 from emulator.network.access import LEGITIMATE
+from emulator.runs.folder import results_folder
 from emulator.runs.results import Results, load_results
 from emulator.scenario import Scenario, checked, load
 from emulator.scenario.words import listed
@@ -29,12 +29,6 @@ Tell = Callable[[Mapping[str, Any]], None]
 
 def _silent(news: Mapping[str, Any]) -> None:
     del news
-
-
-def default_folder(scenario: str | Path) -> Path:
-    """`runs/<scenario>-<time>`, in the current folder."""
-    stem = Path(scenario).stem if Path(scenario).suffix else Path(scenario).name
-    return Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def run(
@@ -61,11 +55,12 @@ def run(
     """
     from emulator.runs.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
 
-    made, folder = _prepared(scenario, out, changes)
-    ended = launch(made, folder, view, listen, tell)
-    if ended.viewer is not None:
-        ended.viewer.stop()
-    return load_results(folder)
+    made = _prepared(scenario, changes)
+    with results_folder(out, _name(scenario)) as folder:
+        ended = launch(made, folder, view, listen, tell)
+        if ended.viewer is not None:
+            ended.viewer.stop()
+        return load_results(ended.folder)
 
 
 def montecarlo(
@@ -85,9 +80,10 @@ def montecarlo(
     from emulator.runs.simulation import Mode  # noqa: PLC0415 - the same
 
     plan = plan or Plan()
-    made, folder = _prepared(scenario, out, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
-    simulate(made, folder, tell, plan)
-    return load_results(folder)
+    made = _prepared(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
+    with results_folder(out, _name(scenario)) as folder:
+        simulate(made, folder, tell, plan)
+        return load_results(folder)
 
 
 def compare(
@@ -118,10 +114,10 @@ def compare(
     from emulator.runs.matchups import matchups_of  # noqa: PLC0415 - the same
     from emulator.runs.montecarlo import Plan  # noqa: PLC0415 - the same
 
-    made, _ = _prepared(scenario, None, {**changes, "trials": trials})
-    name = "scenario" if isinstance(scenario, Scenario) else Path(scenario).name
-    place = Path(out) if out is not None else default_folder(f"compare-{name}")
-    return compare_all(matchups_of(made, schemes, adversaries, parameters), place, tell, plan or Plan())
+    made = _prepared(scenario, {**changes, "trials": trials})
+    matchups = matchups_of(made, schemes, adversaries, parameters)
+    with results_folder(out, f"compare-{Path(_name(scenario)).name}") as folder:
+        return compare_all(matchups, folder, tell, plan or Plan())
 
 
 def design(
@@ -178,12 +174,14 @@ def _not_for(scheme: str) -> str:
     return f"{why}, and this scenario has {scheme}; {instead}, or see by evedrop compare what {scheme} gives"
 
 
-def _prepared(
-    scenario: str | Path | Scenario, out: str | Path | None, changes: Mapping[str, Any], beyond_horizon: bool = False
-) -> tuple[Scenario, Path]:
+def _prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
     dotted = {name.replace("__", "."): value for name, value in changes.items()}
-    place = Path(out) if out is not None else default_folder("run" if isinstance(scenario, Scenario) else scenario)
     if isinstance(scenario, Scenario):
         tables = scenario.model_dump(mode="json", exclude_none=True)
-        return checked(tables, scenario.title, dotted, beyond_horizon=beyond_horizon), place
-    return load(scenario, dotted, beyond_horizon=beyond_horizon), place
+        return checked(tables, scenario.title, dotted, beyond_horizon=beyond_horizon)
+    return load(scenario, dotted, beyond_horizon=beyond_horizon)
+
+
+def _name(scenario: str | Path | Scenario) -> str | Path:
+    """What a results folder is named after."""
+    return "scenario" if isinstance(scenario, Scenario) else scenario

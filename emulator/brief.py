@@ -9,32 +9,21 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from emulator.brief_entries import PARTS, mistakes_in
 from emulator.errors import BriefError
+from emulator.files import Unreadable, opened, why_of
 from emulator.model.process import Process, mistakes_of
-from emulator.streams import KEY_BYTES, Batch
+from emulator.streams import Batch
 
-_KINDS: Mapping[tuple[str, ...], type] = {
-    ("run", "process", "role", "router", "user", "password"): str,
-    ("slots", "trials", "first_trial", "recorded"): int,
-    ("flow", "model", "keys", "part"): dict,
-    ("ends_with_stdin",): bool,
-}
-_PARTS: Mapping[str, tuple[str, ...]] = {
-    "router": ("links", "pace", "users", "leaks", "acknowledgements", "controller", "zid"),
-    "relay": ("users", "receivers", "listen", "zid", "controller"),
-    "sensor": ("scheme", "pace", "receivers", "holds", "history", "leaks", "chart", "plant", "controller"),
-    "legitimate": ("scheme", "window", "outages", "controller"),
-    "eavesdropper": ("strategy", "parameters", "window", "outages"),
-    "controller": ("strategy", "assignment", "acts_on", "plant", "disturbances"),
-    "observer": ("scenario", "results", "recording", "live", "operator", "operator_identity", "shard"),
-}
-ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
+ROLES = tuple(PARTS)
+_MOST_BYTES = 2**30  # the observer's has a scenario with everything in it
+_WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
 @dataclass(frozen=True)
@@ -47,6 +36,8 @@ class Flow:
     """Telemetry, journal and progress are sent at least this often."""
     longest_outage: float = 30.0
     """Seconds for which a process may be cut off before that ends the run."""
+    largest_message: int = 2**30
+    """Bytes of the largest message of the run: more is not taken in."""
 
 
 @dataclass(frozen=True)
@@ -132,15 +123,18 @@ class Brief:
 def read_brief(path: Path, role: str | None = None) -> Brief:
     """The brief in a file. Raises BriefError if it is unreadable, readable by others, or another role's."""
     try:
-        if path.stat().st_mode & 0o077:
-            raise BriefError(f"{path} is readable by others; a brief holds keys: chmod 600 {path}")
-        brief = _parsed(json.loads(path.read_text()))
-    except OSError as error:
-        raise BriefError(f"{path}: {error.strerror}; give the file that `evedrop brief` wrote") from error
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise BriefError(
-            f"{path} is not a brief of this version ({error}); write it again with `evedrop brief`"
-        ) from error
+        with opened(path) as file:
+            if os.fstat(file.fileno()).st_mode & 0o077:
+                raise BriefError(f"{path} is readable by others; a brief holds keys: chmod 600 {path}")
+            found = file.read(_MOST_BYTES + 1)
+    except (OSError, Unreadable) as error:
+        raise BriefError(f"{path}: {why_of(error)}; give the file that `evedrop brief` wrote") from error
+    try:
+        if len(found) > _MOST_BYTES:
+            raise ValueError(f"it has more than {_MOST_BYTES} bytes")
+        brief = _parsed(json.loads(found.decode("utf-8")))
+    except (ValueError, RecursionError) as error:
+        raise BriefError(f"{path} is not a brief of this version ({error}); {_WRITE_AGAIN}") from error
     if role is not None and brief.role != role:
         raise BriefError(
             f"{path} is the brief of a {brief.role}; expected one of a {role}: start `evedrop {brief.role}`"
@@ -149,40 +143,25 @@ def read_brief(path: Path, role: str | None = None) -> Brief:
 
 
 def _parsed(found: Any) -> Brief:
-    if not isinstance(found, dict):
-        raise TypeError("not a JSON object")
-    unknown = set(found) - {known.name for known in fields(Brief)}
-    if unknown:
-        raise TypeError(f"unknown entry {min(unknown)}")
-    if found["role"] not in ROLES:
-        raise ValueError(f"unknown role {found['role']}")
-    for names, kind in _KINDS.items():
-        for name in names:
-            if type(found[name]) is not kind:
-                raise TypeError(f"{name} is no {kind.__name__}")
-    for name in _PARTS[found["role"]]:
-        if name not in found["part"]:
-            raise ValueError(f"part.{name} is missing")
-    for name, key in found["keys"].items():
-        if not isinstance(key, str) or len(bytes.fromhex(key)) != KEY_BYTES:
-            raise ValueError(f"the key of {name} is not {KEY_BYTES} bytes")
+    mistakes = mistakes_in(found)
+    if mistakes:
+        raise ValueError("; ".join(mistakes))
     identity = found.get("identity")
-    if identity is not None:
-        identity = Identity(**identity)
-        if not all(isinstance(value, str) for value in asdict(identity).values()):
-            raise TypeError("identity has an entry that is no str")
-    brief = Brief(**{**found, "flow": Flow(**found["flow"]), "model": Model(**found["model"]), "identity": identity})
-    _check_numbers(brief)
-    return brief
-
-
-def _check_numbers(brief: Brief) -> None:
-    """Raise ValueError or TypeError for numbers that no run has."""
-    if type(brief.patience) is not int or brief.patience < 1:
-        raise ValueError("patience must be a whole number of seconds, at least 1")
-    if min(brief.slots, brief.trials, brief.recorded, brief.flow.window, brief.flow.batch) < 1 or brief.first_trial < 0:
-        raise ValueError("slots, trials, recorded, flow.window and flow.batch must be at least 1")
+    brief = Brief(
+        **{
+            **found,
+            "flow": Flow(**found["flow"]),
+            "model": Model(**found["model"]),
+            "identity": None if identity is None else Identity(**identity),
+        }
+    )
     model = brief.model
-    A, Q, initial = (np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance))
-    if mistakes_of(A, Q, initial, model.singular_noise):
-        raise ValueError("its model is no process")
+    try:
+        matrices = [np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance)]
+    except (ValueError, OverflowError) as error:
+        raise ValueError("model.A, model.Q or model.initial_covariance is no matrix") from error
+    if wrong := mistakes_of(matrices[0], matrices[1], matrices[2], model.singular_noise):
+        raise ValueError(f"its model is no process: model.{wrong[0][0]} {wrong[0][1]}")
+    if not 0.0 <= model.state_probability <= 1.0:
+        raise ValueError(f"model.state_probability is {model.state_probability}, expected a number from 0 to 1")
+    return brief

@@ -11,8 +11,11 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+from emulator.files import Unreadable, text_of
+
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
-_OF_RESULTS = ("summary.json", "slots.parquet")  # the second is there from the start of a run
+_MOST_BYTES = 2**28  # as of every scenario
+_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last while a run goes on
 
 
 def is_scenario(path: Path) -> bool:
@@ -26,8 +29,8 @@ def is_scenario(path: Path) -> bool:
     if path.name == "scenario.toml" and any(path.with_name(name).exists() for name in _OF_RESULTS):
         return False
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
+        text = text_of(path, _MOST_BYTES)
+    except Unreadable:
         return False
     if "process" not in text or "encoding" not in text:
         return False

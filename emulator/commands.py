@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import json
 import sys
+import tempfile
 import time
 from collections import Counter
 from pathlib import Path
@@ -70,20 +71,20 @@ def demo(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
-    from emulator.api import default_folder
+    from emulator.runs.folder import results_folder
     from emulator.runs.launcher import launch
     from emulator.runs.report import ProgressLine
 
     scenario = loaded(options)
-    folder = options.out or default_folder(options.scenario)
-    with ProgressLine(scenario.slots, "slots", options.json) as line:
-        try:
-            ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
-        except (RunError, Interrupted):
-            with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
-                _print_results(folder, options.json)
-            raise
-    _print_results(folder, options.json)
+    with results_folder(options.out, options.scenario) as folder:
+        with ProgressLine(scenario.slots, "slots", options.json) as line:
+            try:
+                ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
+            except (RunError, Interrupted):
+                with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
+                    _print_results(line.moved or folder, options.json)
+                raise
+        _print_results(ended.folder, options.json)
     if ended.viewer is not None:
         _keep_open(ended.viewer)
     return ended.status
@@ -130,22 +131,22 @@ def _hold(viewer: Viewer) -> None:
 
 def montecarlo(options: argparse.Namespace) -> int:
     """Run the trials of a scenario in memory."""
-    from emulator.api import default_folder
+    from emulator.runs.folder import results_folder
     from emulator.runs.montecarlo import simulate
     from emulator.runs.report import ProgressLine
 
     options.trials = 1000 if options.trials is None else options.trials
     plan = _plan(options)
     scenario = loaded(options, beyond_horizon=options.mode != "exact")
-    folder = options.out or default_folder(options.scenario)
-    with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
-        try:
-            status = simulate(scenario, folder, line.tell, plan)
-        except Interrupted:
-            with contextlib.suppress(OSError):  # as above
-                _print_results(folder, options.json)
-            raise
-    _print_results(folder, options.json)
+    with results_folder(options.out, options.scenario) as folder:
+        with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
+            try:
+                status = simulate(scenario, folder, line.tell, plan)
+            except Interrupted:
+                with contextlib.suppress(OSError):  # as above
+                    _print_results(line.moved or folder, options.json)
+                raise
+        _print_results(line.moved or folder, options.json)
     return status
 
 
@@ -158,15 +159,17 @@ def _plan(options: argparse.Namespace) -> Plan:
 
 def sweep(options: argparse.Namespace) -> int:
     """Run Monte Carlo over a grid."""
-    from emulator.api import default_folder
+    from emulator.runs.folder import results_folder
     from emulator.runs.report import ProgressLine, print_sweep
     from emulator.runs.sweep import grid_of, sweep_over
 
     options.trials = 1000 if options.trials is None else options.trials
     grid = grid_of(options.over)
     plan = _plan(options)
-    folder = options.out or default_folder(f"{Path(options.scenario).stem}-sweep")
-    with ProgressLine(0, "trial-slots", options.json) as line:
+    with (
+        results_folder(options.out, f"{Path(options.scenario).stem}-sweep") as folder,
+        ProgressLine(0, "trial-slots", options.json) as line,
+    ):
         table = sweep_over(options.scenario, _changes(options), grid, folder, line.tell, plan)
     if options.json:
         print(json.dumps(table.to_pylist(), ensure_ascii=False))
@@ -178,8 +181,8 @@ def sweep(options: argparse.Namespace) -> int:
 def compare(options: argparse.Namespace) -> int:
     """Compare schemes and adversaries."""
     from emulator.api import compare as compare_all
-    from emulator.api import default_folder
     from emulator.runs.compare_report import print_comparison
+    from emulator.runs.folder import results_folder
     from emulator.runs.montecarlo import Plan
     from emulator.runs.report import ProgressLine
     from emulator.scenario import value_of
@@ -193,8 +196,10 @@ def compare(options: argparse.Namespace) -> int:
                 f"--with {text}: expected SCHEME.PARAMETER=VALUE, such as innovation.state_probability=0.7"
             )
         parameters[key] = value_of(value)
-    folder = options.out or default_folder(f"compare-{Path(options.scenario).name}")
-    with ProgressLine(0, "trial-slots", options.json) as line:
+    with (
+        results_folder(options.out, f"compare-{Path(options.scenario).name}") as folder,
+        ProgressLine(0, "trial-slots", options.json) as line,
+    ):
         found = compare_all(
             options.scenario,
             schemes=_names(options.schemes),
@@ -253,27 +258,31 @@ def view(options: argparse.Namespace) -> int:
 
         print_results(options.run)
         return 0
+    from emulator.runs.results import load_results
+    from emulator.runs.signals import raise_on_signals
     from emulator.runs.viewer import Stand, open_run
 
     stand = None if options.serve is None else Stand.of(options.serve)
-    recording = options.run / "recording.rrd"
-    if recording.is_file() and not (options.run / "summary.json").is_file():
-        raise UsageError(
-            f"{options.run} has no summary.json yet: its run goes on, or was killed; look at it when it is over"
-        )
-    if not recording.is_file():
-        from emulator.view.replay import replay
+    results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
+    if results is not None:
+        print(f"evedrop: {results.remark}", file=sys.stderr)
+    with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+        recording = options.run / "recording.rrd"
+        if results is not None or not recording.is_file():
+            from emulator.view.replay import replay
+        if results is not None:  # that of a run that goes on is not ours to write, and that of a killed one has no end
+            recording = replay(options.run, Path(temporary) / "recording.rrd")
+        elif not recording.is_file():
+            recording = replay(options.run)
+        if options.picture is None:
+            viewer = open_run(options.run, options.view, stand, recording)
+            print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
+            _hold(viewer)
+            return 0
+        from emulator.view.picture import picture
 
-        recording = replay(options.run)
-    if options.picture is None:
-        viewer = open_run(options.run, options.view, stand)
-        print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
-        _hold(viewer)
-        return 0
-    from emulator.view.picture import picture
-
-    for complaint in picture(recording, options.picture, slot=options.slot):
-        print(complaint, file=sys.stderr)
+        for complaint in picture(recording, options.picture, slot=options.slot):
+            print(complaint, file=sys.stderr)
     return 0
 
 
@@ -282,8 +291,11 @@ def diff(options: argparse.Namespace) -> int:
     from emulator.runs.diff import difference
     from emulator.runs.results import load_results
 
-    found = difference(*(load_results(run) for run in options.runs))
+    runs = [load_results(run) for run in options.runs]
+    found = difference(*runs)
     print(found.text)
+    for remark in filter(None, (run.remark for run in runs)):
+        print(remark)
     return 0 if found.same else 1
 
 

@@ -13,8 +13,10 @@ from pathlib import Path
 
 from emulator.brief import Identity
 from emulator.errors import UsageError
+from emulator.files import Unreadable, is_folder, is_there, text_of
 
 _NAME = "control.json"
+_MOST_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -60,15 +62,15 @@ def read_control(folder: Path) -> Control:
     """The control file of a run that goes on. Raises UsageError if there is none, or it is none."""
     path = folder / _NAME
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(text_of(path, _MOST_BYTES))
         identity = found.get("identity")
         control = Control(**{**found, "identity": None if identity is None else Identity(**identity)})
-    except FileNotFoundError as error:
-        over = (folder / "summary.json").is_file()
-        why = "it is over" if over else f"it has no {_NAME} (yet)" if folder.is_dir() else "there is no such folder"
+    except Unreadable as error:
+        if is_there(path):
+            raise no_run(folder, f"{path.name} cannot be read ({error})") from error
+        over = is_there(folder / "summary.json")
+        why = "it is over" if over else f"it has no {_NAME} (yet)" if is_folder(folder) else "there is no such folder"
         raise no_run(folder, why) from error
-    except OSError as error:
-        raise no_run(folder, f"{path.name} cannot be read ({error.strerror})") from error
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise no_run(folder, f"{path.name} is not one ({error})") from error
     entries = asdict(control)

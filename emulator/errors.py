@@ -8,11 +8,21 @@ EvedropError                    exit status
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
-│   └── Gap                     3   a slot is missing, doubled or out of order
+│   ├── Gap                     3   a slot is missing, doubled or out of order
+│   ├── Refusal                 3   another process could not read a message
+│   ├── Contradiction           3   what a process says does not fit what it, or another one, has said
+│   └── Silence                 3   a process is on the network and does nothing
 └── Interrupted               130   the user ended the run; results so far are written
 """
 
 from __future__ import annotations
+
+MOST_MISTAKES = 100
+"""Of a scenario, in one message: nobody reads more at a time."""
+
+
+LONGEST_LINE = 900
+"""Characters of one mistake of a scenario."""
 
 
 class EvedropError(Exception):
@@ -28,11 +38,13 @@ class UsageError(EvedropError):
 
 
 class ScenarioError(UsageError):
-    """A scenario with mistakes: `mistakes` lists every one, a line each."""
+    """A scenario with mistakes: `mistakes` lists every one, a line each, up to `MOST_MISTAKES`."""
 
     def __init__(self, source: str, mistakes: list[str]) -> None:
         self.source = source
-        self.mistakes = mistakes
+        more = len(mistakes) - MOST_MISTAKES
+        short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
+        self.mistakes = short if more <= 0 else [*short, f"and {more} more"]
         count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
         super().__init__("\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in mistakes)]))
 
@@ -63,26 +75,61 @@ class BriefError(EvedropError):
 class RunError(EvedropError):
     """A process failed, or a packet is unaccounted for."""
 
+    at_fault: tuple[str, ...] = ()
+    """The processes that the error is about, if it says which."""
+
 
 class MalformedMessage(RunError):
-    """A message that breaks the protocol of docs/protocol.md."""
+    """A message that breaks the protocol of docs/protocol.md; `at_fault` names its sender, the only one who may write its key."""
 
-    def __init__(self, key: str, found: str, expected: str, payload: bytes) -> None:
+    def __init__(self, key: str, found: str, expected: str, payload: bytes, sender: str = "") -> None:
         shown = payload[:48].hex(" ") + (" …" if len(payload) > 48 else "")
         super().__init__(
             f"malformed message on {key}: {found}; expected {expected}. "
-            f"Its {len(payload)} bytes: {shown}. Check that its sender speaks docs/protocol.md"
+            f"Its {len(payload)} bytes: {shown}. Check that {sender or 'its sender'} speaks docs/protocol.md"
         )
+        self.key = key
+        self.at_fault = (sender,) if sender else ()
 
 
 class Gap(RunError):
     """A slot that is missing, doubled or out of order: the transport lost what the link did not."""
 
-    def __init__(self, key: str, expected: int, found: int) -> None:
+    def __init__(self, key: str, expected: int, found: int, sender: str = "") -> None:
         super().__init__(
             f"gap on {key}: slot {found} arrived where slot {expected} was due. No link loses whole messages, "
-            "so a process or the transport did; look at the logs of the sender and of the router"
+            f"so a process or the transport did; look at the logs of {sender or 'the sender'} and of the router"
         )
+        self.key = key
+        self.at_fault = (sender,) if sender else ()
+
+
+class Refusal(RunError):
+    """Another process could not read a message, and has said so before it ended."""
+
+    def __init__(self, process: str, key: str, sender: str, why: str) -> None:
+        """process: who refused it; key, sender: of the message; why: what the process said."""
+        self.at_fault = (sender,)
+        about = "" if key in why else f"malformed message on {key}: "
+        super().__init__(f"{about}{why} (refused by {process})")
+
+
+class Contradiction(RunError):
+    """What a process says does not fit what it has said before, or what another process says of the same slots."""
+
+    def __init__(self, process: str, what: str, against: str | None = None) -> None:
+        """against: the other process; None if the process contradicts itself."""
+        self.at_fault = (process,) if against is None else (process, against)
+        look = f"logs/{process}.log" if against is None else f"logs/{process}.log and logs/{against}.log"
+        super().__init__(f"{process} contradicts {against or 'itself'}: {what}; look at {look}")
+
+
+class Silence(RunError):
+    """Processes that are on the network and do nothing, while all others wait for them."""
+
+    def __init__(self, processes: tuple[str, ...], what: str) -> None:
+        self.at_fault = processes
+        super().__init__(f"{' and '.join(processes)}: {what}")
 
 
 class Interrupted(EvedropError):

@@ -6,7 +6,7 @@
 
 A name may have its unit beside it. Where the scenario says in which units disturbances are, the file must say so too; powers in
 W and kW are made what the scenario asks for. A column `time`, in seconds, shows where slots are missing. The file may be
-compressed (`.csv.gz`), may have other columns, and may be longer than the run.
+compressed (`.csv.gz`), may have other columns, and may be longer than the run: what comes after the last slot is not read.
 
 Source: docs/scenario.md, plant; docs/microgrid.md, a day of your own.
 """
@@ -14,17 +14,16 @@ Source: docs/scenario.md, plant; docs/microgrid.md, a day of your own.
 from __future__ import annotations
 
 import csv
-import gzip
-import io
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 from emulator.errors import DisturbanceError
+from emulator.files import Limit, Unreadable, lines_of
 
 _KILOWATTS = {"W": 1e-3, "kW": 1.0}
 _HEADER = re.compile(r"^(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]$")
@@ -32,13 +31,19 @@ _TIME = "time"
 _EXAMPLE = "time [s], P_solar [kW], P_load [kW]"
 _MOST_SAID = 5
 _TIME_ERROR = 1e-6  # of a slot: times may be rounded
+MOST_NUMBERS = 10_000_000
+"""Of a table of disturbances: slots times columns, a month of two columns by the second with room to spare."""
+_ROWS_UNASKED = 10_000  # of a scenario that does not say how many slots it has, which is a mistake of its own
 
 
 def found_file(name: str, folder: Path) -> Path:
     """Where a file that a scenario in this folder names is: in the folder, or else among those that are shipped."""
     beside = folder / name
     shipped = Path(str(resources.files("scenarios"))) / name
-    return shipped if not beside.exists() and shipped.is_file() else beside
+    try:
+        return shipped if not beside.exists() and shipped.is_file() else beside
+    except OSError:  # of a name that no file can have: who opens it says so
+        return beside
 
 
 def read_disturbances(
@@ -53,17 +58,28 @@ def read_disturbances(
     Raises DisturbanceError with every mistake: no file, missing columns, wrong units, what is no finite number, times that do
     not advance by `slot_seconds`, fewer rows than `slots`.
     """
-    rows = _rows(path)
-    if not rows:
+    most = MOST_NUMBERS // max(1, len(names))
+    if slots is not None and slots > most:
+        raise DisturbanceError(
+            str(path),
+            [
+                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or disturbances fewer"
+            ],
+        )
+    limit = _ROWS_UNASKED if slots is None else max(0, slots)
+    rows = _rows(path, limit)
+    head = next(rows, None)
+    if head is None:
         what = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
         raise DisturbanceError(str(path), [what])
-    columns, mistakes = _columns(rows[0], names, units)
+    columns, mistakes = _columns(head, names, units)
     if mistakes:
         raise DisturbanceError(str(path), mistakes)
-    numbers, mistakes = _numbers(rows[1:], len(rows[0].cells), columns)
-    timed = columns[0].name == _TIME and _TIME not in names
+    found = _numbers(islice(rows, limit), len(head.cells), columns)
+    numbers, mistakes = found.numbers, found.mistakes
+    timed = columns != [] and columns[0].name == _TIME and _TIME not in names
     if timed and not mistakes:
-        mistakes = list(_few(_time_mistakes(rows[1:], [row[0] for row in numbers], slot_seconds), "times"))
+        mistakes = list(_few(_time_mistakes(found.lines, [row[0] for row in numbers], slot_seconds), "times"))
     if not mistakes and slots is not None and len(numbers) < slots:
         few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
         mistakes = [f"{few}: a longer file, or --slots {len(numbers)}" if numbers else few]
@@ -95,20 +111,26 @@ class _Column:
     factor: float
 
 
-def _rows(path: Path) -> list[_Row]:
-    """Every line that is neither blank nor a comment."""
+@dataclass(frozen=True)
+class _Found:
+    """What the lines after the first have in them: a list of numbers for each, its line, and what is wrong."""
+
+    numbers: list[list[float]]
+    lines: list[int]
+    mistakes: list[str]
+
+
+def _rows(path: Path, slots: int) -> Iterator[_Row]:
+    """Every line that is neither blank nor a comment, of a file of so many slots. Raises DisturbanceError."""
     try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise ValueError("no file")  # a pipe or a device may never end
-        raw = path.read_bytes()
-        text = (gzip.decompress(raw) if path.suffix == ".gz" else raw).decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text), skipinitialspace=True)
-        rows = [_Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if any(cells)]
-    except (OSError, EOFError, ValueError, csv.Error) as error:
-        why = error.strerror if isinstance(error, OSError) and error.strerror else str(error).splitlines()[0]
-        what = f"cannot be read ({why}); expected a CSV file whose first line is such as {_EXAMPLE}"
+        reader = csv.reader(lines_of(path, Limit.of_rows(slots)), skipinitialspace=True)
+        for cells in reader:
+            row = _Row(reader.line_num, [cell.strip() for cell in cells])
+            if any(row.cells) and not row.cells[0].startswith("#"):
+                yield row
+    except (Unreadable, csv.Error) as error:
+        what = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
         raise DisturbanceError(str(path), [what]) from error
-    return [row for row in rows if any(row.cells) and not row.cells[0].startswith("#")]
 
 
 def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> tuple[list[_Column], list[str]]:
@@ -155,22 +177,28 @@ def _factor(unit: str | None, wanted: str | None) -> float | None:
     return None
 
 
-def _numbers(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> tuple[list[list[float]], list[str]]:
-    """A list for each line with the columns' values; and what is wrong with lines."""
+def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _Found:
+    """The columns' values of every line, and what is wrong with lines."""
     places = [(column.place, column.factor) for column in columns]
     numbers: list[list[float]] = []
+    lines: list[int] = []
     wrong: list[_Row] = []
+    all_lines = all_wrong = 0
     for row in rows:
+        all_lines += 1
         try:
             values = [float(row.cells[place]) * factor for place, factor in places]
         except (ValueError, IndexError):
-            wrong.append(row)
-            continue
+            values = [math.nan]
         if len(row.cells) == width and all(map(math.isfinite, values)):
             numbers.append(values)
-        else:
+            lines.append(row.line)
+            continue
+        all_wrong += 1
+        if all_wrong <= _MOST_SAID + 1:  # more are not told, and so need not be kept
             wrong.append(row)
-    return numbers, list(_few(_cell_mistakes(wrong, width, columns), f"{len(wrong)} of {len(rows)} lines"))
+    mistakes = list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines"))
+    return _Found(numbers, lines, mistakes)
 
 
 def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> Iterator[str]:
@@ -185,19 +213,20 @@ def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column])
                 yield f"line {row.line}: {column.name} is {shown}; expected a finite number"
 
 
-def _time_mistakes(rows: Sequence[_Row], times: Sequence[float], slot_seconds: float) -> Iterator[str]:
+def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float) -> Iterator[str]:
     """Where the time does not start at 0, or does not advance by a slot."""
     if times and times[0] != 0.0:
-        yield f"line {rows[0].line}: the time starts at {times[0]:.10g} s; expected 0, and every time less that"
-    for row, (before, time) in zip(rows[1:], pairwise(times), strict=True):
+        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, and every time less that"
+    for line, (before, time) in zip(lines[1:], pairwise(times), strict=True):
         if abs(time - before - slot_seconds) <= _TIME_ERROR * slot_seconds:
             continue
-        missing = round((time - before) / slot_seconds) - 1
+        slots = (time - before) / slot_seconds
+        missing = round(slots) - 1 if math.isfinite(slots) else 0
         what = "times must grow by a slot from line to line"
         if missing > 0:
-            what = f"a gap of {missing} slot{'' if missing == 1 else 's'}: fill it, such as with the line before"
+            what = f"a gap of {missing:.10g} slot{'' if missing == 1 else 's'}: fill it, such as with the line before"
         yield (
-            f"line {row.line}: the time is {time:.10g} s after {before:.10g} s; expected {before + slot_seconds:.10g} s, "
+            f"line {line}: the time is {time:.10g} s after {before:.10g} s; expected {before + slot_seconds:.10g} s, "
             f"for slots of {slot_seconds:.10g} s: {what}"
         )
 

@@ -6,8 +6,8 @@ Every import of weight waits for the command that needs it, so that a peer start
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
-import signal
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,9 @@ from emulator.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
     from emulator.brief import Brief
+
+
+_MOST_TOLD = 5  # mistakes of a scenario in a brief, which nobody wrote by hand
 
 
 def brief(options: argparse.Namespace) -> int:
@@ -38,7 +41,10 @@ def process(options: argparse.Namespace) -> int:
     from emulator.modules import look_in
 
     os.umask(0o077)  # whatever it writes is of the run, and nobody else's business
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from emulator.runs.signals import leave_on_signals
+
+    if options.role != "observer":  # which ends in order
+        leave_on_signals()
     brief = read_brief(options.brief, options.role)
     if getattr(options, "out", None) is not None:
         brief = replace(brief, part={**brief.part, "results": str(options.out)})
@@ -52,6 +58,7 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: Brief, serve: str | None) -> int:
     """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    from emulator.brief_use import expect_usable
     from emulator.model.registry import NotRegistered
 
     if brief.identity is not None:
@@ -72,16 +79,31 @@ def _play(brief: Brief, serve: str | None) -> int:
         case "controller":
             from peers.controller import steer as play
         case "observer":
-            from emulator.runs.observer import observe
+            from emulator.runs.heartbeat import Heartbeat
 
-            return observe(brief, serve)
+            with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
+                return _observe(brief, serve)
         case _:
             raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
     try:
+        expect_usable(brief)
         play(brief)
     except NotRegistered as error:
         raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
     return 0
+
+
+def _observe(brief: Brief, serve: str | None) -> int:
+    from pydantic import ValidationError
+
+    from emulator.runs.observer import observe
+    from emulator.scenario.mistakes import sentences
+
+    try:
+        return observe(brief, serve)
+    except ValidationError as error:
+        lines = "; ".join(sentences(error)[:_MOST_TOLD])
+        raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
 
 
 def health(options: argparse.Namespace) -> int:

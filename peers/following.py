@@ -51,6 +51,7 @@ def follow(
         session.ready()
         k = brief.first
         while k < brief.slots:
+            session.place.slot = k
             message = Reader(downlink, deliveries.recv())
             found = message.integer("k")
             if is_hold(message):
@@ -75,7 +76,7 @@ def follow(
                     answers.had(found, message)
                 due.missed(k, found)
                 continue
-            arrival = read_delivery(message, k, shape, brief.model.header)
+            arrival = read_delivery(message, k, shape, brief.model.header, window)
             answers.before(k, arrival)
             belief = follower.take(k, arrival)
             answers.after(k, belief)

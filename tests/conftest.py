@@ -158,6 +158,8 @@ class Live:
 
 
 TELLING = """
+from emulator.entry import heed_signals
+heed_signals()
 import resource, sys
 from pathlib import Path
 from emulator.cli import main

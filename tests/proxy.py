@@ -33,6 +33,11 @@ class Cable:
         return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
+    def port(self) -> int:
+        """Where it leads to."""
+        return self._port
+
+    @property
     def connections(self) -> int:
         """How many there are."""
         return len(self._ends) // 2

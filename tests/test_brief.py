@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 from emulator.brief import Brief, Flow, Model, read_brief
+from emulator.brief_use import expect_usable
 from emulator.errors import BriefError
 from emulator.runs.briefs import Observation, StreamKeys, briefs_of
-from emulator.scenario import Scenario
+from emulator.scenario import Scenario, load
+from tests.conftest import Evedrop
 
 BRIEF = Brief(
     run="r01",
@@ -216,3 +219,114 @@ def test_model_is_the_only_thing_all_share() -> None:
         "window": 0,
         "outages": [],
     }
+
+
+OPTIONAL = {
+    "first",
+    "patience",
+    "identity",
+    "modules",
+    "header",
+    "singular_noise",
+    "longest_outage",
+    "largest_message",
+    "measurement",
+}
+"""Entries that a brief may leave out, or whose meaning another one gives."""
+WITHIN = ("part.scenario", "part.assignment.parameters", "part.parameters", "part.scheme", "model.A", "model.Q")
+"""Tables whose entries are those of the scenario, looked at by whoever makes something of them, and matrices."""
+KINDS = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart")
+
+
+def every_brief() -> dict[str, dict[str, Any]]:
+    """Briefs of scenarios of many kinds, as JSON, by scenario and process."""
+    found = {}
+    for name in KINDS:
+        scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
+        for process, brief in made(scenario).items():
+            found[f"{name}/{process}"] = json.loads(json.dumps(asdict(brief)))
+    return found
+
+
+def entries(table: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Dotted path, table and name of every entry that is there by name."""
+    if isinstance(table, dict):
+        for name, inner in table.items():
+            yield f"{path}{name}", table, name
+            if f"{path}{name}" not in WITHIN:
+                yield from entries(inner, f"{path}{name}.")
+
+
+def refusal(found: dict[str, Any], folder: Path) -> str | None:
+    """What is said of a brief; None if it can be used."""
+    path = folder / "brief.json"
+    path.write_text(json.dumps(found))
+    path.chmod(0o600)
+    try:
+        expect_usable(read_brief(path))
+    except BriefError as error:
+        return str(error)
+    return None
+
+
+BRIEFS = every_brief()
+
+
+@pytest.mark.parametrize("name", BRIEFS)
+def test_every_brief_lacks_nothing_unnoticed(name: str, tmp_path: Path) -> None:
+    """Each of its entries and keys, left out or of another type, is refused and named; the whole brief can be used."""
+    found = BRIEFS[name]
+    assert refusal(found, tmp_path) is None
+    for path, table, entry in list(entries(found)):
+        before = table.pop(entry)
+        without = refusal(found, tmp_path)
+        shared = path.split(".")[0] in ("keys",) or path.startswith(("part.users.", "part.leaks.", "part.links."))
+        if entry not in OPTIONAL and not shared:
+            assert without is not None, path
+            assert path in without, (path, without)
+        for other in ([["x"]], {"x": {"y": []}}, "\x00", -1.5):
+            table[entry] = other
+            refused = refusal(found, tmp_path)  # whatever it is, nothing but a BriefError
+            if not isinstance(other, type(before)) and before is not None and path not in ("part.modules",):
+                assert refused is not None or isinstance(before, float), (path, other)
+        table[entry] = before
+
+
+@pytest.mark.parametrize("name", [one for one in BRIEFS if BRIEFS[one]["keys"]])
+def test_a_brief_without_its_key_is_refused(name: str, tmp_path: Path) -> None:
+    """The key is named, not what it would have been; a KeyError comes from nowhere."""
+    found = json.loads(json.dumps(BRIEFS[name]))
+    for stream, key in list(found["keys"].items()):
+        del found["keys"][stream]
+        said = refusal(found, tmp_path)
+        assert said is not None, stream
+        assert f"keys.{stream} is missing" in said
+        assert key not in said
+        found["keys"][stream] = key
+
+
+def test_a_process_without_its_key_ends_with_status_2(evedrop: Evedrop) -> None:
+    """Typed as a user does it: one line, before it waits for anybody."""
+    for process, stream in (("sensor", "process"), ("smart", "schedule"), ("router", "link/legitimate")):
+        brief = made(scenario_of())[process]
+        path = replace(brief, keys={name: key for name, key in brief.keys.items() if name != stream}).write(
+            evedrop.folder
+        )
+        done = evedrop(brief.role, str(path))
+        assert done.status == 2
+        assert done.err.count("\n") == 1
+        assert f"keys.{stream} is missing, and {process} cannot work without it; write it again" in done.err
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
+def test_a_brief_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
+    """At once, and without waiting for somebody who writes to it."""
+    path = tmp_path / "sensor.json"
+    if kind == "pipe":
+        os.mkfifo(path, 0o600)
+    elif kind == "folder":
+        path.mkdir(0o700)
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(BriefError, match=r"it is a (pipe or a device|folder)"):
+        read_brief(path)

@@ -99,7 +99,7 @@ def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
     found = loaded_by("pytest", "emulator.pytest_plugin")
     more = found["emulator.pytest_plugin"] - found["pytest"]
     assert packages(more) == set()
-    assert ours(more) == {"emulator.pytest_plugin", "emulator.collect"}
+    assert ours(more) == {"emulator.pytest_plugin", "emulator.collect", "emulator.files"}
 
 
 def test_only_the_view_loads_rerun_and_matplotlib() -> None:

@@ -91,7 +91,7 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
         'line 1: the column "P_load" has no unit',
     ]
     rows = "".join(f"{k},x,{'y' if k == 1 else 1}\n" for k in range(20))
-    found = mistakes(write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}"))
+    found = mistakes(write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}"), 20)
     assert found[1:3] == [
         'line 3: P_solar is "x"; expected a finite number',
         'line 3: P_load is "y"; expected a finite number',

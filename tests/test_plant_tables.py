@@ -291,7 +291,7 @@ def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
     """A pipe that nobody writes to is refused at once."""
     os.mkfifo(tmp_path / "pipe.csv")
     (mistake,) = mistakes(plant__disturbance_values=None, plant__disturbance_file=str(tmp_path / "pipe.csv"))
-    assert "pipe.csv cannot be read (no file); expected a CSV file" in mistake
+    assert "pipe.csv cannot be read (it is a pipe or a device, not a file); expected a CSV file" in mistake
 
 
 def test_a_file_that_is_not_there_is_told() -> None:

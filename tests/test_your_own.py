@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from emulator.errors import ScenarioError
+from emulator.model.eavesdroppers import ANSWERS
 from emulator.runs.results import load_results
 from emulator.scenario import load
 from emulator.scenario.amended import with_event
@@ -46,8 +47,10 @@ link = { quality = 0.8 }
 def _imports_forgotten(tmp_path: Path) -> Iterator[None]:
     """What a test imports from its folder is no other test's."""
     before = list(sys.path)
+    ANSWERS.forget()
     yield
     sys.path[:] = before
+    ANSWERS.forget()
     for name, module in list(sys.modules.items()):
         if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
             del sys.modules[name]
@@ -220,7 +223,27 @@ MISTAKES = {
     "fate": ("link", "Mine(Bernoulli):\n    parameters = {}\n    def __init__(self): super().__init__(0.9)\n"
              "    def fates(self, first, uniforms): return uniforms[:, 0] < 0.9", "has type bool; expected uint8"),
     "quality": ("link", "Mine(Bernoulli):\n    parameters = {}\n    quality = 1.5\n    def __init__(self): super().__init__(0.9)",
-                "expected probabilities"),
+                "quality is 1.5; expected a number from 0 to 1"),
+    "outcomes": ("scheme", "Mine(Plain):\n    def outcomes(self, mu): return 'always'",
+                 "outcomes(0.0) is 'always'; expected Outcomes, or None: no closed form"),
+    "odds": ("scheme", "Mine(Plain):\n    def outcomes(self, mu):\n"
+             "        return super().outcomes(mu).__class__(float('nan'), 0.0, 0.0, 0.0, 0.0)",
+             "outcomes(0.0).predicted is nan; expected a probability, or None in place of Outcomes"),
+    "secret": ("scheme", "Mine(Plain):\n    secret_streams = 'schedule'",
+               "secret_streams is 'schedule'; expected a tuple of names, each once, such as ('schedule',)"),
+    "secrets": ("scheme", "Mine(Plain):\n    secret_streams = None", "secret_streams is None; expected a tuple of names"),
+    "numbered": ("scheme", "Mine(Plain):\n    secret_streams = estimator_streams = (3,)", "secret_streams is (3,); expected a"),
+    "silence": ("scheme", "Mine(Plain):\n    may_be_silent = 'no'", "may_be_silent is 'no'; expected True or False"),
+    "number": ("eavesdropper", "Mine(Naive):\n    @classmethod\n    def outcomes(cls, parameters, mu_d): return 0.5",
+               "outcomes() is float; expected a function of the link's quality that gives Outcomes"),
+    "told": ("eavesdropper", "Mine(Naive):\n    @classmethod\n    def streams(cls, parameters): return 'coin'",
+             "streams() is 'coin'; expected a tuple of names"),
+    "good": ("link", "Mine(Bernoulli):\n    parameters = {}\n    quality = 'good'\n    def __init__(self): super().__init__(0.9)",
+             "quality is 'good'; expected a number from 0 to 1"),
+    "chain": ("link", "Mine(Bernoulli):\n    parameters = {}\n    chain = (1, 2)\n    def __init__(self): super().__init__(0.9)",
+              "in a dry run: "),
+    "soon": ("delay", "Mine(Constant):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
+             "    def arrived(self, lag): return 'soon'", "arrived(0) is 'soon'; expected a number from 0 to 1"),
     "late": ("delay", "Mine(Constant):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
              "    def delays(self, first, numbers): return -numbers", "expected slots, 0 or more"),
 }  # fmt: skip
@@ -236,20 +259,11 @@ def test_a_mistake_in_a_class_is_named_before_anything_starts(case: str, evedrop
     if kind == "link":
         given = {"legitimate.link": f'{{loss = {{model = "case_{case}:Mine"}}}}'}
     changes = [word for key, value in given.items() for word in ("--set", f"{key}={value}")]
-    with pytest.warns(RuntimeWarning) if case == "infinite" else _nothing():
-        done = evedrop("run", "mine.toml", "--view", "off", "--out", "run", *changes)
+    done = evedrop("run", "mine.toml", "--view", "off", "--out", "run", *changes)
     assert done.status == 2, done.err
     line = next(line for line in done.err.splitlines() if said in line)
     assert line.startswith(("  encoding.", f"  {ENTRY[kind]}: is"))
     assert not (evedrop.folder / "run").exists()
-
-
-class _nothing:  # noqa: N801 - a block that expects nothing
-    def __enter__(self) -> None:
-        """Nothing."""
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing."""
 
 
 @pytest.mark.parametrize("name", ["mine", "nowhere.at.all:Mine", "mine:", ":Mine", "__main__:Mine", "os:path"])
@@ -275,6 +289,17 @@ def test_one_name_is_one_module(evedrop: Evedrop) -> None:
     assert done.status == 2
     assert "another one of this name is loaded already" in done.err
     assert evedrop.process("check", "there/s.toml").status == 0
+
+
+@pytest.mark.parametrize("name", ["json", "wave", "zenoh"])
+@pytest.mark.parametrize("entry", ["encoding.scheme", "eavesdroppers.eve.strategy"])
+def test_a_module_called_like_an_installed_one_is_refused(name: str, entry: str, evedrop: Evedrop) -> None:
+    """Nothing in a folder of modules stands in place of Python's or a library's."""
+    (evedrop.folder / f"{name}.py").write_text(f"{HEAD}\n\nclass Mine(Plain):\n    pass\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO)
+    done = evedrop("check", "mine.toml", "--set", f"{entry}={name}:Mine")
+    assert done.status == 2
+    assert re.search(f"has a module {name} .*another one of this name is (loaded already|installed)", done.err)
 
 
 def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -> None:
@@ -329,6 +354,79 @@ def test_another_shape_in_a_later_slot_is_not_sent(evedrop: Evedrop) -> None:
     assert live.status == 3
     assert "slot 30: encode of the scheme turns:Turns gave z of shape (4, 2); expected (2, 4)" in live.err
     assert evedrop("montecarlo", "mine.toml", "--trials", "4", "--out", "memory").status == 3
+
+
+LATER = {
+    "packet": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
+               "        return Packet(x * (np.nan if k == 30 else 1.0), np.zeros(x.shape[1], bool))",
+               "the scheme later_packet:Mine failed in slot 30, trials {trials}: Packet.z, trial 5, is nan; expected finite"),
+    "turned": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
+               "        return Packet(x[:1] if k == 30 else x, np.zeros(x.shape[1], bool))",
+               "the scheme later_turned:Mine failed in slot 30, trials {trials}: Packet.z has shape (1, "),
+    "raised": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
+               "        return Packet(x / [1.0 if k < 30 else None], np.zeros(x.shape[1], bool))",
+               "the scheme later_raised:Mine failed in slot 30, trials {trials}: TypeError: "),
+    "belief": ("eavesdroppers.eve.strategy", "Mine(Naive):\n    def step(self, k, belief, heard):\n"
+               "        after = super().step(k, belief, heard)\n"
+               "        return after if k != 30 else after._replace(x_hat=after.x_hat * np.nan)",
+               "eve's strategy later_belief:Mine failed in slot 30, trials {trials}: Belief.x_hat, trial 5, is nan"),
+    "type": ("eavesdroppers.eve.strategy", "Mine(Naive):\n    def step(self, k, belief, heard):\n"
+             "        after = super().step(k, belief, heard)\n"
+             "        return after if k != 30 else after._replace(P=after.P.astype(np.float32))",
+             "eve's strategy later_type:Mine failed in slot 30, trials {trials}: Belief.P has type float32; expected float64"),
+    "fates": ("legitimate.link.loss.model", "Mine(Bernoulli):\n    parameters = {}\n"
+              "    def __init__(self): super().__init__(0.9)\n    def fates(self, first, uniforms):\n"
+              "        return super().fates(first, uniforms) if first < 32 else 1 / 0",
+              "legitimate's link (later_fates:Mine) failed in slots 32 to 63, trials {trials}: ZeroDivisionError: "),
+}  # fmt: skip
+"""What of a class goes wrong in a later slot than the dry run sees → the entry, the class, what is said."""
+
+
+def later(evedrop: Evedrop, case: str) -> tuple[str, ...]:
+    """Write the scenario and the class of a case; the changes that name it."""
+    entry, body, _ = LATER[case]
+    (evedrop.folder / f"later_{case}.py").write_text(f"{HEAD}\n\nclass {body}\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO.replace("slots = 40", "slots = 100\nfirst_trial = 5"))
+    if entry == ENTRY["link"]:
+        return ("--set", f'legitimate.link={{loss = {{model = "later_{case}:Mine"}}}}')
+    return ("--set", f"{entry}=later_{case}:Mine")
+
+
+@pytest.mark.parametrize("case", LATER)
+def test_what_breaks_in_a_later_slot_ends_a_study_in_memory(case: str, evedrop: Evedrop) -> None:
+    """Status 3, as live, with class, slot and trials; and never an exit as if all were well."""
+    changes = later(evedrop, case)
+    assert evedrop("check", "mine.toml", *changes).status == 0
+    done = evedrop("montecarlo", "mine.toml", "--trials", "20", "--out", "memory", *changes)
+    assert done.status == 3
+    assert LATER[case][2].format(trials="5 to 24") in done.err
+    assert "Traceback" not in done.err
+    assert not (evedrop.folder / "memory").exists()
+
+
+@pytest.mark.parametrize(
+    ("case", "words", "trials"),
+    [
+        ("packet", ("montecarlo", "--trials", "600", "--workers", "2"), "5 to 504"),
+        ("packet", ("sweep", "--over", "seed=1,2", "--trials", "20"), "5 to 24"),
+        ("packet", ("test", "--in-memory"), "5 to 7"),
+        ("fates", ("compare", "--schemes", "plain", "--adversaries", "naive"), "5 to 204"),
+    ],
+    ids=lambda one: one[0] if isinstance(one, tuple) else "",
+)
+def test_every_command_in_memory_names_class_slot_and_trials(
+    case: str, words: tuple[str, ...], trials: str, evedrop: Evedrop
+) -> None:
+    """A worker process, a sweep, a test and a comparison say what a study does."""
+    changes = later(evedrop, case)
+    if words[0] == "test":
+        text = (evedrop.folder / "mine.toml").read_text().replace('"plain"', '"later_packet:Mine"')
+        (evedrop.folder / "mine.toml").write_text(text)
+        changes = ()
+    done = evedrop(words[0], "mine.toml", *words[1:], "--out", "out", *changes)
+    assert done.status == 3
+    assert LATER[case][2].format(trials=trials) in done.err + done.out
+    assert "Traceback" not in done.err
 
 
 def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedrop) -> None:

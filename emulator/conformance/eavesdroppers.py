@@ -15,7 +15,19 @@ import numpy as np
 from emulator.conformance.packets import SchemeOf, Slot, expect_belief, frozen_belief, made, played, row_of
 from emulator.conformance.problems import Problem, large, small
 from emulator.conformance.receivers import Step, expect_actions, expect_expected, expect_pure
-from emulator.conformance.rules import Broken, Keys, Row, Verdict, calling, expect_same, frozen, judged
+from emulator.conformance.rules import (
+    Broken,
+    Keys,
+    Row,
+    Verdict,
+    calling,
+    expect_bool,
+    expect_names,
+    expect_outcomes,
+    expect_same,
+    frozen,
+    judged,
+)
 from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.schemes.scheme import Scheme
@@ -102,13 +114,28 @@ class EavesdropperChecks:
 
     def shapes(self, problem: Problem) -> None:
         """Everything has the shape and type that it must have, and no input is changed."""
-        self._rows(problem)
         kind, parameters = self._listening.kind, self._listening.parameters
+        with calling("streams()", kind):
+            streams = kind.streams(parameters)
+        expect_names("streams()", streams)
+        self._rows(problem)
         with calling("outcomes() and follows_gamma()", kind):
-            kind.outcomes(parameters, 0.5)
+            outcomes_at = kind.outcomes(parameters, 0.5)
             follows = kind.follows_gamma(parameters)
-        if not isinstance(follows, bool):
-            raise Broken(f"follows_gamma() is {follows!r}; expected True or False")
+        if outcomes_at is not None and not callable(outcomes_at):
+            raise Broken(
+                f"outcomes() is {type(outcomes_at).__name__}; expected a function of the link's quality that gives Outcomes, "
+                "or None: no closed form"
+            )
+        for mu_e in (0.0, 0.5, 1.0) if outcomes_at is not None else ():
+            with calling("what outcomes() returned", kind):
+                found = outcomes_at(mu_e)  # type: ignore[misc]
+            if found is None:
+                raise Broken(
+                    f"outcomes() gives None for the quality {mu_e}; expected Outcomes, or None in its own place"
+                )
+            expect_outcomes(f"outcomes() of the quality {mu_e}", found)
+        expect_bool("follows_gamma()", follows)
 
     def twice(self, problem: Problem) -> None:
         """Two that work in turns do what one does by itself."""

@@ -20,13 +20,14 @@ from emulator.conformance.rules import (
     calling,
     expect_array,
     expect_finite,
+    expect_probability,
     expect_same,
     frozen,
     judged,
     key,
 )
 from emulator.model.delays.delay import DelayModel
-from emulator.model.links.link import Fate, LossModel
+from emulator.model.links.link import Chain, Fate, LossModel
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
 from emulator.streams import BlockReader
@@ -90,6 +91,7 @@ class LossChecks:
         with calling("quality, quality_at(), rate_variance()", self._kind):
             quality, each, variance = model.quality, model.quality_at(slots), model.rate_variance(slots)
             settles, memoryless, chain = model.settles, model.memoryless, model.chain
+        expect_probability("quality", quality)
         expect_array("quality_at()", each, np.float64, (len(slots),), "one for each of the slots")
         if not 0.0 <= quality <= 1.0 or not ((each >= 0.0) & (each <= 1.0)).all():
             raise Broken(
@@ -99,6 +101,8 @@ class LossChecks:
             raise Broken(f"rate_variance() is {variance}; expected a variance of a fraction, 0 to 0.25")
         if type(settles) is not bool or type(memoryless) is not bool:
             raise Broken("settles or memoryless is neither True nor False")
+        if chain is not None and not isinstance(chain, Chain):
+            raise Broken(f"chain is {type(chain).__name__}; expected a Chain, or None")
         if chain is not None and not np.allclose(chain.law @ chain.transitions, chain.law):
             raise Broken("chain.law is not the stationary law of chain.transitions; correct them, or return None")
 
@@ -201,6 +205,9 @@ class DelayChecks:
         with calling("arrived()", self._kind):
             said = [self._model().arrived(lag) for lag in range(4)]
         known = [one for one in said if one is not None]
+        for lag, one in enumerate(said):
+            if one is not None:
+                expect_probability(f"arrived({lag})", one)
         if known and (len(known) < len(said) or known != sorted(known) or not 0.0 <= known[0] <= known[-1] <= 1.0):
             raise Broken(f"arrived() of 0 to 3 is {said}; expected probabilities that do not fall, or None always")
 

@@ -143,7 +143,7 @@ def expect_packet(k: int, packet: Any, scheme: Scheme, problem: Problem) -> None
         )
     if packet.sent is not None:
         expect_array(f"slot {k}: Packet.sent", packet.sent, np.bool_, (trials,), _TRIALS)
-    expect_finite(f"slot {k}: Packet.z", packet.z)
+    expect_finite(f"slot {k}: Packet.z", packet.z, problem.batch.first_trial)
 
 
 def expect_belief(where: str, belief: Any, problem: Problem) -> None:
@@ -154,8 +154,8 @@ def expect_belief(where: str, belief: Any, problem: Problem) -> None:
     expect_array(f"{where}.x_hat", belief.x_hat, np.float64, (n, trials), "n states, R trials")
     expect_array(f"{where}.P", belief.P, np.float64, (n, n, trials), "a matrix for each of the R trials")
     expect_array(f"{where}.action", belief.action, np.uint8, (trials,), "an `Action` for each of the R trials")
-    expect_finite(f"{where}.x_hat", belief.x_hat)
-    expect_finite(f"{where}.P", belief.P)
+    expect_finite(f"{where}.x_hat", belief.x_hat, problem.batch.first_trial)
+    expect_finite(f"{where}.P", belief.P, problem.batch.first_trial)
     for i, array in enumerate(belief.memory):
         if not isinstance(array, np.ndarray) or array.shape[-1:] != (trials,):
             raise Broken(f"{where}.memory[{i}] is no array whose last axis is the {trials} trials")

@@ -5,17 +5,20 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.registry import place_of
+from emulator.model.theory import Outcomes
 from emulator.streams import root_of_seed, stream_key
 
 Array = NDArray[Any]
 _ROOT = root_of_seed(0)
+_SHOWN = 60  # characters of a value that a message repeats
+_SLACK = 1e-9  # of a probability, for rounding
 
 
 class Broken(Exception):
@@ -91,16 +94,56 @@ def expect_array(where: str, found: Any, dtype: Any, shape: tuple[int, ...], mea
         )
 
 
-def expect_finite(where: str, found: Array) -> None:
-    """Raise Broken where a number is not finite; the last axis is the trials."""
+def expect_finite(where: str, found: Array, first: int = 0) -> None:
+    """Raise Broken where a number is not finite; the last axis is the trials, from this first one on."""
     bad = ~np.isfinite(found)
     if bad.any():
-        trial = int(np.argwhere(bad)[0][-1])
+        trial = first + int(np.argwhere(bad)[0][-1])
         raise Broken(f"{where}, trial {trial}, is {found[bad].flat[0]}; expected finite numbers")
 
 
 Row = Mapping[str, Array]
 """What was done in one slot: name → array whose last axis is the trials."""
+
+
+def expect_names(where: str, found: Any) -> None:
+    """Raise Broken unless something is a tuple of names, each once."""
+    names = isinstance(found, (tuple, list)) and all(isinstance(name, str) and name for name in found)
+    if not names or len(set(found)) < len(found):
+        raise Broken(f"{where} is {_short(found)}; expected a tuple of names, each once, such as ('schedule',)")
+
+
+def expect_bool(where: str, found: Any) -> None:
+    """Raise Broken unless something is True or False."""
+    if type(found) is not bool:
+        raise Broken(f"{where} is {_short(found)}; expected True or False")
+
+
+def expect_probability(where: str, found: Any) -> None:
+    """Raise Broken unless something is a number from 0 to 1."""
+    if isinstance(found, bool) or not isinstance(found, (int, float, np.floating)) or not 0.0 <= found <= 1.0:
+        raise Broken(f"{where} is {_short(found)}; expected a number from 0 to 1")
+
+
+def expect_outcomes(where: str, found: Any) -> None:
+    """Raise Broken unless something is `Outcomes` of probabilities, or None."""
+    if found is None:
+        return
+    if not isinstance(found, Outcomes):
+        raise Broken(f"{where} is {_short(found)}; expected Outcomes, or None: no closed form")
+    for one in fields(Outcomes):
+        value = getattr(found, one.name)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float, np.floating))
+            or not -_SLACK <= value <= 1 + _SLACK
+        ):
+            raise Broken(f"{where}.{one.name} is {_short(value)}; expected a probability, or None in place of Outcomes")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
 def expect_same(one: Sequence[Row], other: Sequence[Row], trials: slice, first: int, said: str, remedy: str) -> None:
@@ -141,11 +184,17 @@ def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[Verdict]:
 
 
 def _how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
+    how = how_broken(check, problem)
+    return None if how is None else f"{problem}: {how}"
+
+
+def how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
+    """How a rule is broken on a problem; None if it is kept."""
     try:
         check(problem)
     except Broken as error:
-        return f"{problem}: {error}"
+        return str(error)
     except Exception as error:
         # What it gave us may break at any place, ours included.
-        return f"{problem}: what it returned led to {place_of(error)}; expected what the base class describes"
+        return f"what it returned led to {place_of(error)}; expected what the base class describes"
     return None

@@ -10,7 +10,18 @@ import numpy as np
 from emulator.conformance.packets import SchemeOf, Slot, made, played, row_of
 from emulator.conformance.problems import Problem, large, small
 from emulator.conformance.receivers import SIGMAS, expect_actions, expect_expected, expect_pure
-from emulator.conformance.rules import Broken, Keys, Verdict, calling, expect_same, judged
+from emulator.conformance.rules import (
+    Broken,
+    Keys,
+    Verdict,
+    calling,
+    expect_bool,
+    expect_names,
+    expect_outcomes,
+    expect_probability,
+    expect_same,
+    judged,
+)
 from emulator.model.outcomes import legitimate_outcomes
 from emulator.model.schemes.scheme import Scheme
 
@@ -18,6 +29,7 @@ _COLUMN = (
     "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "
     "batch's trials"
 )
+_QUALITIES = (0.0, 0.5, 1.0)
 _STATE = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
 
 
@@ -49,17 +61,29 @@ class SchemeChecks:
 
     def shapes(self, problem: Problem) -> None:
         """Everything has the shape and type that it must have, made together and apart, and no input is changed."""
+        for name in ("secret_streams", "estimator_streams", "header"):
+            expect_names(name, getattr(self._kind, name))
+        for name in ("needs_acknowledgements", "reads_packets", "may_be_silent"):
+            expect_bool(name, getattr(self._kind, name))
         scheme = made(self._scheme_of, problem, self._kind)
         more = sorted(set(scheme.estimator_streams) - set(scheme.secret_streams))
         if more:
             raise Broken(f"estimator_streams has {more}, which secret_streams has not; expected some of those")
-        if not 0.0 <= scheme.state_probability <= 1.0:
-            raise Broken(f"state_probability is {scheme.state_probability}; expected a probability")
+        expect_probability("state_probability", scheme.state_probability)
         for apart in (False, True):
             for _ in played(self._scheme_of, problem, self._kind, apart=apart):
                 pass
-        with calling("outcomes()", self._kind):
-            scheme.outcomes(0.5)
+        for mu in _QUALITIES:
+            with calling("outcomes()", self._kind):
+                found = scheme.outcomes(mu)
+            expect_outcomes(f"outcomes({mu})", found)
+            with calling("eavesdropper_outcomes()", self._kind):
+                theirs = scheme.eavesdropper_outcomes(mu, 1.0, 1.0)
+            expect_outcomes(f"eavesdropper_outcomes({mu}, 1.0, 1.0)", theirs)
+        with calling("packet_bits, secret_bits and initial_secret_bits", self._kind):
+            bits = (scheme.packet_bits, scheme.secret_bits, scheme.initial_secret_bits)
+        if any(type(one) is not int or one < 0 for one in bits):
+            raise Broken(f"packet_bits, secret_bits and initial_secret_bits are {bits!r:.80}; expected whole numbers")
 
     def twice(self, problem: Problem) -> None:
         """Two that work in turns do what one does by itself."""

@@ -10,9 +10,10 @@ Source: docs/results.md, digests.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from hashlib import sha256
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,28 @@ class Rows(NamedTuple):
 def block_starts(slots: int, cuts: Iterable[int] = ()) -> list[int]:
     """The first slots of a run's blocks; cuts: where an outage of the receiver begins or ends."""
     return sorted({*range(0, slots, BLOCK_SLOTS), *(cut for cut in cuts if 0 < cut < slots)})
+
+
+@final
+class Blocks:
+    """The blocks of a run for one receiver."""
+
+    def __init__(self, slots: int, cuts: Iterable[int] = ()) -> None:
+        """cuts: as in `block_starts`."""
+        self._bounds = [*block_starts(slots, cuts), slots]
+
+    def end(self, k: int) -> int:
+        """The slot after the block in which slot k is."""
+        return self._bounds[bisect_right(self._bounds, k)]
+
+    def start(self, k: int) -> int:
+        """The first slot of the block in which slot k is."""
+        return self._bounds[bisect_right(self._bounds, k) - 1]
+
+    def ended(self, first: int, end: int) -> list[int]:
+        """The first slots of the blocks whose last slot is one of first … end − 1."""
+        bounds = self._bounds
+        return [bounds[i - 1] for i in range(bisect_right(bounds, first), bisect_right(bounds, end)) if i > 0]
 
 
 class BeliefLog:
@@ -97,11 +120,36 @@ class InputLog:
         return k - row, _digests(self._failed[: row + 1], [self._u[: row + 1]])
 
 
+@final
+class PartialDigests:
+    """The digests of one block whose slots come in parts."""
+
+    def __init__(self, trials: int) -> None:
+        self._hashes = [sha256() for _ in range(trials)]
+
+    def add(self, x_hat: Floats, P: Floats, action: Codes) -> None:
+        """Take the next slots: x̂ (c, n, R), P (c, n, n, R) and action (c, R)."""
+        c, n, trials = x_hat.shape
+        for row, record in _records(action != Action.LOST, [x_hat, P.reshape(c, n * n, trials)]):
+            self._hashes[row].update(record)
+
+    def digests(self) -> Digests:
+        """Those of all slots so far, (R, 32)."""
+        return np.array([np.frombuffer(one.digest(), np.uint8) for one in self._hashes])
+
+
 def _digests(marks: Flags, numbers: Sequence[Floats]) -> Digests:
     """The digest of every trial, (R, 32), over marks (c, R) and numbers, each (c, …, R), slot by slot."""
+    digests = np.empty((marks.shape[1], DIGEST_BYTES), np.uint8)
+    for row, record in _records(marks, numbers):
+        digests[row] = np.frombuffer(sha256(record).digest(), np.uint8)
+    return digests
+
+
+def _records(marks: Flags, numbers: Sequence[Floats]) -> Iterator[tuple[int, memoryview]]:
+    """Trial and bytes to be digested, for every trial; the bytes are overwritten as the next tile of trials comes."""
     length, trials = marks.shape
     width = sum(one.shape[1] for one in numbers)
-    digests = np.empty((trials, DIGEST_BYTES), np.uint8)
     ordered = np.empty((_TILE, length, width), "<f8")
     records = np.empty((_TILE, length, 1 + ordered.itemsize * width), np.uint8)
     for start in range(0, trials, _TILE):
@@ -115,8 +163,7 @@ def _digests(marks: Flags, numbers: Sequence[Floats]) -> Digests:
         records[rows, :, 0] = marks[:, tile].T
         records[rows, :, 1:] = ordered[rows].view(np.uint8)
         for row, record in enumerate(records[rows], start):
-            digests[row] = np.frombuffer(sha256(record.data).digest(), np.uint8)
-    return digests
+            yield row, record.data
 
 
 class RunDigest:

@@ -19,6 +19,10 @@ from emulator.streams import Batch, BlockReader
 
 _SETTLED = 1e-14
 _LONGEST = 200_000  # slots after which a filter counts as never settled
+_LONGEST_OF_MANY = 4_000  # the same of one with more than some states or measurements, whose slots take longer
+_SOME = 4
+MOST_STATES = 16
+"""Of a filter, and measurements: it is worked out in plain arithmetic, which takes time that grows with their cube."""
 _JUDGED = 32_768  # slots after which one that does not even come nearer does
 _NEARER = (
     0.45  # what is left of it by then, as 1/k: ½ of the last halving; as an exponential of any use: ⅓; as k: twice
@@ -72,7 +76,9 @@ def settled(process: Process, plant: Plant) -> Step:
     """The filter in the end. Raises ValueError if it never settles, or is of no use: it trusts no measurement any more."""
     steps = Steps(process, plant)
     marks = []
-    for k in range(1, _LONGEST + 1):
+    measured = 0 if plant.output_matrix is None else len(plant.output_matrix)
+    longest = _LONGEST if max(process.n, measured) <= _SOME else _LONGEST_OF_MANY
+    for k in range(1, longest + 1):
         step = steps.next()
         if not np.isfinite(step.covariance).all():
             break

@@ -24,7 +24,7 @@ from emulator.model.link_law import LinkLaw, Segment
 from emulator.model.links.link import Chain
 from emulator.model.modulated_block import BLOCK, PARTS, Block
 from emulator.model.process import Floats, Process
-from emulator.model.theory import NOBODY, ExpectedCovariance, Outcomes, OutcomesAt, lyapunov, radius
+from emulator.model.theory import LARGEST_OPERATOR, NOBODY, ExpectedCovariance, Outcomes, OutcomesAt, lyapunov, radius
 
 
 class ModulatedCovariance:
@@ -173,8 +173,10 @@ class _Slot:
 
 
 def limit_of(process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> float:
-    """Trace of lim E P_k behind the link as it is in the end; inf if it has none."""
+    """Trace of lim E P_k behind the link as it is in the end; inf if it has none, NaN if it is too large to work out."""
     chain = law.last
+    if len(chain.law) * process.n**2 > LARGEST_OPERATOR:
+        return float("nan")
     states = limit_states(process, chain, outcomes_at)
     if states is None:
         return float("inf")

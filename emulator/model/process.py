@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 MARGINAL = 1e-7
 """An eigenvalue of A this close to the unit circle is on it, computed: a double one has errors of 1e-8."""
+MOST_STATES = 64
+"""Of a process: what is worked out of n states before a run takes time that grows with n³ and more."""
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding does not explain
 
 
@@ -226,6 +228,9 @@ def mistakes_of(
     Source: docs/mathematics.md, model (assumptions).
     """
     found: list[tuple[str, str]] = []
+    if max(map(len, (A, Q, initial_covariance))) > MOST_STATES:
+        large = f"has {max(map(len, (A, Q, initial_covariance)))} rows; expected at most {MOST_STATES} states"
+        return [("A", f"{large}: theory and check take time that grows with the cube of their number, and more")]
     for name, M in (("A", A), ("Q", Q), ("initial_covariance", initial_covariance)):
         found += [(name, sentence) for sentence in _shape_mistakes(M, A.shape[0] if name != "A" else None)]
     if found:

@@ -22,6 +22,8 @@ from emulator.model.process import MARGINAL, Floats, Process
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python, few enough to set up in 3 ms
 _LARGEST_POWER = 1e100  # of A's entries within a block, far from overflow
 _ROUNDING = 1e-12
+LARGEST_OPERATOR = 512
+"""Rows of a linear operator whose limit is worked out: some seconds; more than that and no limit is said."""
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ class Keys:
 
 def reader_of(key: str) -> str:
     """The process that reads a key; of inputs, which the legitimate estimator may read too, the one that always does."""
-    kind, _, name = key.split("/", 2)[2].partition("/")
+    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
     if kind == "ack":
         return ROUTER if name == "sent" else SENSOR
     readers = {
@@ -103,6 +103,23 @@ def reader_of(key: str) -> str:
         "input": SENSOR,
     }
     return readers.get(kind, name)
+
+
+def writer_of(key: str) -> str:
+    """The only process that may write a key; empty for what is no key of a run."""
+    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
+    if kind == "ack":
+        return LEGITIMATE if name == "sent" else ROUTER
+    writers = {
+        "uplink": SENSOR,
+        "downlink": ROUTER,
+        "journal": ROUTER,
+        "control": OPERATOR if name == OBSERVER else OBSERVER,
+        "estimate": LEGITIMATE,
+        "state": SENSOR,
+        "input": CONTROLLER,
+    }
+    return writers.get(kind, name)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from emulator.network.envelope import Dropped, head_of
-
-_INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
+from emulator.network.whereabouts import Place
 
 
 class Declared(Protocol):
@@ -34,14 +33,17 @@ class InboxClosedError(Exception):
 class Inbox:
     """A subscription to one exact key, read in order with `recv`."""
 
-    def __init__(self, key: str, dropped: Dropped) -> None:
-        self._key, self._head, self._dropped = key, head_of(key), dropped
+    def __init__(self, key: str, dropped: Dropped, place: Place, room: int) -> None:
+        """place: of the process, which is there waiting while it reads; room: for so many messages."""
+        self._room = room
+        self._key, self._head, self._dropped, self._place = key, head_of(key), dropped, place
+        self._waits = (key,)
         self._subscribers: SimpleQueue[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None] = SimpleQueue()
         self._subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
 
     def declare(self, session: zenoh.Session) -> None:
         """Subscribe; what arrived before is read first."""
-        self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(_INBOX_MESSAGES)))
+        self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(self._room)))
 
     def close(self) -> None:
         """There will be no other session."""
@@ -49,6 +51,12 @@ class Inbox:
 
     def recv(self) -> bytes:
         """The next message. Raises InboxClosedError once the connection is closed for good."""
+        self._place.waits = self._waits
+        payload = self._received()
+        self._place.waits = ()
+        return payload
+
+    def _received(self) -> bytes:
         while True:
             if self._subscriber is None:
                 self._subscriber = self._subscribers.get()

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from emulator.model.digest import Digests
+from emulator.model.digest import Blocks, Digests
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
-from emulator.network.telemetry import read_digests, read_failed
+from emulator.network.telemetry import Extent, read_digests, read_failed
 from emulator.network.wire import Reader, pack, packed_flags
 
 
@@ -57,8 +57,11 @@ class Decisions:
         return pack({"k": self.first, "c": self.count, "seconds": self.seconds.tobytes(), "digests": digests})
 
 
-def read_decisions(message: Reader, first: int, trials: int, period: int) -> Decisions:
+def read_decisions(message: Reader, first: int, extent: Extent, blocks: Blocks, period: int) -> Decisions:
     """The controller's telemetry that must begin at slot `first`, with a decision every period slots."""
-    k, c = message.slot(first), message.integer("c", 1)
-    made = len(range(-(-k // period) * period, k + c, period))
-    return Decisions(k, c, message.finite("seconds", (made,)), read_digests(message, trials))
+    c = message.span(first, extent.slots, extent.batch + period)
+    made = len(range(-(-first // period) * period, first + c, period))
+    seconds = message.finite("seconds", (made,))
+    if seconds.size and float(seconds.min()) < 0.0:
+        raise message.malformed(f"seconds of {float(seconds.min()):g}", "numbers of at least 0")
+    return Decisions(first, c, seconds, read_digests(message, extent.trials, blocks.ended(first, first + c)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags, Heard
 from emulator.model.transit import Arrival, Late
-from emulator.network.wire import Reader, flags_of, pack, packed_flags
+from emulator.network.wire import Reader, pack, packed_flags
 
 Headers = NDArray[np.int64]
 
@@ -59,7 +59,7 @@ def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> Bes
     n, trials = shape
     return Beside(
         message.array("header", "<i8", (header, trials)) if header else None,
-        flags_of(message.array("sent", "u1", ((trials + 7) // 8,)), trials) if message.has("sent") else None,
+        message.flags("sent", (trials,)) if message.has("sent") else None,
         message.finite("truth", (n, trials)) if message.has("truth") else None,
     )
 
@@ -72,7 +72,7 @@ def acknowledgement(k: int, acknowledged: Flags) -> bytes:
 def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
     """The acknowledgements (R,) that must be of slot k."""
     message.slot(k)
-    return flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
+    return message.flags("gamma", (trials,))
 
 
 def hold(k: int) -> bytes:
@@ -96,6 +96,12 @@ def once_more(number: int, done: int, first: int) -> bytes:
 def is_once_more(message: Reader) -> bool:
     """Whether a message of the uplink says that packets are sent once more."""
     return message.has("again")
+
+
+def read_once_more(message: Reader, slots: int) -> tuple[int, int, int]:
+    """Number of the round, first slot that is not done, and first slot that follows, of a run of so many."""
+    done = message.integer("again", 0, slots)
+    return message.integer("n", 1), done, message.integer("k", 0, done)
 
 
 def delivery(
@@ -130,14 +136,24 @@ def packed_header(header: Headers, received: Flags) -> bytes:
     return np.compress(received, header, axis=1).astype("<i8").tobytes()
 
 
-def read_delivery(message: Reader, k: int, shape: tuple[int, int], header: int = 0) -> Arrival:
-    """What arrives in slot k, of which the delivery must be; z (n, R) and header (h, R) are 0 where nothing was received."""
+def read_delivery(
+    message: Reader, k: int, shape: tuple[int, int], header: int = 0, window: int | None = None
+) -> Arrival:
+    """What arrives in slot k, of which the delivery must be; z (n, R) and header (h, R) are 0 where nothing was received.
+
+    window: how many slots late a packet may be at most; None is any number.
+    """
     message.slot(k)
-    late = []
-    for one in message.maps("late") if message.has("late") else ():
+    oldest = 0 if window is None else max(0, k - window)
+    late: list[Late] = []
+    parts = message.maps("late") if message.has("late") else []
+    if len(parts) > 2 * (k - oldest + 1):  # of each slot its packets and second copies
+        raise message.malformed(f"{len(parts)} times late packets", f"two times a slot from {oldest} to {k} at most")
+    for one in parts:
         slot = one.integer("k")
-        if slot > k:
-            raise one.malformed(f"a late packet of slot {slot}", f"one of slot {k} or before")
+        if not oldest <= slot <= k:
+            since = "" if oldest == 0 else f", from {oldest} on"
+            raise one.malformed(f"a late packet of slot {slot}", f"one of slot {k} or before{since}")
         late.append(Late(slot, _heard(one, shape, header)))
     heard = _heard(message, shape, header)
     if message.has("truth"):
@@ -147,7 +163,7 @@ def read_delivery(message: Reader, k: int, shape: tuple[int, int], header: int =
 
 def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Heard:
     n, trials = shape
-    gamma = flags_of(message.array("gamma", "u1", ((trials + 7) // 8,)), trials)
+    gamma = message.flags("gamma", (trials,))
     received = int(np.count_nonzero(gamma))
     header = None
     if rows:

@@ -15,38 +15,44 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 import zenoh
 
 from emulator.brief import Brief, Identity
-from emulator.errors import BriefError, MalformedMessage, RunError
+from emulator.errors import BriefError, Gap, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
 from emulator.network.access import OBSERVER, ROUTER, Keys, reader_of
 from emulator.network.connecting import Door, Waiting, connected, endpoint_of
 from emulator.network.connection import Connection
 from emulator.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
 from emulator.network.envelope import Dropped
+from emulator.network.heartbeat import Heartbeat
 from emulator.network.lifeline import Lifeline
+from emulator.network.limits import low_pass
+from emulator.network.mailbox import allowance
 from emulator.network.resending import Kept
-from emulator.network.wire import Reader, over
+from emulator.network.whereabouts import Place
+from emulator.network.wire import Reader, over, refusal
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
 _LEASE_SECONDS = 4.0  # a connection over which nothing comes for so long is lost
 _HEARD_SECONDS = 2.0  # for readers to be found again once a connection is back
 _NEVER_MS = 86_400_000
+_ANSWER_BYTES = 64 * 2**20  # for the operator
+_WINDOWS = 8  # that an inbox has room for: what was sent again in some rounds waits there too
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
 
 
-def _transport(identity: Identity | None, listens: bool = False) -> dict[str, Any]:
+def _transport(identity: Identity | None, largest: int, listens: bool = False) -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
     link: dict[str, Any] = {
         "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
-        "rx": {"buffer_size": 1 << 20},
+        "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
     if identity is not None:
         from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
@@ -82,6 +88,7 @@ class Credentials(Protocol):
 
 def client_config(entry: Credentials) -> dict[str, Any]:
     """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
+    largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
     return {
         "mode": "client",
@@ -92,7 +99,7 @@ def client_config(entry: Credentials) -> dict[str, Any]:
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(entry.identity), "auth": auth},
+        "transport": {**_transport(entry.identity, largest), "auth": auth},
     }
 
 
@@ -110,14 +117,16 @@ def _once(door: Door) -> zenoh.Config:
 
 
 def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
-    """Configuration of a router: it listens, asks for user and password, and denies what is not granted."""
+    """Configuration of a router: it listens, asks for user and password, and drops what is not granted or too large."""
+    transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
         "mode": "router",
         **({"id": brief.part["zid"]} if brief.role == "router" and brief.part["zid"] is not None else {}),
         "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(brief.identity, listens=True), "auth": {"usrpwd": {"dictionary_file": users_file}}},
+        "transport": {**transport, "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
+        "low_pass_filter": low_pass(brief.run, brief.part["limits"]),
     }
 
 
@@ -162,6 +171,11 @@ class Session:
         self._process = brief.process
         self.patience = float(brief.patience)
         """Seconds that are waited for the others."""
+        self.place = Place()
+        """Where this process is, to be kept up to date as it works."""
+        self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
+        """Bytes that one sender may have waiting to be read."""
+        self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router)
@@ -178,6 +192,8 @@ class Session:
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
+        # A router has nobody to connect to: it is its network.
+        self._heartbeat = Heartbeat((lambda: True) if brief.role in ("router", "relay") else self.linked)
         self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
@@ -186,9 +202,26 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, MalformedMessage | Gap):
+            self._complain(error)
         if self._lifeline is not None:
             self._lifeline.release()
+        self._heartbeat.stop()
         self._connection.close()
+
+    def _complain(self, error: MalformedMessage | Gap) -> None:
+        """Tell the observer, which ends the run, what cannot be read and why; wait a moment for it to do so."""
+        outlet = self._reporting
+        if outlet is not None and outlet.matched:
+            outlet(refusal(error.key, str(error)))
+            with suppress(Empty):
+                self._commands.get(timeout=_HEARD_SECONDS)
+
+    @property
+    def _reporting(self) -> Outlet | None:
+        """Where this process reports to the observer, if it does."""
+        key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
+        return self._outlets.get(key)
 
     def _changed(self, connected: bool) -> None:
         """The connection was lost or is back."""
@@ -207,7 +240,7 @@ class Session:
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key, to be read in order with `recv`."""
-        return self._connection.add(Inbox(key, self._dropped))
+        return self._connection.add(Inbox(key, self._dropped, self.place, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
@@ -291,18 +324,22 @@ class Session:
 
     def appear(self) -> None:
         """Show that this process is there."""
+        outlet = self._reporting
+        if outlet is not None:
+            self.place.answer(outlet)
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self._connection.appear(self.keys.alive(self._process))
+        self._heartbeat.start()
 
     def conclude(self) -> None:
         """Confirm that this process ends because it was told to, and say how many messages it has dropped.
 
         The relay, which reports nothing, withdraws its token instead.
         """
-        key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
-        if key in self._outlets:
-            self._outlets[key](over(self.dropped))
+        outlet = self._reporting
+        if outlet is not None:
+            outlet(over(self.dropped))
         else:
             self._connection.disappear()
 
@@ -329,6 +366,9 @@ class Session:
                 sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
                 sys.stderr.flush()
                 os._exit(RunError.exit_status)
+            if command.text("do") == "where":
+                self.place.ask()
+                return
             if self._kept and command.text("do") == "again":
                 command.integer("n"), command.integer("k")
                 self._rounds.put(command)
@@ -337,8 +377,9 @@ class Session:
 
     def wait_for(self, command: str) -> None:
         """Wait for one command of the conductor: `start` or `end`."""
-        while self.command().text("do") != command:
-            pass
+        with self.place.waiting(self._control):
+            while self.command().text("do") != command:
+                pass
         if command == "end":
             self.conclude()
 

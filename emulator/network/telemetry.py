@@ -13,11 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.account import COUNTED_BURSTS, Account
-from emulator.model.digest import DIGEST_BYTES, Digests
+from emulator.model.digest import DIGEST_BYTES, Blocks, Digests
 from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Belief, Codes, Flags
-from emulator.network.wire import Reader, flags_of, pack, packed_flags
+from emulator.network.wire import Reader, pack, packed_flags, shown
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What a run has, to which the numbers in messages are held."""
+
+    slots: int
+    batch: int
+    """Slots that one report may cover."""
+    n: int
+    trials: int
+    recorded: int = 1
+    """Trials whose covariances are reported."""
+    inputs: int = 0
+    """Inputs that a controller decides; 0 without one."""
+    measures: bool = False
+    """Whether the sensor filters what it measures."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the states of a slot, (n, R)."""
+        return self.n, self.trials
 
 
 def held(k: int) -> bytes:
@@ -71,24 +93,18 @@ class Truth:
         return pack(fields)
 
 
-def read_truth(message: Reader, first: int, shape: tuple[int, int], inputs: int = 0, measures: bool = False) -> Truth:
-    """The sensor's telemetry that must begin at slot `first`, with so many inputs, and of one that filters or not."""
-    k, c = message.slot(first), message.integer("c", 1)
-    n, trials = shape
-    flags = {
-        name: flags_of(message.array(name, "u1", (c, (trials + 7) // 8)), trials) if message.has(name) else None
-        for name in ("sent", "alarms")
-    }
-    masks = message.array("nu", "u1", (c, (trials + 7) // 8))
+def read_truth(message: Reader, first: int, extent: Extent) -> Truth:
+    """The sensor's telemetry that must begin at slot `first`."""
+    c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
     return Truth(
-        k,
+        first,
         message.finite("x", (c, n, trials)),
-        flags_of(masks, trials),
-        flags["sent"],
-        flags["alarms"],
-        message.finite("u", (c, inputs, trials)) if inputs else None,
-        read_failed(message, (c, trials)) if inputs else None,
-        message.finite("true", (c, n, trials)) if measures else None,
+        message.flags("nu", (c, trials)),
+        message.flags("sent", (c, trials)) if message.has("sent") else None,
+        message.flags("alarms", (c, trials)) if message.has("alarms") else None,
+        message.finite("u", (c, extent.inputs, trials)) if extent.inputs else None,
+        read_failed(message, (c, trials)) if extent.inputs else None,
+        message.finite("true", (c, n, trials)) if extent.measures else None,
     )
 
 
@@ -96,16 +112,24 @@ def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
     """Where decisions failed, (…, R): nowhere, unless it is said."""
     if not message.has("failed"):
         return np.zeros(shape, np.bool_)
-    return flags_of(message.array("failed", "u1", (*shape[:-1], (shape[-1] + 7) // 8)), shape[-1])
+    return message.flags("failed", shape)
 
 
-def read_digests(message: Reader, trials: int) -> dict[int, Digests]:
-    """Block, by its first slot → digests, (R, 32)."""
+def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, Digests]:
+    """Block, by its first slot → digests, (R, 32); blocks: those that end in the slots of the message."""
     digests: dict[int, Digests] = {}
-    for block, value in message.map("digests").items():
-        if type(block) is not int or not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
-            raise message.malformed(f"digests of block {block!r}", f"{trials * DIGEST_BYTES} bytes a block")
+    found = message.map("digests")
+    for block, value in found.items():
+        if type(block) is not int or block not in blocks:
+            expected = (
+                f"of the blocks that end in these slots, {blocks}" if blocks else "none: no block ends in these slots"
+            )
+            raise message.malformed(f"digests of block {shown(block)}", expected)
+        if not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
+            raise message.malformed(f"digests of block {block}", f"{trials * DIGEST_BYTES} bytes a block")
         digests[block] = np.frombuffer(value, np.uint8).reshape(trials, DIGEST_BYTES)
+    if len(digests) < len(blocks):
+        raise message.malformed(f"digests of blocks {sorted(digests)}", f"those of {blocks}, which end in these slots")
     return digests
 
 
@@ -151,22 +175,27 @@ class Report:
         )
 
 
-def read_report(message: Reader, first: int, shape: tuple[int, int], recorded: int) -> Report:
-    """A receiver's telemetry that must begin at slot `first`."""
-    k, c = message.slot(first), message.integer("c", 1)
-    n, trials = shape
+def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, window: int = 0) -> Report:
+    """A receiver's telemetry that must begin at slot `first`; blocks: its digests'; window: how late its packets may be."""
+    c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
     action = message.array("action", "u1", (c, trials))
     if action.size and int(action.max()) > max(Action):
         raise message.malformed(f"action {int(action.max())}", f"actions from 0 to {int(max(Action))}")
+    late, used = (
+        message.counts(name, "<u2", (c, trials), window) if message.has(name) else None
+        for name in ("late", "late_used")
+    )
+    if used is not None and (late is None or (used > late).any()):
+        raise message.malformed("more in late_used than in late", "late packets that were used among those that came")
     return Report(
-        k,
+        first,
         message.finite("x_hat", (c, n, trials)),
         action,
-        message.finite("P", (c, n, n, recorded)),
+        message.finite("P", (c, n, n, extent.recorded)),
         message.finite("trace", (c, 2)),
-        message.array("late", "<u2", (c, trials)) if message.has("late") else None,
-        read_digests(message, trials),
-        message.array("late_used", "<u2", (c, trials)) if message.has("late_used") else None,
+        late,
+        read_digests(message, trials, blocks.ended(first, first + c)),
+        used,
     )
 
 
@@ -180,11 +209,11 @@ def is_leaving(message: Reader) -> bool:
     return message.has("leaves")
 
 
-def read_leaving(message: Reader, shape: tuple[int, int]) -> tuple[int, Belief]:
+def read_leaving(message: Reader, extent: Extent) -> tuple[int, Belief]:
     """The slot before which a receiver leaves, and what it believes."""
-    n, trials = shape
-    x_hat, P = message.finite("x_hat", shape), message.finite("P", (n, n, trials))
-    return message.integer("k"), Belief(x_hat, P, np.zeros(trials, np.uint8))
+    n, trials = extent.shape
+    x_hat, P = message.finite("x_hat", extent.shape), message.finite("P", (n, n, trials))
+    return message.integer("k", 0, extent.slots), Belief(x_hat, P, np.zeros(trials, np.uint8))
 
 
 @dataclass(frozen=True)
@@ -212,21 +241,39 @@ def _account(link: Account) -> dict[str, Any]:
     }
 
 
-def read_journal(message: Reader, first: int, windows: Mapping[str, int], trials: int) -> Journal:
+def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent: Extent) -> Journal:
     """The journal that must begin at slot `first`, with every receiver in it; windows: receiver → its window."""
-    k, c = message.slot(first), message.integer("c", 1)
+    c, trials = message.span(first, extent.slots, extent.batch), extent.trials
     links: dict[str, Account] = {}
     for name, window in windows.items():
         link = message.nested("links").nested(name)
         reasons = link.nested("lost")
         if set(link.map("lost")) != set(REASONS):
-            raise message.malformed(f"{name} lost for {list(link.map('lost'))}", f"the reasons {sorted(REASONS)}")
+            raise message.malformed(
+                f"{name} lost for {shown(list(link.map('lost')))}", f"the reasons {sorted(REASONS)}"
+            )
         links[name] = Account(
-            flags_of(link.array("delivered", "u1", (c, (trials + 7) // 8)), trials),
-            {reason: reasons.array(reason, "<u4", (c,)) for reason in REASONS},
-            link.array("late", "<u2", (c, trials)) if link.has("late") else None,
-            link.array("bursts", "<u4", (COUNTED_BURSTS,)),
-            link.array("delays", "<u4", (window + 2,)),
-            link.array("unsent", "<u4", (c,)) if link.has("unsent") else None,
+            link.flags("delivered", (c, trials)),
+            {reason: reasons.counts(reason, "<u4", (c,), trials) for reason in REASONS},
+            link.counts("late", "<u2", (c, trials), window) if link.has("late") else None,
+            link.counts("bursts", "<u4", (COUNTED_BURSTS,), c * trials),
+            link.counts("delays", "<u4", (window + 2,), c * trials),
+            link.counts("unsent", "<u4", (c,), trials) if link.has("unsent") else None,
         )
-    return Journal(k, c, links)
+        _check_account(message, name, links[name], window)
+    return Journal(first, c, links)
+
+
+def _check_account(message: Reader, name: str, link: Account, window: int) -> None:
+    """Every packet of a slot has one fate: delivered in the slot, lost, not sent, or, where it may be late, under way."""
+    trials = link.delivered.shape[1]
+    fates = np.count_nonzero(link.delivered, axis=1) + sum(counts.astype(np.int64) for counts in link.lost.values())
+    fates += 0 if link.unsent is None else link.unsent.astype(np.int64)
+    wrong = (fates > trials) if window else (fates != trials)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise message.malformed(
+            f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} of them"
+        )
+    if int(link.delays.sum(dtype=np.int64)) > link.delivered.size:
+        raise message.malformed(f"more delays than packets of {name}", f"at most {link.delivered.size}")

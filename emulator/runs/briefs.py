@@ -10,18 +10,22 @@ from typing import Any
 
 from emulator.brief import Brief, Flow, Model
 from emulator.errors import UsageError
+from emulator.files import Unreadable, contents
 from emulator.model.account import COUNTED_BURSTS
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.answers import NoAnswer
+from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
 from emulator.modules import named_in
 from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
+from emulator.network.limits import Sizes
 from emulator.runs.acknowledging import chart_of, way_back_of
 from emulator.runs.folder import new_folder
 from emulator.runs.loop_briefs import LoopBriefs
 from emulator.runs.ports import Places, places_at
 from emulator.runs.routers import Routers, identities_of
 from emulator.scenario import Scenario
+from emulator.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
 from emulator.streams import root_of_seed, stream_key
 
 _WINDOW_BYTES = 64 * 2**20
@@ -44,14 +48,14 @@ class StreamKeys:
         if scenario.secret_file is None:
             return cls(root, stream_key(root, "secret"))
         try:
-            secret = Path(scenario.secret_file).read_bytes()
-        except OSError as error:
+            secret = contents(Path(scenario.secret_file), MOST_SECRET_BYTES)
+        except Unreadable as error:
             raise UsageError(
-                f"--secret {scenario.secret_file}: {error.strerror}; give a file of 32 or more bytes"
+                f"--secret {scenario.secret_file} cannot be read ({error}); give a file of {SECRET_BYTES} or more bytes"
             ) from error
-        if len(secret) < 32:
+        if len(secret) < SECRET_BYTES:
             raise UsageError(
-                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected 32 or more, random ones"
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more, random ones"
             )
         return cls(root, stream_key(secret, "secret"))
 
@@ -99,7 +103,25 @@ def flow_of(scenario: Scenario) -> Flow:
     batch = max(1, window // 4)
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
-    return Flow(window, batch, scenario.longest_outage)
+    sizes = sizes_of(scenario, batch)
+    return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
+
+
+def sizes_of(scenario: Scenario, batch: int) -> Sizes:
+    """What the sizes of messages follow from, with reports of so many slots."""
+    plant, table = scenario.driven, scenario.controller
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return Sizes(
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        batch,
+        max(scenario.window(name) for name in scenario.receivers),
+        len(scenario.receivers),
+        len(scheme.header),
+        0 if plant is None or table is None else plant.inputs,
+        1 if table is None else table.period,
+    )
 
 
 def history_of(scenario: Scenario) -> int:
@@ -152,7 +174,8 @@ def briefs_of(
     model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
     identities = identities_of(run, places, tuple(users))
-    loop = LoopBriefs(scenario)
+    loop, flow = LoopBriefs(scenario), flow_of(scenario)
+    limits = sizes_of(scenario, flow.batch).of_kinds
 
     def imports(process: str, part: Mapping[str, Any]) -> bool:
         """Whether a process may need a class that is not built in. Of links, somebody may set another while the run goes on."""
@@ -171,7 +194,7 @@ def briefs_of(
             trials=scenario.trials,
             first_trial=scenario.first_trial,
             recorded=scenario.record_trials,
-            flow=flow_of(scenario),
+            flow=flow,
             model=model,
             keys={name: key.hex() for name, key in owned.items()},
             part={**part, "modules": scenario.modules} if imports(process, part) else part,
@@ -198,6 +221,7 @@ def briefs_of(
                 "acknowledgements": None if back is None else back._asdict(),
                 "controller": loop.wiring,
                 "zid": routers.zid,
+                "limits": limits,
             },
         ),
         brief(
@@ -234,6 +258,7 @@ def briefs_of(
                 "operator": users[OPERATOR],
                 "shard": observation.shard,
                 "operator_identity": asdict(identities[OPERATOR]) if identities else None,
+                "classes": _answers(scenario),
             },
         ),
     ]
@@ -241,11 +266,29 @@ def briefs_of(
         made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
     if places.relay is not None:
         part = routers.relay_part(scenario.receivers, places.relay)
-        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring}))
+        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring, "limits": limits}))
     for name, table in scenario.eavesdroppers.items():
         part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
         made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
     return {one.process: one for one in made}
+
+
+def _answers(scenario: Scenario) -> dict[str, Any]:
+    """What eavesdroppers' classes that are not built in say of themselves: all that the observer will ask."""
+    tables = scenario.eavesdroppers
+    names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
+    foreign = {name for name in names if STRATEGIES.foreign(name)}
+    if foreign:
+        from emulator.runs.expectation import expectations_of  # noqa: PLC0415 - it is long to import, and seldom needed
+
+        for name, expectation in expectations_of(scenario).items():
+            if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:
+                try:
+                    expectation.traces(scenario.slots)
+                    _ = expectation.limit, expectation.infinite_variance
+                except NoAnswer as error:
+                    raise UsageError(f"eavesdroppers.{name}: its class has no theory of itself ({error})") from error
+    return ANSWERS.of(foreign)
 
 
 def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:

@@ -17,19 +17,24 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from emulator.brief import Brief
+from emulator.entry import INTERRUPTED
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
 from emulator.runs.folder import private_opener
+from emulator.runs.held import HeldFolder
+from emulator.runs.signals import held_back
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
 ROUTER_RESTARTS = 3  # of a router that a signal ended: the run goes on with the new one
-_BEGIN_SECONDS = 10.0  # for the observer to begin to write what there is
+SILENCE_SECONDS = 30.0  # after which an observer that says nothing is given up: its heartbeat is a second
+_BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there is
 _GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
-_FINISH_SECONDS = 60.0  # for the observer to write it, once it has begun
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
+_HUBS = frozenset({ROUTER, RELAY, OBSERVER})
+_ROUTER_LOST = "has had no connection with the router"
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
@@ -67,15 +72,17 @@ class Exit:
         """As a sentence goes on after the process's name."""
         if self.status < 0:
             return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
 class Children:
     """The processes of a run. Final; on leaving the block all are gone."""
 
-    def __init__(self, logs: Path, private: Path, lock_step: bool = False) -> None:
-        """lock_step: the processes wait for each other in every slot, or every few."""
-        self._logs = logs
+    def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
+        """folder: of the results; lock_step: the processes wait for each other in every slot, or every few."""
+        self._folder = folder
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -131,10 +138,10 @@ class Children:
             environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
         try:
             path = brief.write(self._private)
-            log_file = self._logs / f"{brief.process}.log"
-            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
+            log_file = self._folder.now / "logs" / f"{brief.process}.log"
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "emulator", brief.role, str(path)],
+                    [sys.executable, "-P", "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE if conducts else log,
                     stderr=log,
@@ -161,7 +168,8 @@ class Children:
 
     def restart_router(self, ended: Exit) -> bool:
         """Start a router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
         self._killed.add(self._processes[ended.process].pid)
@@ -218,11 +226,14 @@ class Children:
             path.unlink(missing_ok=True)
 
     def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
-        """Have the observer end, at once or after so many seconds; its last news if it came to it."""
+        """Have the observer end, at once or after so many seconds; its last news if it came to it.
+
+        Once it has begun to finish it may take its time, as long as it says that it lives.
+        """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
         ending: News | None = None
-        while time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS):
+        while self.silent_seconds < SILENCE_SECONDS and (self._finishing or time.monotonic() - begun < _BEGIN_SECONDS):
             news = self.news(0.05)
             if isinstance(news, Exit):
                 if news.process == OBSERVER:
@@ -251,11 +262,16 @@ class Children:
 
     def story(self, first: Exit | None, ending: News | None) -> str:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
-        suspects = list(ending.get("suspects", [])) if ending is not None else []
+        suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
-        if first is None or (first.process == OBSERVER and first.status > 0):
+        lost = None if first is None else self._lost_by_all(first.process, suspects)
+        if lost is not None:
+            first, suspects = None, [lost]  # it is at fault, and not the process that gave up first
+        if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
-        if first is not None:
+        if accused and why:
+            named, head = [name for name in accused if name in self._processes], why
+        elif first is not None:
             named, head = [first.process], f"{first.process} {first.manner}"
             words = reversed(self._log(first.process))
             why = next((line for line in words if line.startswith(_COMPLAINT)), "")
@@ -264,8 +280,9 @@ class Children:
         else:
             named, head = [], f"the run failed: {why}"
         at_fault = _sender(why)
-        if at_fault is not None and at_fault in self._processes and at_fault not in named:
-            named, head = [at_fault, *named], f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        if at_fault is not None and at_fault in self._processes and (at_fault not in named or accused):
+            named = list(dict.fromkeys([at_fault, *named]))
+            head = f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
@@ -278,7 +295,7 @@ class Children:
                 if name != OBSERVER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                if status:
+                if status and not ({ROUTER, RELAY} & set(suspects) and self._lost_router(name)):
                     return Exit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return Exit(suspects[0], 0)
@@ -286,10 +303,29 @@ class Children:
                 return None
             time.sleep(0.01)
 
+    def _lost_router(self, name: str) -> bool:
+        """Whether a process ended because it could not reach its router any more."""
+        return any(_ROUTER_LOST in line for line in self._log(name))
+
+    def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
+        """The router that a process gave up, if the observer misses it too, or all others that are connected to it; else None."""
+        if not self._lost_router(name):
+            return None
+        if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
+            return missed
+        place = self._briefs[name].router
+        others = [one for one, brief in self._briefs.items() if brief.router == place and one not in _HUBS]
+        deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
+        while time.monotonic() < deadline:
+            if all(self._lost_router(one) for one in others):
+                return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+            time.sleep(0.05)
+        return None
+
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""
         try:
-            text = _COLOUR.sub("", (self._logs / f"{name}.log").read_text(errors="replace"))
+            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text(errors="replace"))
         except OSError as error:
             return [f"(cannot be read: {error.strerror})"]
         return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]

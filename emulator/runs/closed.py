@@ -49,8 +49,10 @@ class Closed:
 
     @cached_property
     def limit(self) -> float:
-        """Trace of the limit; inf if it is unbounded."""
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to work out."""
         if self.chain is not None:
+            if len(self.chain.start) * self.process.n**2 > theory.LARGEST_OPERATOR:
+                return float("nan")
             return float(np.trace(self.chain.limit(self.process)))
         if self.acknowledged[1] > 0.0:
             return float("inf")
@@ -78,13 +80,14 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
     if table is None or (table.attack != "none" and scenario.timeline.jams is not None):
         return None
     needed = {LEGITIMATE, receiver} | ({table.jammer} if table.jammer is not None else set())
-    if not all(_independent(scenario, name) for name in needed):
+    threshold = scenario.encoding.parameters.get("threshold", 1)
+    long = type(threshold) is int and threshold > theory.LARGEST_OPERATOR  # one state of the chain for each slot of it
+    if long or not all(_independent(scenario, name) for name in needed):
         return None
     process, quality = scenario.process.process, scenario.quality
     split = _split(scenario, receiver)
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
     kind = closed_form(scenario.encoding.scheme, reader)
-    threshold = scenario.encoding.parameters.get("threshold", 1)
     # Unless acknowledgements are forged the user never misses a reference, and what it does with a slot tells more.
     told = receiver != LEGITIMATE or table.attack == "forge"
     if kind == "reference" and told and not ReferenceCode(process).decorrelates:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 import sys
@@ -28,6 +29,20 @@ def print_results(folder: Path, as_json: bool = False) -> None:
         raise UsageError(
             f"{folder / 'summary.json'} is not a run summary of this version ({error!r}); run the scenario again"
         ) from error
+
+
+def print_ending(folder: Path, status: int, how: str) -> None:
+    """Print what `evedrop run` prints at its end: the closing report, and why the run failed. Nobody has to read it.
+
+    status: the exit status of the run; how: why it failed.
+    """
+    with contextlib.suppress(UsageError, OSError):
+        print_results(folder)
+        sys.stdout.flush()
+    if status not in {0, 1}:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"evedrop: {how}\n")
+            sys.stderr.flush()
 
 
 def replay_command(folder: Path) -> str | None:

@@ -12,7 +12,9 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
@@ -43,6 +45,7 @@ from emulator.runs.workers import connected
 from emulator.scenario import Scenario
 
 _SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
+_WRITE_SECONDS, _WRITE_SHARE = 3.0, 50.0  # from one compare.json to the next, and as a multiple of what one takes
 _ALIKE = 1e-6  # share by which two errors of theory may differ and be called equal: rounding, and no more
 
 
@@ -308,20 +311,26 @@ def compare_all(matchups: Matchups, folder: Path, tell: Callable[[News], None], 
     with stop_on_signals() as stop, connected(plan.scheduler) as client:
         new_folder(folder)
         everything = list(itertools.chain(*tasks))
-        with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+        with said_of(folder), contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+            written, took = time.monotonic(), 0.0
             try:
                 for group, its_tasks in zip(groups, tasks, strict=True):
                     merger = _merged(group, plan, itertools.islice(results, len(its_tasks)))
                     if not merger.complete:
                         break
                     played.append((group, merger))
+                    began = time.monotonic()
+                    if began - written > max(_WRITE_SECONDS, _WRITE_SHARE * took):
+                        _write_found(folder, _comparison(matchups, played))
+                        written = time.monotonic()
+                        took = written - began
             except RunError as error:
                 failure = error
-    found = _comparison(matchups, played)
-    if not found.schemes:
-        shutil.rmtree(folder)
-        raise failure or Interrupted("interrupted before a scheme was done; nothing was kept")
-    _write(folder, found, played)
+        found = _comparison(matchups, played)
+        if not found.schemes:
+            shutil.rmtree(folder)
+            raise failure or Interrupted("interrupted before a scheme was done; nothing was kept")
+        _write(folder, found, played)
     if failure is not None:
         raise failure
     if len(played) < len(groups):
@@ -433,9 +442,17 @@ def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger
     from emulator.view.comparison import draw  # noqa: PLC0415 - matplotlib takes half a second
 
     with said_of(folder):
-        write_private(folder / "compare.json", found.as_json() + "\n")
+        _write_found(folder, found)
         scenarios = folder / "scenarios"
         make_private(scenarios)
         for group, _ in played:
             write_private(scenarios / f"{group.name}.toml", resolved(group.scenario))
         draw(private_pictures(folder / "compare"), found)
+
+
+def _write_found(folder: Path, found: Comparison) -> None:
+    """Write compare.json of the schemes so far, if there is one, whole at any moment."""
+    if found.schemes:
+        unfinished = folder / "compare.json.new"
+        write_private(unfinished, found.as_json() + "\n")
+        os.replace(unfinished, folder / "compare.json")

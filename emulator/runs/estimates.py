@@ -15,6 +15,7 @@ from emulator.scenario import Scenario
 from emulator.scenario.filter_noise import is_singular
 
 _LARGE_BYTES = 1e9
+_SHOWN_STATES = 3  # of a matrix that is written out
 _NEAR = 0.01  # of a covariance's largest entry
 
 
@@ -64,9 +65,11 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
     if driven is not None and driven.output_matrix is not None:
         wanted = settled(process, driven).innovation
         if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
+            small = process.n <= _SHOWN_STATES
             found.append(
-                f"process.Q is {process.Q.tolist()}, but what the sensor's filter adds a slot has the covariance "
-                f'{wanted.tolist()}: process.Q = "filter" takes that; inputs and disturbances come to it'
+                f"process.Q is {process.Q.tolist() if small else 'another'}, but what the sensor's filter adds a slot has the "
+                f"covariance {wanted.tolist() if small else 'of its innovations'}: "
+                f'process.Q = "filter" takes that; inputs and disturbances come to it'
             )
     if process.singular_noise and is_singular(process.Q):
         found.append(

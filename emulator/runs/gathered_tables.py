@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from emulator.runs.folder import private_file
+from emulator.runs.growing import parquet_or_stream
 from emulator.runs.results import NULLABLE
 
 _BYTES = 4 * 2**20
@@ -90,10 +91,7 @@ class _Rows:
         self._gathered = gathered
         self._held: pa.Table = schema.empty_table()
         self._reach = np.zeros(max(1, len(gathered.receivers)), np.int64)
-        try:
-            self._batches = pq.ParquetFile(path).iter_batches(gathered.slots_at_once * len(self._reach))
-        except (OSError, pa.ArrowException):
-            self._batches = iter(())
+        self._batches = parquet_or_stream(path.parent, path.stem, gathered.slots_at_once * len(self._reach))
 
     def below(self, end: int) -> pa.Table:
         """The rows of all slots below `end` that have not been given before."""

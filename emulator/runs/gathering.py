@@ -19,14 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
+import pyarrow.compute as pc
 
 from emulator.errors import UsageError
 from emulator.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from emulator.runs.folder import make_private
 from emulator.runs.gathered_tables import Gathered, Journals, Recorded, Statistics
+from emulator.runs.growing import parquet_or_stream
 from emulator.runs.judge import replay_of
-from emulator.runs.results import ResultsWriter, load_results, write_summary
+from emulator.runs.results import DIGESTS, ResultsWriter, load_results, write_summary
 from emulator.runs.scorekeeper import Ending, summary_of, write_resolved
 from emulator.runs.shard_score import left
 from emulator.runs.totals import Totals
@@ -95,10 +96,8 @@ def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: Resu
 
 def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     """Block → digests of the shard's trials, (R, 32), of one peer."""
-    try:
-        table = pq.read_table(shard.folder / "digests.parquet", filters=[("peer", "=", name)])
-    except (OSError, pa.ArrowException):  # whoever wrote it was killed before it was whole
-        return {}
+    batches = parquet_or_stream(shard.folder, "digests")
+    table = pa.Table.from_batches(batches, DIGESTS).filter(pc.field("peer") == name)
     starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())
     digests = np.frombuffer(values, np.uint8).reshape(-1, DIGEST_BYTES)
     return {int(start): digests[starts == start] for start in np.unique(starts)}

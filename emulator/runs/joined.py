@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.model.account import Account
-from emulator.model.digest import Digests
+from emulator.model.digest import Blocks, Digests
 from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
-from emulator.network.access import CONTROLLER
+from emulator.network.access import CONTROLLER, ROUTER, SENSOR
 from emulator.network.loop_wire import read_decisions
-from emulator.network.telemetry import Journal, Report, Truth, read_journal, read_report, read_truth
+from emulator.network.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
 from emulator.network.wire import Reader
 
 Message = TypeVar("Message")
@@ -130,21 +130,18 @@ class Joiner:
 
     def __init__(
         self,
+        extent: Extent,
         windows: Mapping[str, int],
-        shape: tuple[int, int],
-        recorded: int,
-        loop: tuple[int, int] | None = None,
-        measures: bool = False,
+        blocks: Mapping[str, Blocks],
+        period: int | None = None,
+        check: Callable[[str, Report], None] = lambda _name, _report: None,
     ) -> None:
-        """windows: receiver → slots by which a packet may be late for it; loop: a controller's inputs, and its period.
+        """windows: receiver → slots by which a packet may be late for it; blocks: of the digests of receivers and controller.
 
-        measures: whether the sensor filters what it measures.
+        period: a controller's; None without one. check: is given every receiver's report before anything is made of it.
         """
-        self._measures = measures
-        self._windows = windows
-        self._shape = shape
-        self._recorded = recorded
-        self._loop = loop
+        self._check = check
+        self._extent, self._windows, self._blocks, self._period = extent, windows, blocks, period
         self._decided = 0
         self._truth = _Column[Truth]()
         self._journal = _Column[Journal]()
@@ -152,7 +149,7 @@ class Joiner:
         self._done = 0
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
         """Receiver, or controller → block, by its first slot → digests."""
-        if loop is not None:
+        if period is not None:
             self.digests[CONTROLLER] = {}
 
     @property
@@ -174,32 +171,37 @@ class Joiner:
         """The first slot that a receiver, or the controller, has not reported."""
         return self._decided if name == CONTROLLER else self._reports[name].end
 
+    def places(self, reporters: Iterable[str]) -> dict[str, int]:
+        """Process → the first slot that it has not reported: sensor, router, and these."""
+        return {SENSOR: self.sent, ROUTER: self.journaled, **{name: self.reported(name) for name in reporters}}
+
     def complete(self, slots: int) -> bool:
         """Whether so many slots have been given back, and a controller has reported them."""
-        return self._done == slots and (self._loop is None or self._decided == slots)
+        return self._done == slots and (self._period is None or self._decided == slots)
 
     def decisions(self, telemetry: Reader) -> Floats:
         """Take the controller's telemetry; what its decisions took."""
-        message = read_decisions(telemetry, self._decided, self._shape[1], 1 if self._loop is None else self._loop[1])
+        message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
         self._decided += message.count
         self.digests[CONTROLLER].update(message.digests)
         return message.seconds
 
     def truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
-        inputs = 0 if self._loop is None else self._loop[0]
-        message = read_truth(telemetry, self._truth.end, self._shape, inputs, self._measures)
+        message = read_truth(telemetry, self._truth.end, self._extent)
         self._truth.add(message, message.count)
 
     def report(self, name: str, telemetry: Reader) -> None:
         """Take a receiver's telemetry."""
-        message = read_report(telemetry, self._reports[name].end, self._shape, self._recorded)
-        self._reports[name].add(message, message.count)
+        column = self._reports[name]
+        message = read_report(telemetry, column.end, self._extent, self._blocks[name], self._windows[name])
+        self._check(name, message)
+        column.add(message, message.count)
         self.digests[name].update(message.digests)
 
     def journal(self, journal: Reader) -> Mapping[str, Account]:
         """Take the router's journal; the accounts in it."""
-        message = read_journal(journal, self._journal.end, self._windows, self._shape[1])
+        message = read_journal(journal, self._journal.end, self._windows, self._extent)
         self._journal.add(message, message.count)
         return message.links
 
@@ -241,10 +243,12 @@ class Joiner:
             for name in ("sent", "alarms")
         )
         inputs = None
-        if self._loop is not None:
+        if self._extent.inputs:
             u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
             inputs = InputSlots(u, failed)
-        true = _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._measures else None
+        true = (
+            _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._extent.measures else None
+        )
         return Slots(first, x, nu, receivers, sent, alarms, inputs, true)
 
 

@@ -23,6 +23,7 @@ from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.schemes import scheme_of
 from emulator.runs.expectation import expected_traces_of
 from emulator.runs.folder import new_folder
+from emulator.runs.held import HeldFolder
 from emulator.runs.histogram import SlotHistograms
 from emulator.runs.joined import concatenated
 from emulator.runs.judge import replay_of
@@ -73,10 +74,13 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
     started = time.monotonic()
     failure: RunError | None = None
     merger = Merger(scenario, plan.mode)
+
+    def ending(how: str) -> Ending:
+        return Ending(time.monotonic() - started, how, replay_of(folder, scenario, plan.mode.value))
+
     with stop_on_signals() as stop, connected(plan.scheduler) as client:
         tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
-        new_folder(folder)
-        with said_of(folder):
+        with contextlib.closing(HeldFolder(new_folder(folder))) as held, said_of(folder):
             write_resolved(folder, scenario)
             with (
                 ResultsWriter.of(folder, scenario) as writer,
@@ -85,16 +89,20 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
                 try:
                     for result in results:
                         merger.add(result, writer)
+                        writer.checkpoint(merger.at, lambda: merger.summary(ending("")), lambda: merger.write(writer))
                 except RunError as error:
                     failure = error
-                merger.write(writer)
+                how = str(failure) if failure else "complete" if merger.complete else "interrupted"
+                if merger.trials:
+                    merger.write(writer)
+                    summary = merger.summary(ending(how))
+                    writer.settle(merger.at, summary)
             if not merger.trials:
-                shutil.rmtree(folder)
+                shutil.rmtree(held.now)
                 raise failure or Interrupted("interrupted before anything was done; nothing was kept")
-            how = str(failure) if failure else "complete" if merger.complete else "interrupted"
-            replay = replay_of(folder, scenario, plan.mode.value)
-            summary = merger.summary(Ending(time.monotonic() - started, how, replay))
-            write_summary(folder, summary)
+            write_summary(held.now, summary)
+            if held.now != folder:
+                tell({"event": "moved", "folder": str(held.now)})
     if failure is not None:
         raise failure
     if not merger.complete:
@@ -219,6 +227,11 @@ class Merger:
         self.trials = 0
 
     @property
+    def at(self) -> str:
+        """How far it came."""
+        return f"{self.trials} of {self._scenario.trials} trials"
+
+    @property
     def complete(self) -> bool:
         """Whether every trial has every slot."""
         done = (tally.done == tally.slots for totals in self._totals for tally in totals.tallies.values())
@@ -256,9 +269,8 @@ class Merger:
 
     @np.errstate(over="ignore")
     def write(self, writer: ResultsWriter) -> None:
-        """Write the rows of all slots that some trial came to."""
-        if not self.trials:
-            return
+        """Write the rows of all slots that some trial came to, in place of those that were written before."""
+        writer.restart_slots()
         expected = expected_traces_of(self._scenario)
         for name in self._scenario.receivers:
             sums = self._sums[name].measured()

@@ -1,7 +1,7 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
-Its news go to standard output, a JSON object a line: `{"event": "started"}`, then four times a second `{"event":
-"progress", …}`, every second `{"event": "alive"}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
+Its news go to standard output, a JSON object a line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
+times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
 and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole. An observer that was started by
 hand then prints the table and the verdict that `evedrop run` prints.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import time
 import traceback
 from collections.abc import Mapping
@@ -22,28 +21,39 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
-from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError, UsageError
+from emulator.entry import heeded
+from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.model.answers import NoAnswer
+from emulator.model.digest import Blocks
+from emulator.model.eavesdroppers import ANSWERS
 from emulator.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from emulator.network.declared import Question
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
 from emulator.network.session import Session
 from emulator.network.telemetry import is_held, is_leaving, read_leaving
-from emulator.network.wire import Reader
+from emulator.network.whereabouts import is_whereabouts, read_whereabouts
+from emulator.network.wire import Reader, is_refusal, read_refusal
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
-from emulator.runs.joined import Joiner, Slots
+from emulator.runs.heartbeat import set_news_apart, tell
+from emulator.runs.held import HeldFolder
+from emulator.runs.joined import Joiner
 from emulator.runs.judge import replay_of
-from emulator.runs.news import set_news_apart, tell
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
+from emulator.runs.rows import DigestRows, write_rows
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
+from emulator.runs.stall import Stall, patience_of
 from emulator.runs.stand_in import StandIn
+from emulator.runs.status import status_of
 from emulator.runs.steering import Steering
+from emulator.runs.summary_file import unwritten
+from emulator.runs.verification import Verifier, extent_of
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
@@ -52,8 +62,7 @@ if TYPE_CHECKING:
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
-_BEAT_SECONDS = 1.0
-_ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
+_ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone
 
 
 def observe(brief: Brief, serve: str | None = None) -> int:
@@ -64,13 +73,14 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     """
     stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     set_news_apart()
     by_hand = not brief.ends_with_stdin
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
+    ANSWERS.learn(brief.part["classes"])  # so that the classes themselves need not run here
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario, confirmations, by_hand)
     if by_hand:
@@ -81,6 +91,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     viewer = None if stand is None else observation.show(stand)
     status, how = 0, "complete"
     try:
+        observation.hold()
         write_resolved(observation.folder, scenario)
         with observation.writer():
             try:
@@ -89,8 +100,11 @@ def observe(brief: Brief, serve: str | None = None) -> int:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
             finally:
                 tell("finishing")
+            observation.settle(how)
     except OSError as error:
-        status, how = RunError.exit_status, _unwritten(error)
+        status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)
+    except NoAnswer as error:  # of a class that the operator's change of a link has a question for
+        status, how = RunError.exit_status, f"an eavesdropper's class could not say what theory expects of it: {error}"
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
@@ -98,22 +112,6 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     if viewer is not None:
         viewer.stop()
     return status
-
-
-def _print_ending(folder: Path, status: int, how: str) -> None:
-    """Print what `evedrop run` prints at its end: the table, the verdict, and why the run failed. Nobody has to listen."""
-    from emulator.runs.closing import print_results  # noqa: PLC0415 - a launched observer has no use for it
-
-    with suppress(UsageError, OSError):
-        print_results(folder)
-        sys.stdout.flush()
-    if status not in {0, 1}:
-        print(f"evedrop: {how}", file=sys.stderr, flush=True)  # noqa: T201 - nobody else says it
-
-
-def _unwritten(error: OSError) -> str:
-    """What a summary and a message say of results that could not be written."""
-    return f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again"
 
 
 def _end_orphaned() -> None:
@@ -130,16 +128,20 @@ class Observation:
         self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
         """by_hand: whether nobody has launched the others who would end them."""
-        self.folder = Path(brief.part["results"])
+        self._place = Path(brief.part["results"])
+        self._held: HeldFolder | None = None
+        self._final: dict[str, Any] | None = None
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
-        self._shape = (len(scenario.process.A), scenario.trials)
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        table, plant = scenario.controller, scenario.driven
-        loop = None if table is None or plant is None else (plant.inputs, table.period)
-        measures = plant is not None and plant.output_matrix is not None
-        self._joiner = Joiner(windows, self._shape, scenario.record_trials, loop, measures)
+        blocks = {name: Blocks(scenario.slots, scenario.cuts(name)) for name in scenario.digested}
+        table = scenario.controller
+        self._extent = extent_of(scenario, brief.flow.batch)
+        self._verifier = Verifier(blocks, scenario.record_trials, scenario.first_trial)
+        period = None if table is None else table.period
+        self._joiner = Joiner(self._extent, windows, blocks, period, self._verifier.report)
+        self._digest_rows = DigestRows(self._joiner.digests, scenario.first_trial)
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[dict[str, Any]] = []
@@ -149,13 +151,25 @@ class Observation:
         self._live: str | None = brief.part["live"]
         self._showing: Showing | None = None
         self._writer: ResultsWriter
-        self._started = self._ended = self._told = self._beaten = time.monotonic()
+        self._started = self._ended = self._told = time.monotonic()
         self._suspects: list[str] = []
+        self._accused: tuple[str, ...] = ()
+        """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
+        self._stall: Stall
         self._outages: list[Mapping[str, Any]] = []
         self._misdelivered: dict[str, int] = {}
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
+
+    @property
+    def folder(self) -> Path:
+        """The results folder, also if it was renamed. Raises FileNotFoundError if it was removed."""
+        return self._place if self._held is None else self._held.now
+
+    def hold(self) -> None:
+        """Keep hold of the results folder from now on. Raises OSError if there is none."""
+        self._held = HeldFolder(self._place)
 
     def show(self, stand: Stand) -> Viewer:
         """A viewer for browsers, which the run will be streamed to."""
@@ -171,8 +185,8 @@ class Observation:
 
     def conduct(self, stop: Stop) -> None:
         """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
-        with Session(self._brief, meanwhile=lambda: self._wait(stop)) as session:
-            conductor = Conductor(session, self._scenario.digested, stop, self._beat, self._scenario.relayed)
+        with Session(self._brief, meanwhile=stop.check) as session:
+            conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
                 self._recording = open_recording(
@@ -182,6 +196,9 @@ class Observation:
             patience = self._brief.flow.longest_outage
             self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
+            batch = self._brief.flow.batch
+            limit = patience_of(patience, self._scenario.pace, batch)
+            self._stall = Stall(limit, batch, lambda: conductor.ask("where"))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -195,8 +212,11 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
+                    self._save()
+                    self._look(conductor)
             except EvedropError as error:
-                self._suspects = conductor.missing if isinstance(error, RunError) else []
+                self._suspects = conductor.missing
+                self._accused = error.at_fault if isinstance(error, RunError) else ()
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
@@ -204,7 +224,6 @@ class Observation:
                 self._dismiss(conductor)
                 self._recovery.give_up(self._joiner.done)
                 self._outages = self._recovery.account()
-                self._writer.digest_rows(self._scenario.first_trial, self._joiner.digests)
                 self._ended = time.monotonic()
             tell("over")
             try:
@@ -214,10 +233,14 @@ class Observation:
                 if session.dropped:
                     self._misdelivered[OBSERVER] = session.dropped
 
-    def _wait(self, stop: Stop) -> None:
-        """What is done while there is no router yet."""
-        stop.check()
-        self._beat()
+    def _look(self, conductor: Conductor) -> None:
+        """See whether a process that is there keeps the run waiting."""
+        done, at = self._joiner.done, self._steering.at
+        held = at is not None and done >= at
+        present = set(self._scenario.digested) - conductor.absent
+        beside = (CONTROLLER,) if done < self._scenario.slots else ()
+        missing = bool(conductor.missing)
+        self._stall.look(done, lambda: self._joiner.places(present), beside, held=held, missing=missing)
 
     @property
     def _control(self) -> Control:
@@ -258,32 +281,25 @@ class Observation:
 
     def _dismiss(self, conductor: Conductor) -> None:
         """The run is over: nobody can get at it, and whoever waits is told."""
-        remove_control(self.folder)
+        with suppress(FileNotFoundError):
+            remove_control(self.folder)
         self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
         while not conductor.questions.empty():
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
 
     def _status(self, conductor: Conductor) -> dict[str, Any]:
-        """How the run is doing, as docs/protocol.md has it."""
-        steering, now = self._steering, time.monotonic()
+        """How the run is doing."""
         before, done = self._recent
-        links = {}
-        for name, tally in self._keeper.totals.tallies.items():
-            account = tally.link
-            fraction = account["delivered"] / account["offered"] if account["offered"] else None
-            links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
-        return {
-            "slot": self._joiner.done,
-            "slots": self._scenario.slots,
-            "slots_per_second": 0.0 if steering.paused else (self._joiner.done - done) / max(now - before, 1e-3),
-            "state": "paused" if steering.paused else "running" if steering.at is None else "held",
-            "processes": conductor.processes,
-            "links": links,
-            "events": steering.events,
-        }
+        rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)
+        return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.totals)
 
     def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
         message = Reader(conductor.keys[source], payload)
+        if is_refusal(message):
+            raise read_refusal(message, source)
+        if is_whereabouts(message):
+            self._stall.take(source, read_whereabouts(message, self._scenario.slots))
+            return
         if not self._news(source, message):
             return
         if source == ROUTER:
@@ -303,8 +319,10 @@ class Observation:
         slots = self._joiner.take()
         if slots is None:
             return
+        self._verifier.joined(slots)
         scored = self._keeper.add(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
+        self._digest_rows.write(self._writer)
         if self._recording is not None:
             self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
         conductor.report(self._joiner.done)
@@ -332,7 +350,7 @@ class Observation:
 
     def _leave(self, name: str, message: Reader) -> None:
         """Report for a receiver from now on, until it is back."""
-        k, left = read_leaving(message, self._shape)
+        k, left = read_leaving(message, self._extent)
         away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
         if away is None:
             raise message.malformed(f"a leave before slot {k}", "one where an event makes the receiver leave")
@@ -341,15 +359,9 @@ class Observation:
         def put(payload: bytes) -> None:
             self._joiner.report(name, Reader(key, payload))
 
+        self._verifier.left(name, k, left)
         self._steering.left(name, k)
         self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
-
-    def _beat(self) -> None:
-        """Show the launcher that we live, when there is nothing else to tell."""
-        now = time.monotonic()
-        if now - self._beaten >= _BEAT_SECONDS:
-            self._beaten = now
-            tell("alive")
 
     def _progress(self, scored: Mapping[str, Scored]) -> None:
         now = time.monotonic()
@@ -361,46 +373,70 @@ class Observation:
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
         tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
 
-    def finish(self, status: int, how: str) -> int:
-        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
-        safe = self._recording.close() if self._recording is not None else True
+    @property
+    def _at(self) -> str:
+        """How far the run came."""
+        return f"slot {self._joiner.done}"
+
+    def _save(self) -> None:
+        """Have on disk what was measured, from time to time. Raises RunError if it cannot be written."""
+        try:
+            with suppress(NoAnswer):  # which is told at the end; rows are written before figures are asked for
+                self._writer.checkpoint(self._at, self._so_far)
+        except OSError as error:
+            raise RunError(unwritten(error)) from error
+
+    def _so_far(self) -> dict[str, Any]:
+        """The summary of a run that goes on."""
+        self._ended = time.monotonic()
+        return self._summary("")
+
+    def _summary(self, how: str) -> dict[str, Any]:
+        """The summary by now; a shard leaves its score for the run's."""
+        folder = self.folder
         if self._brief.part["shard"]:
-            with suppress(OSError):  # of a full disk, which the summary says
-                leave(self._keeper.totals, self.folder)
+            leave(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
-        replay = replay_of(self.folder, self._scenario)
+        replay, wall = replay_of(folder, self._scenario), self._ended - self._started
         ending = Ending(
-            self._ended - self._started,
+            wall,
             how,
             replay,
             events=self._events,
             outages=self._outages,
+            accused=self._accused,
             misdelivered=self._misdelivered,
         )
-        summary = summary_of(self._scenario, self._keeper.totals, digests, ending)
-        if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
-            status = RunError.exit_status
-            summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
-        if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
-            status = 1
+        return summary_of(self._scenario, self._keeper.totals, digests, ending)
+
+    def settle(self, how: str) -> None:
+        """Have all that was measured on disk, its summary too. Raises OSError if it cannot be written."""
+        self._digest_rows.write(self._writer)
+        self._final = self._summary(how)
+        self._writer.settle(self._at, self._final)
+
+    def finish(self, status: int, how: str) -> int:
+        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
+        safe = self._recording.close() if self._recording is not None else True
         try:
+            summary = {**(self._final or self._summary(how)), "ended": how}
+            if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
+                status = RunError.exit_status
+                summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+            if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
+                status = 1
+            how = str(summary["ended"])
             write_summary(self.folder, summary)
         except OSError as error:
-            status = RunError.exit_status
-            summary["ended"] = _unwritten(error)
+            status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell("ended", status=status, how=summary["ended"], suspects=self._suspects, view=view)
+        accused = list(self._accused)
+        tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
         if self._by_hand:
-            _print_ending(self.folder, status, str(summary["ended"]))
+            from emulator.runs.closing import print_ending  # noqa: PLC0415 - a launched observer has no use for it
+
+            with suppress(FileNotFoundError):
+                print_ending(self.folder, status, how)
         if not safe:
             os._exit(status)
         return status
-
-
-def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
-    """All rows of some slots."""
-    for name, one in scored.items():
-        writer.slot_rows(slots.first, name, one.sums, one.expected)
-    writer.input_rows(slots, first_trial)
-    writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
-    writer.journal_rows(slots)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from io import StringIO
+from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -33,13 +36,38 @@ News = Mapping[str, Any]
 _DIGEST_WIDTH = 100  # columns of a terminal that has room for digests
 
 
+class _Unfailing:
+    """A stream that forgets what cannot be written to it: the terminal may be closed while the run is ended in order."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _unfailing(stream: TextIO | None) -> TextIO:
+    return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
+
+
 class ProgressLine:
     """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
 
     def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
-        self.console = Console(stderr=True, highlight=False, markup=False)
+        self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
+        self.moved: Path | None = None
+        """Where the results folder is, if it was renamed."""
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -83,6 +111,11 @@ class ProgressLine:
             )
         elif kind == "reconnected" and not self._quiet:
             self.console.print(outage_line(news), soft_wrap=True)
+        elif kind == "moved":
+            self.moved = Path(news["folder"])
+            self.console.print(
+                f"the results folder was renamed while the run went on; it is {self.moved}", soft_wrap=True
+            )
         elif kind == "ended" and news.get("view"):
             self.console.print(f"the view stopped early: {news['view']}")
 

@@ -5,163 +5,53 @@ Source: docs/results.md.
 
 from __future__ import annotations
 
-import json
-import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import errno
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from emulator.errors import UsageError
-from emulator.model.digest import DIGEST_BYTES, Digests
+from emulator.model.digest import Digests
 from emulator.model.links.link import REASONS
 from emulator.model.plant import Plant
 from emulator.model.process import Floats
 from emulator.model.receiver import Action, Codes, Flags
 from emulator.network.access import CONTROLLER
 from emulator.network.wire import packed_flags
-from emulator.runs.folder import private_file, write_private
+from emulator.runs.growing import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish, write_figures
+from emulator.runs.held import HeldFolder
 from emulator.runs.histogram import LEVELS
-from emulator.runs.input_table import input_columns, inputs_schema, inputs_schema_in
+from emulator.runs.input_table import input_columns, inputs_schema
 from emulator.runs.joined import Slots
+from emulator.runs.reading import Results, load_results
 from emulator.runs.score import SlotSums
+from emulator.runs.summary_file import plain, summary_text, write_summary
+from emulator.runs.tables import ACTIONS, DIGESTS, JOURNAL, NULLABLE, SENT, SLOTS, trials_schema
 from emulator.scenario import Scenario
 from emulator.scenario.disturbances import disturbances_of
 
-_ROWS = 65_536  # rows of a table held back until they are worth writing
-_BYTES = 16 * 2**20  # the same of wide rows, as a journal's of many trials are; and a row group has no more
+_ROUND_SECONDS = 3.0  # at the longest from one round to the next: what a killed writer loses
+_ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # held back at the most, at the start of a run and later
+_ROUND_SHARE = 8  # of what is on disk, so much less may be held back
+_FIGURES_SHARE = 50  # so many times as long as figures took nothing is spent on them
 
-SLOTS = pa.schema(
-    [
-        ("slot", pa.int64()),
-        ("peer", pa.dictionary(pa.int8(), pa.string())),
-        ("trials", pa.int64()),
-        ("mean_squared_error", pa.float64()),
-        ("mean_actual_trace_covariance", pa.float64()),
-        ("standard_error", pa.float64()),
-        ("mean_trace_covariance", pa.float64()),
-        ("expected_trace_covariance", pa.float64()),
-        ("received_fraction", pa.float64()),
-        ("used_fraction", pa.float64()),
-        *((f"{quantity}_quantile_{level:g}", pa.float64()) for quantity in ("error", "trace") for level in LEVELS),
-    ]
-)
-JOURNAL = pa.schema(
-    [
-        ("slot", pa.int64()),
-        ("link", pa.dictionary(pa.int8(), pa.string())),
-        ("offered", pa.int64()),
-        ("delivered", pa.int64()),
-        ("late", pa.int64()),
-        ("lost", pa.int64()),
-        *((f"lost_by_{reason}", pa.int64()) for reason in REASONS),
-        ("delivered_mask", pa.binary()),
-    ]
-)
-ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
-"""What a receiver did, as the observer knows it: `misled` is an innovation used as the state."""
-SENT = ("state", "innovation", "nothing")
-"""What a packet was."""
-
-
-NULLABLE = {
-    "mean_squared_error",
-    "mean_actual_trace_covariance",
-    "expected_trace_covariance",
-    *(field.name for field in SLOTS if "quantile" in field.name),
-}
-"""Columns in which NaN means that there is nothing."""
-
-
-def _trials_schema(n: int) -> pa.Schema:
-    return pa.schema(
-        [
-            ("slot", pa.int64()),
-            ("peer", pa.dictionary(pa.int8(), pa.string())),
-            ("trial", pa.int64()),
-            ("sent", pa.dictionary(pa.int8(), pa.string())),
-            ("action", pa.dictionary(pa.int8(), pa.string())),
-            ("squared_error", pa.float64()),
-            ("trace_covariance", pa.float64()),
-            ("x", pa.list_(pa.float64(), n)),
-            ("x_hat", pa.list_(pa.float64(), n)),
-            ("P", pa.list_(pa.float64(), n * n)),
-        ]
-    )
-
-
-DIGESTS = pa.schema(
-    [
-        ("peer", pa.dictionary(pa.int8(), pa.string())),
-        ("trial", pa.int64()),
-        ("block", pa.int64()),
-        ("digest", pa.binary(DIGEST_BYTES)),
-    ]
-)
-
-
-class _Table:
-    """A Parquet file that grows. Rows are held back, as arrays of one row each slot, until they make a row group."""
-
-    def __init__(self, path: Path, schema: pa.Schema, names: Mapping[str, tuple[str, ...]]) -> None:
-        """names: what the codes of each dictionary column stand for."""
-        self._writer = pq.ParquetWriter(
-            private_file(path), schema, compression="zstd", compression_level=1, use_dictionary=[*names]
-        )
-        self._schema = schema
-        self._names = {column: pa.array(words) for column, words in names.items()}
-        self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
-        self._rows = self._bytes = 0
-
-    def add(self, columns: Sequence[NDArray[Any]]) -> None:
-        """Take rows: an array for each column, codes where it has names, and two dimensions where it holds lists or bytes."""
-        for held, column in zip(self._held, columns, strict=True):
-            held.append(np.array(column))  # a copy: a view would keep a whole message from being forgotten
-            self._bytes += held[-1].nbytes
-        self._rows += len(columns[0])
-        if self._rows >= _ROWS or self._bytes >= _BYTES:
-            self._write()
-
-    def _write(self) -> None:
-        whole = [np.concatenate(held) for held in self._held] if self._rows else []
-        at_once = max(1, self._rows * _BYTES // max(1, self._bytes))
-        for first in range(0, self._rows, at_once):
-            columns = [
-                self._column(field, values[first : first + at_once])
-                for field, values in zip(self._schema, whole, strict=True)
-            ]
-            self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
-        self._held, self._rows, self._bytes = [[] for _ in self._schema], 0, 0
-
-    def _column(self, field: pa.Field, values: NDArray[Any]) -> pa.Array:
-        if field.name in self._names:
-            return pa.DictionaryArray.from_arrays(pa.array(values.astype(np.int8)), self._names[field.name])
-        if pa.types.is_fixed_size_list(field.type):
-            return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-        if pa.types.is_fixed_size_binary(field.type):
-            return pa.FixedSizeBinaryArray.from_buffers(field.type, len(values), [None, pa.py_buffer(values)])
-        if pa.types.is_binary(field.type):
-            ends = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
-            return pa.BinaryArray.from_buffers(
-                field.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)]
-            )
-        return pa.array(values, field.type, from_pandas=field.name in NULLABLE)
-
-    def close(self) -> None:
-        try:
-            self._write()
-        finally:
-            self._writer.close()
+__all__ = [
+    "ACTIONS", "DIGESTS", "JOURNAL", "NULLABLE", "SENT", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
+    "seen_actions", "write_summary",
+]  # fmt: skip
 
 
 class ResultsWriter:
-    """Writes a results folder. Final; use it as a context manager, so that whatever ends the run, the files are whole."""
+    """Writes the tables of a results folder. Final; a context manager.
+
+    While the block runs, rows go to streams that can be read whatever ends the writer; on leaving it they become Parquet
+    files. `write_summary` then ends the folder.
+    """
 
     def __init__(
         self,
@@ -171,21 +61,37 @@ class ResultsWriter:
         around: Sequence[float] | None = None,
         loop: tuple[Plant, Floats] | None = None,
     ) -> None:
-        """around: what is added to states and estimates, (n,); loop: of a closed one, plant and disturbances (slots, q)."""
+        """around: what is added to states and estimates, (n,); loop: of a closed one, plant and disturbances (slots, q).
+
+        Raises OSError if the folder cannot be written.
+        """
         self._digested = receivers if loop is None else (*receivers, CONTROLLER)
         self._around = None if around is None or not any(around) else np.array(around)
+        self._held = HeldFolder(folder)
+        self._unfinished = Unfinished(folder)
+        self._loop = loop
         peers = {"peer": self._digested}
         words = {**peers, "sent": SENT, "action": ACTIONS}
-        self._slots = _Table(folder / "slots.parquet", SLOTS, peers)
-        self._trials = _Table(folder / "trials.parquet", _trials_schema(n), words)
-        self._journal = _Table(folder / "journal.parquet", JOURNAL, {"link": receivers})
-        self._digests = _Table(folder / "digests.parquet", DIGESTS, peers)
-        self._tables = [self._slots, self._trials, self._journal, self._digests]
-        self._loop = loop
+        self._kinds: dict[str, tuple[pa.Schema, Mapping[str, tuple[str, ...]]]] = {
+            "slots": (SLOTS, peers),
+            "trials": (trials_schema(n), words),
+            "journal": (JOURNAL, {"link": receivers}),
+            "digests": (DIGESTS, peers),
+        }
         if loop is not None:
             plant, disturbances = loop
-            self._inputs = _Table(folder / "inputs.parquet", inputs_schema(plant.inputs, disturbances.shape[1]), {})
-            self._tables.append(self._inputs)
+            self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1]), {})
+        self._streams = {name: self._stream(name, 0) for name in self._kinds}
+        self._outdated: list[Stream] = []
+        self._restarts = self._bytes = self._on_disk = self._slots = 0
+        self._at = "slot 0"
+        self._broken = self._figures_before = False
+        self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
+        self._round()
+
+    def _stream(self, name: str, number: int) -> Stream:
+        schema, names = self._kinds[name]
+        return Stream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
 
     @classmethod
     def of(cls, folder: Path, scenario: Scenario) -> Self:
@@ -203,17 +109,81 @@ class ResultsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        failures: list[Exception] = []
-        for table in self._tables:
-            try:
-                table.close()
-            except (
-                OSError,
-                pa.ArrowException,
-            ) as failure:  # one that cannot be written keeps no other from being whole
-                failures.append(failure)
-        if failures and error is None:
-            raise failures[0]
+        failure: OSError | None = None
+        try:
+            if not self._broken:
+                self._round()
+        except OSError as found:
+            failure = found
+        for stream in (*self._streams.values(), *self._outdated):
+            stream.close()
+        try:
+            finish(self._held.now)
+        except (OSError, pa.ArrowException) as found:  # what was measured stays where it is, and can be read
+            failure = failure or (found if isinstance(found, OSError) else OSError(str(found)))
+        self._unfinished.close()
+        self._held.close()
+        if failure is not None and error is None:
+            raise failure
+
+    def checkpoint(
+        self, at: str, figures: Callable[[], Mapping[str, Any]], before: Callable[[], None] = lambda: None
+    ) -> None:
+        """See to it that what was measured is on disk: within seconds, or when there is much that is not.
+
+        at: how far the run came, in words; figures: the summary so far, which is asked for more rarely if it takes long;
+        before: called before figures are asked for. Raises OSError if the disk is full or the folder is gone.
+        """
+        self._at = at
+        began = time.monotonic()
+        least, most = _ROUND_BYTES
+        if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_SHARE)):
+            return
+        if began >= self._figures_due:
+            before()
+        self._round()
+        self._round_due = time.monotonic() + _ROUND_SECONDS
+        if began >= self._figures_due:
+            self._figures_due = self._round_due
+            self.write_figures(figures())
+            # The first time theory is imported, which says nothing about the next.
+            took = time.monotonic() - began if self._figures_before else 0.0
+            self._figures_before = True
+            self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
+
+    def settle(self, at: str, figures: Mapping[str, Any]) -> None:
+        """Have everything on disk, with the last figures: nothing more will come. Raises OSError as above."""
+        self._at = at
+        self._round()
+        self.write_figures(figures)
+
+    def write_figures(self, figures: Mapping[str, Any]) -> None:
+        """Write the summary so far, of a run that did not end yet."""
+        write_figures(self._held.now, summary_text({**figures, "ended": self._at}))
+
+    def restart_slots(self) -> None:
+        """Forget the rows of all slots, for others will take their place."""
+        self._restarts += 1
+        self._outdated.append(self._streams["slots"])
+        self._streams["slots"] = self._stream("slots", self._restarts)
+
+    def _round(self) -> None:
+        if self._broken:  # what would come after a part of a batch could not be read
+            raise OSError(errno.EIO, "an earlier part could not be written")
+        self._broken = True  # unless all goes well
+        self._unfinished.round(self._at, self._slots, self._streams)
+        self._broken = False
+        self._on_disk, self._bytes = self._on_disk + self._bytes, 0
+        for stream in self._outdated:
+            stream.close()
+            (self._held.now / UNFINISHED / stream.file).unlink()
+        self._outdated = []
+
+    def _add(self, table: str, columns: Sequence[NDArray[Any]]) -> None:
+        stream = self._streams[table]
+        self._bytes += stream.add(columns)
+        if stream.held_bytes >= BATCH_BYTES:  # these rows count from the next round on
+            stream.write()
 
     def slot_rows(
         self,
@@ -235,9 +205,11 @@ class ResultsWriter:
             variance = np.maximum(0.0, sums.error_squared / trials - mean * mean) * trials / (trials - 1.0)
             standard_error = np.where(trials > 1, np.sqrt(variance / trials), np.nan)
             columns = [sums.trace / trials, expected, sums.received / trials, sums.used / trials]
+        self._slots = max(self._slots, first + count)
         nothing = np.full(count, np.nan)
         spread = quantiles if quantiles is not None else np.full((count, 2 * len(LEVELS)), np.nan)
-        self._slots.add(
+        self._add(
+            "slots",
             [
                 np.arange(first, first + count),
                 self._names(name, count),
@@ -247,7 +219,7 @@ class ResultsWriter:
                 standard_error,
                 *columns,
                 *spread.T,
-            ]
+            ],
         )
 
     def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
@@ -260,7 +232,8 @@ class ResultsWriter:
         packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, len(SENT) - 1)
         x = self._levels(slots.x[:, :, :recorded])
         for name, receiver in slots.receivers.items():
-            self._trials.add(
+            self._add(
+                "trials",
                 [
                     k,
                     self._names(name, count),
@@ -272,7 +245,7 @@ class ResultsWriter:
                     x,
                     self._levels(receiver.x_hat[:, :, :recorded]),
                     np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
-                ]
+                ],
             )
 
     def _levels(self, x: Floats) -> Floats:
@@ -284,7 +257,7 @@ class ResultsWriter:
         """A row per slot and recorded trial, the first of which is first_trial: what moved the plant."""
         if slots.inputs is None or self._loop is None:
             return
-        self._inputs.add(input_columns(slots, *self._loop, first_trial))
+        self._add("inputs", input_columns(slots, *self._loop, first_trial))
 
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
@@ -294,7 +267,8 @@ class ResultsWriter:
             delivered = np.count_nonzero(receiver.delivered, axis=1)
             by_reason = [receiver.lost[reason].astype(np.int64) for reason in REASONS]
             lost = np.sum(by_reason, axis=0)
-            self._journal.add(
+            self._add(
+                "journal",
                 [
                     np.arange(slots.first, slots.first + slots.count),
                     self._names(name, slots.count),
@@ -304,7 +278,7 @@ class ResultsWriter:
                     lost,
                     *by_reason,
                     packed_flags(receiver.delivered),
-                ]
+                ],
             )
 
     def _names(self, name: str, count: int) -> NDArray[np.int8]:
@@ -316,112 +290,10 @@ class ResultsWriter:
             for block, values in sorted(blocks.items()):
                 trials = len(values)
                 numbers = np.arange(first_trial, first_trial + trials)
-                self._digests.add([self._names(name, trials), numbers, np.full(trials, block), values])
+                self._add("digests", [self._names(name, trials), numbers, np.full(trials, block), values])
 
 
 def seen_actions(action: Codes, nu: Flags) -> Codes:
     """Indices into `ACTIONS`: what was done, with the truth about the packet's type."""
     misled = (action == Action.STATE) & nu
     return np.where(misled, np.uint8(ACTIONS.index("misled")), action)
-
-
-def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write summary.json; infinite and undefined numbers as strings, which JSON lacks."""
-    unfinished = folder / "summary.json.new"
-    write_private(unfinished, json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n")
-    os.replace(unfinished, folder / "summary.json")
-
-
-def plain(value: Any) -> Any:
-    """The same with infinite and undefined numbers as strings, which JSON lacks."""
-    if isinstance(value, Mapping):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(inner) for inner in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return str(value)
-    return value
-
-
-@dataclass(frozen=True)
-class Results:
-    """A results folder, read: `summary` as in docs/results.md, the tables as Arrow."""
-
-    folder: Path
-    summary: Mapping[str, Any]
-
-    def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
-        path = self.folder / f"{name}.parquet"
-        try:
-            table = pq.read_table(path)
-        except (OSError, pa.ArrowException) as error:
-            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
-        wanted = _trials_schema(_states_in(table.schema)) if expected is None else expected
-        if not table.schema.equals(wanted):
-            other = [field.name for field in wanted if field not in table.schema] or table.schema.names
-            raise UsageError(
-                f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
-            )
-        empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
-        if empty:
-            raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
-        return table
-
-    @property
-    def slots(self) -> pa.Table:
-        """A row per slot and peer: statistics over trials."""
-        return self._table("slots", SLOTS)
-
-    @property
-    def trials(self) -> pa.Table:
-        """A row per slot, peer and recorded trial."""
-        return self._table("trials")
-
-    @property
-    def journal(self) -> pa.Table:
-        """A row per slot and link."""
-        return self._table("journal", JOURNAL)
-
-    @property
-    def inputs(self) -> pa.Table | None:
-        """A row per slot and recorded trial of a closed loop; None without a controller."""
-        if self.summary.get("controller") is None:
-            return None
-        return self._table("inputs", inputs_schema_in(self.folder / "inputs.parquet"))
-
-    @property
-    def digests(self) -> pa.Table:
-        """A row per peer, trial and block of 256 slots."""
-        return self._table("digests", DIGESTS)
-
-
-def _states_in(schema: pa.Schema) -> int:
-    """The number of states in a table of trials, as far as it is one."""
-    x = schema.field("x").type if "x" in schema.names else None
-    return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
-
-
-def load_results(folder: str | Path) -> Results:
-    """Read a results folder. Raises UsageError if it is none, naming the file that is missing or broken."""
-    path = Path(folder) / "summary.json"
-    try:
-        summary = json.loads(path.read_text())
-    except OSError as error:
-        if (Path(folder) / "shards").is_dir():
-            raise UsageError(
-                f"{folder} is of a run in shards that goes on or was killed; each of its shards is a results folder by "
-                f"itself when it has ended, such as {Path(folder) / 'shards' / '1'}"
-            ) from error
-        raise UsageError(
-            f"{folder} is no results folder ({path.name}: {error.strerror}); give the --out of a run"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
-    parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
-    if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
-        raise UsageError(f"{path} is no summary of a run; run the scenario again")
-    return Results(Path(folder), summary)

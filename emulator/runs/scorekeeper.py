@@ -30,6 +30,7 @@ from emulator.runs.loop_tally import Acted
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.totals import Totals
 from emulator.runs.verdict import Secrecy, secrecy
+from emulator.runs.verification import verification_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials
@@ -104,8 +105,10 @@ class Ending:
     """As the summary has them."""
     outages: Sequence[Mapping[str, Any]] = ()
     """The same."""
+    accused: tuple[str, ...] = ()
+    """The processes that the run has ended with because of what they did."""
     misdelivered: Mapping[str, int] = field(default_factory=dict)
-    """The same."""
+    """Process → messages of other keys that it dropped."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -150,6 +153,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         "links": links,
         "events": list(ending.events),
         "outages": list(ending.outages),
+        "verification": verification_of(scenario, ending.accused) if ending.mode == "live" else None,
         "misdelivered": dict(ending.misdelivered),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),

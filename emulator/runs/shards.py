@@ -13,13 +13,14 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from emulator.errors import Interrupted, RunError, UsageError
 from emulator.runs.children import News
 from emulator.runs.folder import new_folder
+from emulator.runs.held import HeldFolder
 from emulator.runs.launcher import Ended, launch_one
 from emulator.runs.ports import Places, loopback_places
 from emulator.runs.viewer import Viewer
@@ -107,7 +108,7 @@ class OneProgress:
             self._latest[number] = news
             if len(self._latest) == len(self._trials):
                 self._tell(self._all())
-        else:
+        elif kind != "moved":  # with the folder of all, which is told of itself
             if kind == "ended" and number in self._latest:  # its last slots were too few to be told of
                 self._latest[number] = {**self._latest[number], "done": self._slots}
             self._tell({**news, "shard": number} if kind == "reconnected" else news)
@@ -163,7 +164,7 @@ def launch_shards(
     The view is of the first shard, which has the recorded trials.
     """
     places = _places(scenario)
-    new_folder(folder)
+    held = HeldFolder(new_folder(folder))
     shards = shards_of(scenario, folder)
     progress, course = OneProgress(shards, tell), _Course()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, places, strict=True)]
@@ -175,11 +176,21 @@ def launch_shards(
     for thread in threads:
         thread.join()
     try:
-        return Ended(_made_one(scenario, folder, shards, course, progress.started), course.viewer)
-    except BaseException:
+        now = held.now
+        if now != folder:
+            tell({"event": "moved", "folder": str(now)})
+            shards = [replace(shard, folder=now / _FOLDER / str(shard.number)) for shard in shards]
+        return Ended(_made_one(scenario, now, shards, course, progress.started), course.viewer, now)
+    except BaseException as error:
         if course.viewer is not None:
             course.viewer.stop()
+        if isinstance(error, FileNotFoundError):
+            raise RunError(
+                f"{folder} was removed while the run went on; run again, and leave it where it is"
+            ) from error
         raise
+    finally:
+        held.close()
 
 
 def _places(scenario: Scenario) -> list[Places]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -24,14 +25,17 @@ from emulator.model.eavesdroppers.eavesdropper import Knowledge
 from emulator.model.link import Fates, Link
 from emulator.model.outcomes import eavesdropper_outcomes
 from emulator.model.process import Floats, ProcessNoise, Trajectory
-from emulator.model.receiver import Codes, Flags, Receiver, trace_of
+from emulator.model.receiver import Belief, Codes, Flags, Receiver, trace_of
 from emulator.model.schemes import scheme_of
+from emulator.model.schemes.scheme import Encoder, Packet
 from emulator.model.theory import misled_covariances
+from emulator.modules import look_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.runs.acknowledging import Acknowledging
 from emulator.runs.attendance import Attendance
 from emulator.runs.briefs import StreamKeys
 from emulator.runs.filtering import true_errors
+from emulator.runs.guarding import Guard
 from emulator.runs.joined import ReceiverSlots, Slots
 from emulator.runs.loop import Loop, Source, informed
 from emulator.runs.loop_tally import Acted, SolveTimes
@@ -92,12 +96,18 @@ class Simulation:
         self._batch = Batch(scenario.slots, len(trials), trials.start)
         self._process = scenario.process.process
         self._keys = StreamKeys.of(scenario)
+        if scenario.modules is not None:
+            look_in(scenario.modules)
         self._scheme = scheme_of(self._process, scenario.encoding.spec)
+        self._guard = guard = Guard(scenario, self._scheme, self._batch)
         secret = self._keys.secret(self._scheme.secret_streams)
-        self._shared = self._scheme.shared(secret, self._batch)
-        self._initial = self._scheme.initial_state(secret, self._batch)
-        self._receivers: dict[str, Receiver] = {LEGITIMATE: informed(scenario, self._shared.estimator())}
-        self._receivers.update({name: self._eavesdropper(name) for name in scenario.eavesdroppers})
+        with guard.asking(LEGITIMATE, range(1)):
+            self._shared = self._scheme.shared(secret, self._batch)
+            self._initial = self._scheme.initial_state(secret, self._batch)
+            self._receivers: dict[str, Receiver] = {LEGITIMATE: informed(scenario, self._shared.estimator())}
+        for name in scenario.eavesdroppers:
+            with guard.asking(name, range(1)):
+                self._receivers[name] = self._eavesdropper(name)
         self._betrayed = {
             name: STRATEGIES[table.strategy].betrayed(table.parameters)
             for name, table in scenario.eavesdroppers.items()
@@ -110,7 +120,7 @@ class Simulation:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
-        return STRATEGIES[table.strategy](knowledge, self._batch)
+        return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:
         """All slots, some tens or hundreds at a time."""
@@ -129,7 +139,12 @@ class Simulation:
         for block, end in pairwise(bounds):
             for first in range(block, end, length):
                 chunk = range(first, min(first + length, end))
-                yield play(chunk, {name: links[name].fates(chunk) for name in names})
+                fates = {}
+                for name in names:
+                    with self._guard.asking_link(name, chunk):
+                        fates[name] = links[name].fates(chunk)
+                    self._guard.fates(name, chunk, fates[name])
+                yield play(chunk, fates)
 
     def _exact(self) -> Callable[[range, Mapping[str, Fates]], Chunk]:
         n, trials, slots = self._process.n, self._batch.trials, self._batch.slots
@@ -160,7 +175,7 @@ class Simulation:
             loop.begin(len(chunk))
             for row, k in enumerate(chunk):
                 true[row], x[row], predicted = loop.advance(k)
-                packet = encoder.encode(k, x[row], predicted)
+                packet = self._packet(encoder, k, x[row], predicted)
                 nu[row] = packet.nu
                 if packet.sent is not None and sent is not None:
                     sent[row] = packet.sent
@@ -168,12 +183,15 @@ class Simulation:
                         of_link.silence(row, packet.sent)
                 if back is not None:
                     arrived = back.take(k, packet.sent, {name: fate.in_time_of(row) for name, fate in fates.items()})
-                    encoder.acknowledged(k, arrived)
+                    with self._guard.asking(LEGITIMATE, range(k, k + 1)):
+                        encoder.acknowledged(k, arrived)
                     if alarms is not None:
                         alarms[row] = back.alarms
                 for name, one in present.items():
                     truth = x[row] if self._betrayed.get(name) == k else None
-                    belief = one.take(k, fates[name], row, packet.z, packet.header, truth)
+                    belief = self._belief(
+                        name, k, partial(one.take, k, fates[name], row, packet.z, packet.header, truth)
+                    )
                     if (counts := late[name]) is not None:
                         counts[:, row] = one.late, one.late_used
                     digests = logs[name].add(k, belief)
@@ -235,7 +253,7 @@ class Simulation:
             measured = self._blank(chunk, fates)
             delivered = {name: one.in_time for name, one in fates.items()}
             for row, k in enumerate(chunk):
-                nu, w = self._shared.nu(k), noise.at(k)
+                nu, w = self._nu(k), noise.at(k)
                 if trajectory is not None:
                     trajectory.advance()
                 for name, action, one in self._acts(k, row, measured, delivered):
@@ -245,7 +263,7 @@ class Simulation:
                         action,
                         nu,
                         w,
-                        lambda k=k: trajectory.predicted - self._shared.chi(k),  # type: ignore[misc, union-attr]
+                        lambda k=k: trajectory.predicted - self._chi(k),  # type: ignore[misc, union-attr]
                     )
                     covariances[name] = update.believed_covariance(self._process, k, covariances[name], action)
                     one.error[row] = (errors[name] * errors[name]).sum(axis=0)
@@ -272,11 +290,11 @@ class Simulation:
             delivered = {name: one.in_time for name, one in fates.items()}
             for row, k in enumerate(chunk):
                 for name, receiver in self._receivers.items():
-                    actions[row, places[name]] = receiver.act(k, delivered[name][row])
+                    actions[row, places[name]] = self._act(name, receiver, k, delivered[name][row])
                 believed = update.believed_covariance(self._process, k, believed, actions[row])
                 traces[row] = trace_of(believed)
                 for name, error in errors.items():
-                    action, nu = actions[row, places[name]], self._shared.nu(k)
+                    action, nu = actions[row, places[name]], self._nu(k)
                     actual[name] = update.actual_covariance(self._process, k, actual[name], action, nu, f[k])
                     error[row] = trace_of(actual[name])
             measured = {}
@@ -286,6 +304,41 @@ class Simulation:
             return Chunk(chunk.start, measured, None)
 
         return play
+
+    def _packet(self, encoder: Encoder, k: int, x: Floats, predicted: Floats) -> Packet:
+        """The packet of slot k."""
+        with self._guard.asking(LEGITIMATE, range(k, k + 1)):
+            packet = encoder.encode(k, x, predicted)
+        self._guard.packet(k, packet)
+        return packet
+
+    def _belief(self, name: str, k: int, take: Callable[[], Belief]) -> Belief:
+        """A receiver's belief after slot k."""
+        with self._guard.asking(name, range(k, k + 1)):
+            belief = take()
+        self._guard.belief(name, k, belief)
+        return belief
+
+    def _nu(self, k: int) -> Flags:
+        """ν_k, (R,)."""
+        with self._guard.asking(LEGITIMATE, range(k, k + 1)):
+            nu = self._shared.nu(k)
+        self._guard.shared(k, nu)
+        return nu
+
+    def _chi(self, k: int) -> Floats:
+        """χ_k, (n, R)."""
+        with self._guard.asking(LEGITIMATE, range(k, k + 1)):
+            chi = self._shared.chi(k)
+        self._guard.shared(k, self._shared.nu(k), chi)
+        return chi
+
+    def _act(self, name: str, receiver: Receiver, k: int, gamma: Flags) -> Codes:
+        """A receiver's action in slot k, (R,)."""
+        with self._guard.asking(name, range(k, k + 1)):
+            action = receiver.act(k, gamma)
+        self._guard.acted(name, k, action)
+        return action
 
     def _misled(self) -> set[str]:
         """Receivers that may take an innovation for the state."""
@@ -308,6 +361,6 @@ class Simulation:
     ) -> Iterator[tuple[str, Codes, Measured]]:
         """Every receiver's action in slot k, which is one row of delivered (c, R)."""
         for name, one in measured.items():
-            action = self._receivers[name].act(k, delivered[name][row])
+            action = self._act(name, self._receivers[name], k, delivered[name][row])
             one.action[row] = action
             yield name, action, one

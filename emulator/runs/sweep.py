@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import re
 import shutil
 import time
@@ -32,6 +33,7 @@ Grid = Mapping[str, Sequence[Any]]
 Point = Mapping[str, Any]
 
 _MOST_POINTS = 10_000
+_WRITE_SECONDS = 3.0  # from one table of what is done to the next
 _RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and nothing that makes a list of it
 _WHOLE = re.compile(r"[+-]?\d+")
 
@@ -96,41 +98,57 @@ def sweep_over(
     rows: list[dict[str, Any]] = []
     failure: RunError | None = None
     done = 0
+    description = {"scenario": str(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
     with stop_on_signals() as stop, connected(plan.scheduler) as client:
         new_folder(folder)
         told = teller(tell, total)
         everything = list(itertools.chain(*tasks))
-        with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
-            try:
-                for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
-                    summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
-                    if summary is None:
-                        break
-                    rows += _rows(point, scenario, summary)
-                    done += 1
-            except RunError as error:
-                failure = error
-    if not rows:
-        shutil.rmtree(folder)
-        raise failure or Interrupted("interrupted before a point was done; nothing was kept")
-    table = pa.Table.from_pylist(rows)
-    description = {"scenario": str(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
-    from emulator.view.sweeps import draw  # noqa: PLC0415 - matplotlib takes half a second
-
-    with said_of(folder):
-        pq.write_table(table, private_file(folder / "sweep.parquet"))
-        text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
-        write_private(folder / "sweep.json", text + "\n")
-        draw(private_pictures(folder / "sweep"), table, tuple(grid))
-        if HOUSE_FIGURES[0] in table.column_names:
-            from emulator.view.household_sweep import draw as draw_household  # noqa: PLC0415 - as above
-
-            draw_household(private_pictures(folder / "household"), table, next(iter(grid)))
+        with said_of(folder):
+            text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
+            write_private(folder / "sweep.json", text + "\n")
+            with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+                written = time.monotonic()
+                try:
+                    for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
+                        summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
+                        if summary is None:
+                            break
+                        rows += _rows(point, scenario, summary)
+                        done += 1
+                        if time.monotonic() - written > _WRITE_SECONDS:
+                            _write_table(folder, rows)
+                            written = time.monotonic()
+                except RunError as error:
+                    failure = error
+            if not rows:
+                shutil.rmtree(folder)
+                raise failure or Interrupted("interrupted before a point was done; nothing was kept")
+            table = _write_table(folder, rows)
+            _draw(folder, table, grid)
     if failure is not None:
         raise failure
     if done < len(scenarios):
         raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
     return table
+
+
+def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
+    """Write the table of the points so far, whole at any moment."""
+    table = pa.Table.from_pylist(rows)
+    unfinished = folder / "sweep.parquet.new"
+    pq.write_table(table, private_file(unfinished))
+    os.replace(unfinished, folder / "sweep.parquet")
+    return table
+
+
+def _draw(folder: Path, table: pa.Table, grid: Grid) -> None:
+    from emulator.view.sweeps import draw  # noqa: PLC0415 - matplotlib takes half a second
+
+    draw(private_pictures(folder / "sweep"), table, tuple(grid))
+    if HOUSE_FIGURES[0] in table.column_names:
+        from emulator.view.household_sweep import draw as draw_household  # noqa: PLC0415 - as above
+
+        draw_household(private_pictures(folder / "household"), table, next(iter(grid)))
 
 
 def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:

@@ -5,7 +5,6 @@ Source: docs/testing.md.
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +12,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from emulator.api import default_folder
 from emulator.collect import scenarios_in
 from emulator.errors import RunError, ScenarioError, UsageError
-from emulator.runs.folder import make_private
+from emulator.runs.folder import claimed, default_folder
 from emulator.runs.judge import told
 from emulator.runs.launcher import launch
 from emulator.runs.montecarlo import Plan, simulate
@@ -104,13 +102,13 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 
     try:
         made = load(scenario, changes)
-        folder = _claimed(default_folder(scenario) if manner.out is None else manner.out / Path(scenario).stem)
+        folder = claimed(default_folder(scenario) if manner.out is None else manner.out / Path(scenario).stem)
     except ScenarioError as error:
         return ended(Outcome.MISTAKES, error.mistakes)
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)])
     try:
-        _run(made, folder, manner)
+        folder = _run(made, folder, manner)
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
     except RunError as error:
@@ -119,31 +117,16 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, seed=made.seed, folder=folder)
 
 
-def _run(scenario: Scenario, folder: Path, manner: Manner) -> None:
+def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
+    """Run a scenario into a folder; where the results are."""
     if manner.in_memory:
         simulate(scenario, folder, _silent, Plan(workers=manner.workers))
-    else:
-        launch(scenario, folder, "off", None, _silent)
+        return folder
+    return launch(scenario, folder, "off", None, _silent).folder
 
 
 def _silent(news: Mapping[str, Any]) -> None:
     del news
-
-
-def _claimed(wanted: Path) -> Path:
-    """A new folder of that name, or with a number after it: tests of the same name run at the same time."""
-    for number in itertools.count(1):
-        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-        try:
-            make_private(folder, exist_ok=False)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise UsageError(
-                f"{folder} cannot be made ({error.strerror}); give another folder for the results"
-            ) from error
-        return folder
-    raise AssertionError  # there is always another number
 
 
 def _reasons(summary: Mapping[str, Any]) -> Iterator[str]:

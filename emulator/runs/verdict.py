@@ -160,7 +160,8 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     known = user_theory.known and theirs.known
     user_bound = user_theory.limit if user_theory.known else math.inf
     perfect_by_theory = (math.isfinite(user_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
-    perfect_by_theory = perfect_by_theory if known else None
+    # A limit too large to be worked out promises nothing, and denies nothing.
+    perfect_by_theory = perfect_by_theory if known and not math.isnan(user_bound + theirs.limit) else None
     complete = user.done == user.slots
     slots = user.slots if complete else max(user.done, 2)
     gap = theirs.traces(slots) - user_theory.traces(slots)

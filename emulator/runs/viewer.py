@@ -160,12 +160,12 @@ class Viewer:
         end(self._process)
 
 
-def open_run(run: Path, mode: str, stand: Stand | None = None) -> Viewer:
-    """A viewer with the recording of a finished run's results folder; for browsers, at a stand if there is one.
+def open_run(run: Path, mode: str, stand: Stand | None = None, recording: Path | None = None) -> Viewer:
+    """A viewer with the recording of a results folder, or another of the same run; for browsers, at a stand if there is one.
 
     Raises UsageError if there is none, or no viewer can be started.
     """
-    recording = run / "recording.rrd"
+    recording = run / "recording.rrd" if recording is None else recording
     if not recording.is_file():
         raise UsageError(f"{recording} does not exist; give the results folder of a run made without --view off")
     if stand is not None:

@@ -16,7 +16,8 @@ from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
-from emulator.errors import RunError, UsageError
+from emulator.entry import SIGNALS
+from emulator.errors import EvedropError, RunError, UsageError
 from emulator.model.registry import place_of
 from emulator.runs.environment import own_environment
 from emulator.runs.trials import BatchResult, Task, carry_out
@@ -37,11 +38,16 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
             return
         try:
             result = carry_out(task, tell, stopped)
+        except EvedropError:
+            raise
         except Exception as error:
             # An error of ours shows where it comes from; one of somebody's class says what that is.
             if isinstance(error, OSError) or not foreign(task.scenario):
                 raise
-            raise RunError(f"a trial failed: {place_of(error)}; run `evedrop check` on the class it is in") from error
+            raise RunError(
+                f"one of the trials {task.start} to {task.stop - 1} failed: {place_of(error)}; run `evedrop check` on the "
+                "class it is in"
+            ) from error
         yield result
 
 
@@ -66,10 +72,10 @@ class _Worker:
         # process, which would run the caller's script a second time.
         command = f"from emulator.runs.workers import work; work({theirs.fileno()})"
         # Until it can answer to it, our own stop waits: the mask is inherited.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", command],
+                [sys.executable, "-P", "-c", command],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
@@ -152,7 +158,9 @@ def work(descriptor: int) -> None:
     """A worker's life: tasks from its pipe until it is ended, or whoever started it is gone."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    for number in (signal.SIGINT, signal.SIGHUP):  # these reach whoever started us too, who says when to stop
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     with contextlib.suppress(EOFError, OSError), Connection(descriptor) as pipe:
         while True:
             pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
@@ -163,8 +171,10 @@ def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
         return carry_out(task, tell, stopped)
     except OSError:
         raise
+    except EvedropError as error:
+        return str(error)
     except Exception as error:
-        return place_of(error)
+        return f"trials {task.start} to {task.stop - 1}: {place_of(error)}"
 
 
 @contextlib.contextmanager
@@ -222,6 +232,8 @@ def on_cluster(tasks: list[Task], client: Any, tell: Tell, stopped: Stopped) -> 
 def _result(future: Any) -> BatchResult:
     try:
         result: BatchResult = future.result()
+    except RunError as error:
+        raise RunError(f"a worker failed: {error}") from error
     except Exception as error:
         raise RunError(
             f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "

@@ -68,6 +68,8 @@ def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], se
             for name in event.names:
                 if name in links:
                     yield from _set_mistakes(f"event.{i}", event, links[name], tables, sentences)
+                elif _table(_table(tables.get("eavesdroppers")).get(name)).get("links") is not None:
+                    yield from _pooled_mistakes(f"event.{i}", name, event, tables, sentences)
     yield from _order_mistakes(events, receivers)
     yield from _jams_in_turn(events)
 
@@ -170,6 +172,16 @@ def _set_mistakes(
         yield f"{path}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
     if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
         yield f"{path}.set.loss.model: is another than at first, but the link's losses are tied to another link's"
+
+
+def _pooled_mistakes(
+    path: str, name: str, event: EventTable, tables: Mapping[str, Any], sentences: Sentences
+) -> Iterator[str]:
+    """Of an event that changes links which are pooled: they become one, of a quality or a loss model of its own."""
+    if not {"quality", "loss"} & set(event.set or {}):
+        yield f"{path}.set: {name} has several links; expected a quality or a loss, of the one link in place of them"
+        return
+    yield from _set_mistakes(path, event, LinkTable(quality=1.0), tables, sentences)
 
 
 def _order_mistakes(events: Sequence[tuple[int, EventTable]], receivers: Sequence[str]) -> Iterator[str]:

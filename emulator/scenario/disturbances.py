@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import DisturbanceError
+from emulator.model.links.checks import is_number
 from emulator.model.process import Floats
 from emulator.plant_data import found_file, read_disturbances
 from emulator.scenario.tables import Scenario
@@ -38,8 +39,8 @@ def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
     units, slots, seconds = plant.get("disturbance_units"), tables.get("slots"), tables.get("slot_seconds")
     if not isinstance(units, list) or not all(isinstance(unit, str) for unit in units):
         units = None
-    slots = slots if type(slots) is int else None
-    seconds = float(seconds) if isinstance(seconds, (int, float)) and seconds > 0 else 1.0
+    slots = slots if type(slots) is int and slots > 0 else None
+    seconds = float(seconds) if seconds and is_number(seconds, 0.0, 1e6) else 1.0
     file = plant.pop("disturbance_file")
     try:
         plant["disturbance_values"] = read_disturbances(found_file(file, Path()), names, units, slots, seconds)

@@ -5,21 +5,27 @@ Source: docs/your-own.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import astuple
+from functools import partial
 from typing import Any
 
 from emulator.conformance.eavesdroppers import EavesdropperChecks, Listening
 from emulator.conformance.links import DelayChecks, LossChecks
 from emulator.conformance.problems import Problem
-from emulator.conformance.rules import Broken
+from emulator.conformance.rules import how_broken
 from emulator.conformance.schemes import SchemeChecks
+from emulator.model.answers import NoAnswer
 from emulator.model.delays import DELAY_MODELS, delay_of
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
 from emulator.model.links import LOSS_MODELS, loss_of
+from emulator.model.process import Process
 from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.model.schemes.scheme import Scheme
 from emulator.modules import names_in
 from emulator.network.access import LEGITIMATE
-from emulator.scenario.tables import Scenario
+from emulator.scenario.table import model_mistakes
+from emulator.scenario.tables import EavesdropperTable, Scenario
 from emulator.scenario.words import as_toml
 from emulator.streams import Batch
 
@@ -44,29 +50,50 @@ def dry_run(scenario: Scenario) -> list[str]:
     kind = SCHEMES[scenario.encoding.scheme]
     if SCHEMES.foreign(scenario.encoding.scheme):
         check = SchemeChecks(lambda process: scheme_of(process, spec), kind).shapes
-        broken = _broken(check, problem)
+        broken = how_broken(check, problem)
         if broken is not None:
             return [*found, f"encoding.scheme: is {as_toml(scenario.encoding.scheme)}; in a dry run: {broken}"]
     for name, table in scenario.eavesdroppers.items():
         entry = "strategy" if table.reads_as is None else "reads_as"
         if not SCHEMES.foreign(scenario.encoding.scheme) and not STRATEGIES.foreign(getattr(table, entry)):
             continue
-        strategy = STRATEGIES[table.strategy]
-        listening = Listening(
-            table.strategy, strategy, table.parameters, lambda process: scheme_of(process, spec), kind
-        )
-        broken = _broken(EavesdropperChecks(listening).shapes, problem)
+        broken = _eavesdropper_broken(scenario, table, entry, batch)
         if broken is not None:
             found.append(f"eavesdroppers.{name}.{entry}: is {as_toml(getattr(table, entry))}; in a dry run: {broken}")
     return found
 
 
-def _broken(check: Callable[[Problem], None], problem: Problem) -> str | None:
+def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: str, batch: Batch) -> str | None:
+    """What breaks when an eavesdropper hears the scheme; a class that is not built in is put to work in a process of its own."""
+    spec, name = scenario.encoding.spec, getattr(table, entry)
+    if not STRATEGIES.foreign(name):
+        kind = SCHEMES[scenario.encoding.scheme]
+        strategy = STRATEGIES[table.strategy]
+        make = partial(_scheme, spec)
+        checks = EavesdropperChecks(Listening(table.strategy, strategy, table.parameters, make, kind))
+        return how_broken(checks.shapes, Problem(scenario.process.process, batch))
+    public = scenario.process
+    process = (public.A, public.Q, public.initial_covariance, public.singular_noise)
+    registry = "STRATEGIES" if entry == "strategy" else "READERS"
     try:
-        check(problem)
-    except Broken as error:
+        found = ANSWERS.ask(name, "dry_run", registry, table.strategy, table.parameters, spec, process, astuple(batch))
+        if found is None:
+            _ask_for_theory(scenario, table)
+    except NoAnswer as error:
         return str(error)
-    return None
+    return None if found is None else str(found)
+
+
+def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
+    """Raise NoAnswer if what a class claims of its outcomes is no answer."""
+    outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, scenario.encoding.mu_d)
+    if outcomes_at is not None:
+        for quality in (0.0, 0.5, 1.0):
+            outcomes_at(quality)
+
+
+def _scheme(spec: Mapping[str, Any], process: Process) -> Scheme:
+    return scheme_of(process, spec)
 
 
 def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
@@ -75,7 +102,21 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
         link = scenario.link(receiver)
         yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
     for i, event in enumerate(scenario.event):
-        yield from _settings_mistakes(f"event.{i}.set", event.set or {}, problem)
+        # What is wrong with the models of an event shows across tables, and is told there.
+        if event.set is not None and not _model_mistakes(event.set):
+            yield from _settings_mistakes(f"event.{i}.set", event.set, problem)
+
+
+def _model_mistakes(settings: Mapping[str, Any]) -> bool:
+    """Whether a loss or delay model cannot be made as it is described."""
+    for name, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS)):
+        found = settings.get(name)
+        if found is not None and not isinstance(found, Mapping):
+            return True
+        given = {entry: value for entry, value in (found or {}).items() if entry != "unit"}
+        if found is not None and model_mistakes(name, given, models):
+            return True
+    return False
 
 
 def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
@@ -83,12 +124,12 @@ def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem)
     for spec in losses["links"] if losses and losses["model"] == "pooled" else [losses] if losses else []:
         if LOSS_MODELS.foreign(spec["model"]):
             check = LossChecks(lambda spec=spec: loss_of(spec), LOSS_MODELS[spec["model"]]).shapes  # type: ignore[misc]
-            broken = _broken(check, problem)
+            broken = how_broken(check, problem)
             if broken is not None:
                 yield f"{path}.loss.model: is {as_toml(spec['model'])}; in a dry run: {broken}"
     delay = settings.get("delay")
     if delay and DELAY_MODELS.foreign(delay["model"]):
         given = {name: value for name, value in delay.items() if name != "unit"}
-        broken = _broken(DelayChecks(lambda: delay_of(given), DELAY_MODELS[delay["model"]]).shapes, problem)
+        broken = how_broken(DelayChecks(lambda: delay_of(given), DELAY_MODELS[delay["model"]]).shapes, problem)
         if broken is not None:
             yield f"{path}.delay.model: is {as_toml(delay['model'])}; in a dry run: {broken}"

@@ -6,6 +6,7 @@ Source: docs/scenario.md.
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
@@ -18,6 +19,7 @@ from pydantic import (
 )
 
 from emulator.errors import ScenarioError, UsageError
+from emulator.files import Unreadable, is_folder, is_there, shown, text_of
 from emulator.model.registry import place_of
 from emulator.modules import named_in
 from emulator.scenario.disturbances import disturbances_beside, disturbances_read
@@ -27,6 +29,16 @@ from emulator.scenario.filter_noise import filter_noise_read
 from emulator.scenario.mistakes import across_tables, sentences
 from emulator.scenario.recordings import beside, read_recordings
 from emulator.scenario.tables import Scenario
+from emulator.scenario.values import unusable
+
+MOST_BYTES = 2**28
+"""Of a scenario file: room for the outcomes of millions of packets inside it."""
+MOST_VALUES = 1_000_000
+"""In lists of a scenario file: more would take longer to read than anybody waits."""
+_MOST_DOTS = 32
+# Python's reader of TOML takes a time that grows with the square of a key's parts.
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
+_DOTTED = re.compile(rf"""(?<![A-Za-z0-9_"'.-])(?:{_PART}){{{_MOST_DOTS}}}""")
 
 
 def shipped() -> dict[str, Path]:
@@ -55,30 +67,27 @@ def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond
     """
     path = shipped().get(str(source), Path(source))
     # A shipped scenario names nothing in its folder: what a change names is in the current one.
-    folder = Path() if str(source) in shipped() else path if path.is_dir() else path.parent
-    return parse(read(source), str(source), changes, beyond_horizon=beyond_horizon, folder=folder)
+    folder = Path() if str(source) in shipped() else path if is_folder(path) else path.parent
+    return parse(read(source), shown(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def read(source: str | Path) -> str:
     """The text of a shipped scenario or a file."""
     path = shipped().get(str(source), Path(source))
+    if is_folder(path):
+        path = path / "scenario.toml"
+        if not is_there(path):
+            raise UsageError(f"{shown(source)} is a folder without a scenario.toml; give a scenario's name or file")
     try:
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise UsageError(f"{source} is neither a file nor a folder; give a scenario's name or file")
-        return path.read_text(encoding="utf-8-sig")
-    except IsADirectoryError as error:
-        inner = path / "scenario.toml"
-        if inner.is_file():
-            return inner.read_text(encoding="utf-8")
-        raise UsageError(f"{source} is a folder without a scenario.toml; give a scenario's name or file") from error
-    except OSError as error:
+        return text_of(path, MOST_BYTES)
+    except Unreadable as error:
+        if is_there(path):
+            raise UsageError(f"{shown(path)} cannot be read ({error}); a scenario is a TOML file") from error
         near = difflib.get_close_matches(str(source), shipped(), 1)
         hint = f"did you mean {near[0]}? " if near else ""
         raise UsageError(
-            f"no scenario {source} ({error.strerror}); {hint}`evedrop list` shows the shipped ones"
+            f"no scenario {shown(source)} ({error}); {hint}`evedrop list` shows the shipped ones"
         ) from error
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{source} is not text in UTF-8 ({error.reason}); a scenario is a TOML file") from error
 
 
 def parse(
@@ -93,10 +102,19 @@ def parse(
 
     folder: where the files are that it names; those that a change names are in the current one.
     """
+    if (values := text.count(",")) > MOST_VALUES:
+        large = f"has about {values} values; expected at most {MOST_VALUES}"
+        raise ScenarioError(source, [f"{large}: put disturbances and recordings into files of their own"])
+    if (dotted := _DOTTED.search(text)) is not None:
+        line = text.count("\n", 0, dotted.start()) + 1
+        long = f"line {line} has a key of {_MOST_DOTS} or more parts"
+        raise ScenarioError(source, [f"{long}; expected one such as legitimate.link.quality"])
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
+    if mistakes := list(unusable(tables)):
+        raise ScenarioError(source, mistakes)
     beside(tables, folder)
     disturbances_beside(tables, folder)
     for entry in ("secret_file", "modules"):
@@ -119,6 +137,8 @@ def checked(
     """
     for key, value in (changes or {}).items():
         _set(tables, key, value)
+    if changes and (wrong := list(unusable(tables))):
+        raise ScenarioError(source, wrong)
     if any(named_in(tables)):
         tables.setdefault("modules", str(folder))
     if isinstance(tables.get("modules"), str):
@@ -128,7 +148,9 @@ def checked(
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:
         raise ScenarioError(source, [*sentences(error), *recordings, *_across(tables, beyond_horizon, None)]) from error
-    mistakes = recordings + (dry_run(scenario) or _across(tables, beyond_horizon, scenario))
+    broken = dry_run(scenario)
+    # A class that breaks in a dry run breaks again when it is asked about itself: that is not told twice.
+    mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
     if scenario.nemesis is not None:
         tables, found = with_faults(tables, scenario, sentences)
         mistakes += found
@@ -140,13 +162,17 @@ def checked(
     return scenario
 
 
-def _across(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None) -> list[str]:
-    """What only shows across tables; an error of somebody's class that is asked on the way is a mistake too."""
+def _across(
+    tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None, silent: bool = False
+) -> list[str]:
+    """What only shows across tables; an error of somebody's class that is asked on the way is a mistake too, unless silent."""
     try:
         return across_tables(tables, beyond_horizon, scenario)
     except Exception as error:
         if not foreign(tables):
             raise
+        if silent:
+            return []
         return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from emulator.model.elementary import semidefinite_factor
-from emulator.model.local_filter import Step, settled
+from emulator.model.local_filter import MOST_STATES, Step, settled
 from emulator.model.process import Floats, Process
 from emulator.scenario.plant import PlantTable, plant_of
 from emulator.scenario.process import ProcessTable
@@ -28,7 +28,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
     if not isinstance(process, dict) or process.get("Q") != FILTER:
         return []
     n = len(process["A"]) if isinstance(process.get("A"), list) else 1
-    process["Q"] = np.eye(max(1, n)).tolist()  # until it is known, or in its place
+    process["Q"] = np.eye(max(1, n) if n <= MOST_STATES else 1).tolist()  # until it is known, or in its place
     plant = tables.get("plant")
     if not isinstance(plant, Mapping) or plant.get("output_matrix") is None:
         return [
@@ -73,6 +73,11 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
     found = []
     if C is None or not numbers(C):
         return []
+    if max(n, len(C)) > MOST_STATES:
+        large = f"is of {len(C)} measurements of {n} states"
+        return [
+            f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, for the filter is plain arithmetic"
+        ]
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
         found.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")

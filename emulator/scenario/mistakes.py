@@ -14,6 +14,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from emulator.files import Unreadable, contents
 from emulator.model.eavesdroppers import READERS, STRATEGIES
 from emulator.model.horizon import horizon
 from emulator.model.link import Course
@@ -35,6 +36,7 @@ from emulator.scenario.plant import ControllerTable, PlantTable
 from emulator.scenario.process import ProcessTable
 from emulator.scenario.table import Found
 from emulator.scenario.tables import (
+    MOST_SECRET_BYTES,
     SECRET_BYTES,
     AcknowledgementsTable,
     EavesdropperTable,
@@ -45,6 +47,8 @@ from emulator.scenario.tables import (
 from emulator.scenario.words import as_toml, listed, no_entry
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # whether there is a theory does not depend on it
+_ROOTS: Mapping[str, type[BaseModel]] = {LinkTable.__name__: LinkTable}
+"""Tables that are checked by themselves, by the name that an error has of them; any other error is of a scenario."""
 _EXPECTED: Mapping[str, str] = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -67,13 +71,13 @@ def sentences(error: ValidationError) -> list[str]:
             inner: list[Found] = detail["ctx"]["mistakes"]
             lines += [f"{path}.{name}: {what}" if path else f"{name}: {what}" for name, what in inner]
         else:
-            lines.append(f"{path}: {_sentence(detail)}")
+            lines.append(f"{path}: {_sentence(detail, _ROOTS.get(error.title, Scenario))}")
     return lines
 
 
-def _sentence(detail: ErrorDetails) -> str:
+def _sentence(detail: ErrorDetails, root: type[BaseModel]) -> str:
     kind, found, context = detail["type"], detail["input"], detail.get("ctx", {})
-    table, field = _field(detail["loc"])
+    table, field = _field(detail["loc"], root)
     name = str(detail["loc"][-1]) if detail["loc"] else ""
     example = f", such as {as_toml(field.examples[0])}" if field is not None and field.examples else ""
     if kind == "missing":
@@ -89,16 +93,18 @@ def _sentence(detail: ErrorDetails) -> str:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {as_toml(found)}; expected a number {bound}{example}"
-    if kind in {"too_long", "too_short"}:
-        limit = f"more than {context['max_length']}" if kind == "too_long" else f"fewer than {context['min_length']}"
-        return f"has {limit} entries; expected {'at most' if kind == 'too_long' else 'at least'} so many"
+    if kind in {"too_long", "too_short", "string_too_long"}:
+        things = "characters" if kind == "string_too_long" else "entries"
+        few = kind == "too_short"
+        limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
+        return f"has {limit} {things}; expected {'at least' if few else 'at most'} so many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(found)}; expected {expected}{example}"
 
 
-def _field(location: Sequence[int | str]) -> tuple[type[BaseModel] | None, Any]:
-    """The table an error is in, and the field's description if it is a field."""
-    table: type[BaseModel] | None = Scenario
+def _field(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel] | None, Any]:
+    """The table an error is in, and the field's description if it is a field; root: the table that was checked."""
+    table: type[BaseModel] | None = root
     field = None
     inner: Mapping[str, type[BaseModel]] = {
         "process": ProcessTable,
@@ -155,6 +161,11 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
     found += event_mistakes(tables, links, sentences)
     if isinstance(tables.get("eavesdroppers", {}), dict):
         found += nemesis_mistakes(tables, (LEGITIMATE, *tables.get("eavesdroppers", {})))
+    if scenario is not None and not found:
+        try:
+            _ = scenario.timeline
+        except ValidationError as error:
+            found += [f"event: several of them together leave a link that is none: {line}" for line in sentences(error)]
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     sound = scenario if not found else None
@@ -255,10 +266,9 @@ def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
 def _secret_mistakes(file: str) -> list[str]:
     """Why a file cannot hold a secret."""
     try:
-        size = len(Path(file).read_bytes())
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        return [f"secret_file: {file} cannot be read ({why}); expected a file of {SECRET_BYTES} or more random bytes"]
+        size = len(contents(Path(file), MOST_SECRET_BYTES))
+    except Unreadable as error:
+        return [f"secret_file: {file} cannot be read ({error}); expected a file of {SECRET_BYTES} or more random bytes"]
     if size < SECRET_BYTES:
         return [f"secret_file: {file} has {size} bytes; expected {SECRET_BYTES} or more, random ones"]
     return []

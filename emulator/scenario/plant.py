@@ -5,6 +5,7 @@ Source: docs/scenario.md, plant and controller.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from pydantic import AfterValidator, ConfigDict, Field
 
 from emulator.model.controllers import CONTROLLERS, Assignment
 from emulator.model.plant import Plant
-from emulator.model.process import Floats, Process
+from emulator.model.process import MOST_STATES, Floats, Process
 from emulator.scenario.table import Found, Matrix, Number, Table, numbers, one_of
 from emulator.scenario.words import as_toml, listed
 
@@ -47,11 +48,13 @@ class PlantTable(Table):
         found: list[Found] = []
         for kind in ("input", "disturbance"):
             names, matrix, units = table.get(f"{kind}s") or [], table.get(f"{kind}_matrix"), table.get(f"{kind}_units")
-            if not isinstance(names, list):
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 continue
-            found += [
-                (f"{kind}s", f"has {as_toml(name)} twice") for name in sorted({n for n in names if names.count(n) > 1})
-            ]
+            if len(names) > MOST_STATES:
+                found.append((f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"))
+                continue
+            twice = sorted(name for name, count in Counter(names).items() if count > 1)
+            found += [(f"{kind}s", f"has {as_toml(name)} twice") for name in twice]
             if names and matrix is None:
                 found.append(
                     (f"{kind}_matrix", f"is missing; expected a row for each state, a number for each of {kind}s")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from emulator.errors import TraceError
+from emulator.model.delays.trace import MOST_DELAYS
 from emulator.scenario.words import as_toml
 from emulator.traces import Recording
 
@@ -28,10 +29,16 @@ def beside(tables: Mapping[str, Any], folder: Path) -> None:
 def read_recordings(tables: Mapping[str, Any]) -> list[str]:
     """Put what is recorded in the place of every recording's `file` and `column`; the mistakes, with their paths."""
     mistakes = []
+    delays = 0
     slots = tables.get("slots")
     for path, loss in _traces(tables):
         if path.endswith("delay"):
             mistakes += [f"{path}.{entry}: {what}" for entry, what in _replace(loss, "values")]
+            before, delays = delays, delays + (len(loss["values"]) if isinstance(loss["values"], list) else 0)
+            if before <= MOST_DELAYS < delays:
+                mistakes.append(
+                    f"{path}.file: is one too many; expected at most {MOST_DELAYS} delays on all links together"
+                )
             continue
         source = "outcomes" if "outcomes" in loss else "file"
         wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(loss, "outcomes")]
@@ -49,6 +56,8 @@ def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]
     """Path and table of every loss or delay model that is a trace, wherever a link may be described."""
     entries = tables.items() if isinstance(tables, dict) else enumerate(tables) if isinstance(tables, list) else ()
     for name, inner in entries:
+        if not isinstance(inner, (dict, list)):
+            continue
         if name in ("loss", "delay") and isinstance(inner, dict) and inner.get("model") == "trace":
             yield f"{path}{name}", inner
         else:

@@ -140,7 +140,9 @@ def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]
         return []
     model = models.get(str(found.get("model")))
     if model is None:
-        name = found.get("model", "")
+        if "model" not in found:
+            return [(f"{entry}.model", f"is missing; expected model = {as_toml(models.names[0])}, or another")]
+        name = found["model"]
         said = _no_class(name, models) or f"; expected {listed(models.names)}{near(name, models.names)}"
         return [(f"{entry}.model", f"is {as_toml(name)}{said}")]
     given = {name: value for name, value in found.items() if name != "model"}

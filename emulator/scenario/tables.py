@@ -14,12 +14,12 @@ from pydantic import AfterValidator, ConfigDict, Field
 
 from emulator.model.acknowledgements import ATTACKS
 from emulator.model.controllers import Assignment
-from emulator.model.eavesdroppers import READERS, STRATEGIES
+from emulator.model.eavesdroppers import ANSWERS, READERS, STRATEGIES
 from emulator.model.link import Course
 from emulator.model.plant import Plant
 from emulator.model.registry import asked, is_own
 from emulator.model.schemes import SCHEMES
-from emulator.modules import elsewhere, look_in
+from emulator.modules import elsewhere, look_in, trusted_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import ExpectTable
@@ -37,9 +37,11 @@ from emulator.scenario.table import (
     registered,
 )
 from emulator.scenario.timeline import Timeline
+from emulator.scenario.values import MOST_EAVESDROPPERS
 from emulator.scenario.words import as_toml, listed, no_entry
 
 SECRET_BYTES = 32
+MOST_SECRET_BYTES = 2**20
 
 
 class EncodingTable(Table):
@@ -210,7 +212,7 @@ class NetworkTable(Table):
 class Scenario(Table):
     """One scenario, checked."""
 
-    title: Annotated[str, Field(min_length=1, examples=["Two eavesdroppers beside a planar vehicle"])]
+    title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
     slots: Annotated[int, Field(ge=1, le=100_000_000, strict=True, examples=[2000])]
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
@@ -227,7 +229,7 @@ class Scenario(Table):
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
     eavesdroppers: Annotated[
         dict[ProcessName, EavesdropperTable],
-        Field(max_length=64, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
+        Field(max_length=MOST_EAVESDROPPERS, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
     ] = Field(default_factory=dict)
     plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
@@ -249,14 +251,21 @@ class Scenario(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether there is a folder of modules; they are looked for in it from now on, so that entries can name classes."""
+        """Whether there is a folder of modules; they are looked for in it from now on, so that entries can name classes.
+
+        Without a scheme or a link of somebody's own nothing in it is imported here: see `emulator.model.answers`.
+        """
         folder = table.get("modules")
         if not isinstance(folder, str):
             return []
         if not Path(folder).is_dir():
             return [("modules", f'is "{folder}", which is no folder; expected the one that the modules are in')]
-        look_in(str(Path(folder).absolute()))
-        return [("modules", what) for what in elsewhere(folder, table)]
+        absolute = str(Path(folder).absolute())
+        wrong = [("modules", what) for what in elsewhere(absolute, table)]
+        ANSWERS.folder = absolute
+        if any(trusted_in(table)):
+            look_in(absolute)
+        return wrong
 
     @property
     def relayed(self) -> bool:

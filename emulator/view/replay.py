@@ -28,14 +28,14 @@ _CODES = {
 }
 
 
-def replay(folder: Path) -> Path:
-    """Write the recording.rrd of a results folder; its path.
+def replay(folder: Path, path: Path | None = None) -> Path:
+    """Write the recording of a results folder to a path, by default its recording.rrd; the path.
 
     Raises UsageError if the folder's tables cannot be read, or hold no recorded trial.
     """
     results = load_results(folder)
     scenario = load(folder / "scenario.toml", beyond_horizon=True)
-    path = folder / "recording.rrd"
+    path = folder / "recording.rrd" if path is None else path
     peers = {name: _peer(results, name) for name in scenario.receivers}
     x, nu, sent = _truth(results, scenario.receivers[0])
     if not len(x):

@@ -29,10 +29,16 @@ _START_SECONDS = 60.0
 
 _INIT = """
 mount -t proc proc /proc && ip link set lo up || exit
-if [ "$(awk '/^MemAvailable/ {print $2}' /proc/meminfo)" -gt 10000000 ]; then mount -t tmpfs tmpfs "$0"; fi
+echo nameserver 127.0.0.1 >"$1/resolv.conf" && mount --bind "$1/resolv.conf" /etc/resolv.conf || exit
+if [ "$(awk '/^MemAvailable/ {print $2}' /proc/meminfo)" -gt 10000000 ]; then mount -t tmpfs tmpfs "$1/data"; fi
+shift
 exec "$@"
 """
-"""The first command of the namespaces. Where there is room, images are in memory: that is faster, and gone at once."""
+"""The first command of the namespaces; its argument is the daemon's folder, and then what it becomes.
+
+Where there is room, images are in memory: that is faster, and gone at once. Names are asked of the machine itself, as where
+systemd-resolved runs: that is when Docker 20.10 lets a container's questions out of a network that is internal.
+"""
 
 
 def checkout(folder: Path) -> Path:
@@ -64,7 +70,7 @@ class Docker:
                     # However the tests end, it ends with them.
                     *("setpriv", "--pdeathsig", "KILL"),
                     *("unshare", "--net", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child"),
-                    *("sh", "-c", _INIT, str(data)),
+                    *("sh", "-c", _INIT, "sh", str(folder)),
                     *("dockerd", "--data-root", str(data), "--exec-root", str(folder / "exec")),
                     *("--host", self.address, "--pidfile", str(folder / "docker.pid"), "--bridge", "none"),
                     # By systemd's means it would ask for control groups of process ids that are not those it has here.
@@ -96,9 +102,14 @@ class Docker:
         found: list[dict[str, Any]] = json.loads(self(kind, "inspect", name))
         return found[0]
 
-    def inside(self, *command: str) -> str:
-        """What a command says that sees the daemon's network."""
-        return run("nsenter", f"--net=/proc/{self.pid}/ns/net", *command).stdout
+    def entering(self, mounts: bool = False) -> tuple[str, ...]:
+        """The words that start a command on the daemon's host: in its network; with its mounts too, though without a /proc."""
+        inner = (f"--mount=/proc/{self.pid}/ns/mnt",) if mounts else ()
+        return ("nsenter", f"--net=/proc/{self.pid}/ns/net", *inner)
+
+    def inside(self, *command: str, mounts: bool = False) -> str:
+        """What a command says on the daemon's host."""
+        return run(*self.entering(mounts), *command).stdout
 
     def end(self) -> None:
         """End it with all that runs in it, and remove all it wrote."""

@@ -43,12 +43,26 @@ def test_up_alone_runs_the_demo(project: Make) -> None:
         assert {service: demo.state(service)["ExitCode"] for service in ROLES} == dict.fromkeys(ROLES, 0)
         complete(demo, 600)
         assert len(list((demo.folder / "runs").iterdir())) == runs
-    assert {path.stat().st_uid for path in (demo.folder / "runs").rglob("*")} == {4321}
-    folder = demo.results().folder.name
+    everything = (demo.folder / "runs", *(demo.folder / "runs").rglob("*"))
+    assert {path.stat().st_uid for path in everything} == {4321}, "Docker made ./runs as root"
+    assert demo.results().folder.stat().st_mode & 0o777 == 0o700
     # Word by word as docs/containers.md has it, in the background.
-    how = ("run", "--detach", "--rm", "--no-deps", "--service-ports", "observer")
-    demo.compose(*how, "view", f"/runs/{folder}", "--serve", "0.0.0.0:17450")
+    demo.compose("run", "--detach", "--rm", "--service-ports", "finished", f"/runs/{demo.results().folder.name}")
     demo.shown()
+
+
+def test_the_recipe_for_a_script_gives_table_and_status(project: Make) -> None:
+    """Word by word as docs/containers.md has it: all that the observer says, the table too, and the status of the run."""
+    tested = project(EVEDROP_OPTIONS=f"{SHORT} --set expect=[{{figure='smart.mean_squared_error',below=0}}]")
+    tested.compose("up", "--detach")
+    said = tested.compose("logs", "--follow", "observer").stdout
+    identity = tested.compose("ps", "--all", "--quiet", "observer").stdout.strip()
+    assert tested.docker("wait", identity) == "1"
+    complete(tested, 600)
+    ended = said.index('"ended"')
+    digest = tested.results().summary["peers"]["smart"]["digest"]
+    for words in ("1 of 1 expectations FAILED", digest[:12], "relative secrecy", "results: /runs/two-eavesdroppers-"):
+        assert said.index(words) > ended
 
 
 def test_a_scenario_of_ones_own(project: Make) -> None:

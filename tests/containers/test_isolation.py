@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tests.conftest import wait_until
+from tests.conftest import LIMIT, wait_until
 from tests.containers.machine import Docker
 from tests.containers.project import ENDLESS, ROLES, Project, projects
 
 pytestmark = pytest.mark.containers
+
+MEMORY = 2**30
+"""Bytes that a container may take."""
 
 PROBE = """
 import concurrent.futures, json, pathlib, selectors, socket, sys, time
@@ -49,7 +54,7 @@ print(json.dumps(found))
 def going(tmp_path_factory: pytest.TempPathFactory, docker: Docker) -> Iterator[Project]:
     """A run that does not end by itself; taken down in the middle, it leaves what was measured."""
     with projects(tmp_path_factory.mktemp("going"), docker) as make:
-        one = make(EVEDROP_OPTIONS=ENDLESS)
+        one = make(EVEDROP_OPTIONS=ENDLESS, EVEDROP_MEMORY=str(MEMORY))
         one.compose("up", "--detach")
         one.running()
         yield one
@@ -90,6 +95,94 @@ def test_who_can_reach_what(going: Project) -> None:
         wait_until(
             lambda service=service: going.state(service)["Health"]["Status"] == "healthy", f"a healthy {service}"
         )
+
+
+SERVICES = """
+import socket, sys, threading
+web, names = socket.create_server(("0.0.0.0", 0)), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+names.bind(("127.0.0.1", 53))
+def serve():
+    while True:
+        web.accept()[0].close()
+threading.Thread(target=serve, daemon=True).start()
+print(web.getsockname()[1], flush=True)
+while True:
+    question = names.recv(512)[12:]
+    print(question[1 : 1 + question[0]].decode(), flush=True)
+"""
+"""Two services of the host: one that listens at every address, and the one that names are asked of, which says who asks."""
+
+REACHES = """
+import socket, sys
+reached = []
+for host in sys.argv[3:]:
+    try:
+        socket.create_connection((host, int(sys.argv[1])), 2.0).close()
+        reached.append(host)
+    except OSError:
+        pass
+try:
+    socket.getaddrinfo(sys.argv[2] + ".leak.example", 80)
+except OSError:
+    pass
+print(*reached)
+"""
+"""Connects to a port of hosts, and says which let it; asks for a name that nobody has."""
+
+
+def test_no_way_leads_out(going: Project) -> None:
+    """No process of the run reaches the host at any address, or has it ask for a name; only what forwards the view reaches it."""
+    docker, project = going.docker, going.environment["COMPOSE_PROJECT_NAME"]
+    networks = docker("network", "ls", "-q", "--filter", f"label=com.docker.compose.project={project}").split()
+    gateways = {docker.inspected("network", one)["IPAM"]["Config"][0]["Gateway"] for one in networks}
+    found = json.loads(docker.inside("ip", "-json", "-4", "address"))
+    hosts = {one["local"] for link in found for one in link["addr_info"] if one["local"] != "127.0.0.1"}
+    assert gateways > hosts, "only what forwards the view is on a network that the host is in"
+    begun = [*docker.entering(), sys.executable, "-c", SERVICES]
+    with subprocess.Popen(begun, stdout=subprocess.PIPE, text=True) as services:
+        try:
+            assert services.stdout is not None
+            port = services.stdout.readline().strip()
+
+            def reached(service: str) -> set[str]:
+                quick = ("exec", "-e", "RES_OPTIONS=timeout:1 attempts:1", going.container(service))
+                said = docker(*quick, "python", "-c", REACHES, port, service, *sorted(hosts | gateways))
+                return set(said.split())
+
+            with ThreadPoolExecutor() as looking:
+                by_service = dict(zip(ROLES, looking.map(reached, ROLES), strict=True))
+            assert by_service == {service: set() for service in ROLES}
+            assert reached("view") == hosts, "otherwise this test would find nothing"
+            docker.inside(sys.executable, "-c", REACHES, port, "the-host-itself", mounts=True)
+        finally:
+            services.kill()
+        assert set(services.stdout.read().split()) == {"the-host-itself"}
+
+
+GREEDY = """
+import sys, threading
+over = threading.Event()
+try:
+    for number in range(5000):
+        threading.Thread(target=over.wait, daemon=True).start()
+except RuntimeError:
+    print(number, flush=True)
+over.set()
+held = b"x" * int(sys.argv[1])
+"""
+"""Starts threads until it may not, says how many it could, and then takes memory."""
+
+
+def test_a_container_cannot_take_the_whole_machine(going: Project) -> None:
+    """Its threads and its memory end at a limit, which ends what asked for more, and not the run."""
+    greedy = ("docker", "-H", going.docker.address, "exec", going.container("eavesdropper-1"), "python", "-c", GREEDY)
+    done = subprocess.run([*greedy, str(MEMORY + 1)], capture_output=True, text=True, check=False, timeout=LIMIT)
+    assert done.returncode == 137, done.stderr
+    assert 100 < int(done.stdout) < 1024
+    for service in (*ROLES, "view", "briefs"):
+        limits = going.docker.inspected("container", going.container(service))["HostConfig"]
+        assert (limits["Memory"], limits["MemorySwap"], limits["PidsLimit"]) == (MEMORY, MEMORY, 1024)
+    going.running(going.progress())
 
 
 def test_the_view_is_on_loopback_alone(going: Project) -> None:

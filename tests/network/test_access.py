@@ -47,8 +47,8 @@ def flow(stage: Bench) -> None:
         assert np.array_equal(z, np.where(gamma, stage.packet(k), 0.0)), name
         assert late == (), name
     if stage.due % BATCH == 0:
-        windows = dict.fromkeys(stage.scenario.receivers, 0)
-        journal = telemetry.read_journal(wire.Reader(*stage.journal.hear()), stage.due - BATCH, windows, 5)
+        windows, extent = dict.fromkeys(stage.scenario.receivers, 0), telemetry.Extent(100_000, BATCH, *SHAPE)
+        journal = telemetry.read_journal(wire.Reader(*stage.journal.hear()), stage.due - BATCH, windows, extent)
         assert journal.count == BATCH
 
 

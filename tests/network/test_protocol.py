@@ -14,12 +14,13 @@ import pytest
 from emulator.brief import read_brief
 from emulator.errors import MalformedMessage
 from emulator.model.account import COUNTED_BURSTS, Account
-from emulator.model.digest import BeliefLog, RunDigest
+from emulator.model.digest import BeliefLog, Blocks, RunDigest
 from emulator.model.elementary import normal_quantile
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
 from emulator.network import envelope, loop_wire, operator, packets, telemetry, wire
 from emulator.network.access import Keys, Wiring, grants
+from emulator.network.whereabouts import Whereabouts, read_whereabouts
 from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
 TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -54,6 +55,15 @@ def packets_of(heard: Heard) -> dict[str, Any]:
     return {"gamma": heard.gamma.astype(int).tolist(), "z": heard.z[:, heard.gamma].tolist()}
 
 
+SLOTS = 100_000
+"""Of the run that all golden messages could be of."""
+
+
+def extent_of(shape: dict[str, Any]) -> telemetry.Extent:
+    """What messages of a shape are held to."""
+    return telemetry.Extent(SLOTS, 1024, shape["n"], shape["trials"], shape.get("recorded", 1), shape.get("inputs", 0))
+
+
 def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
     mask = wire.packed_flags(flags(value["gamma"])).tobytes()
@@ -78,7 +88,8 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    report = telemetry.read_report(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), shape["recorded"])
+    window = shape.get("window", 0)
+    report = telemetry.read_report(wire.Reader(KEY, raw), value["k"], extent_of(shape), Blocks(SLOTS), window)
     columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in report.digests.items()}
     late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(report, name)) is not None}
@@ -94,7 +105,7 @@ def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
     inputs = shape.get("inputs", 0)
-    truth = telemetry.read_truth(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), inputs)
+    truth = telemetry.read_truth(wire.Reader(KEY, raw), value["k"], extent_of(shape))
     found = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
     return {**found, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()} if inputs else found
 
@@ -146,7 +157,8 @@ def encode_decisions(_shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 def decode_decisions(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    found = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], shape["trials"], shape["period"])
+    extent = extent_of({"n": 1, **shape})
+    found = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], extent, Blocks(SLOTS), shape["period"])
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in found.digests.items()}
     return {"k": found.first, "c": found.count, "seconds": found.seconds.tolist(), "digests": digests}
 
@@ -166,7 +178,7 @@ def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    journal = telemetry.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], shape["trials"])
+    journal = telemetry.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], extent_of({"n": 1, **shape}))
     links = {
         name: {
             "delivered": link.delivered.astype(int).tolist(),
@@ -180,6 +192,22 @@ def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
     return {"k": journal.first, "c": journal.count, "links": links}
 
 
+def decode_whereabouts(_shape: dict[str, Any], _value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it."""
+    where = read_whereabouts(wire.Reader(KEY, raw), SLOTS)
+    return {"k": where.slot, "waits": list(where.waits)}
+
+
+def decode_refusal(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+    """As the observer reads it from the sensor, who refuses what an eavesdropper wrote."""
+    message = wire.Reader(KEY, raw)
+    assert wire.is_refusal(message)
+    refusal = wire.read_refusal(message, "sensor")
+    assert refusal.at_fault == ("eve",)
+    assert str(refusal) == f"malformed message on {value['refuses']}: {value['why']} (refused by sensor)"
+    return {name: message.text(name) for name in value}
+
+
 def encode_leaving(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As a receiver makes it."""
     belief = Belief(np.array(value["x_hat"]), np.array(value["P"]), np.zeros(shape["trials"], np.uint8))
@@ -190,7 +218,7 @@ def decode_leaving(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
     """As the observer reads it."""
     message = wire.Reader(KEY, raw)
     assert telemetry.is_leaving(message)
-    k, belief = telemetry.read_leaving(message, (shape["n"], shape["trials"]))
+    k, belief = telemetry.read_leaving(message, extent_of(shape))
     return {"k": k, "x_hat": belief.x_hat.tolist(), "P": belief.P.tolist()}
 
 
@@ -205,7 +233,8 @@ def decode_once_more(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) 
     """As the router reads it."""
     message = wire.Reader(KEY, raw)
     assert packets.is_once_more(message)
-    return {name: message.integer(name) for name in value}
+    number, done, first = packets.read_once_more(message, SLOTS)
+    return {"n": number, "again": done, "k": first}
 
 
 def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -285,7 +314,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
     ),
     "progress": (
         lambda _shape, value: wire.progress(value["k"]),
-        lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw)},
+        lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw, SLOTS)},
     ),
     "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
     "once more": (lambda _shape, value: packets.once_more(value["n"], value["again"], value["k"]), decode_once_more),
@@ -315,6 +344,8 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, value: envelope.enclosed(value["key"], wire.pack(value["message"])),
         lambda _shape, value, raw: decode_envelope(value["key"], raw),
     ),
+    "whereabouts": (lambda _shape, value: Whereabouts(value["k"], tuple(value["waits"])).pack(), decode_whereabouts),
+    "refusal": (lambda _shape, value: wire.refusal(value["refuses"], value["why"]), decode_refusal),
 }
 
 

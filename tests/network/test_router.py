@@ -42,8 +42,8 @@ def run_through(bench: Bench) -> tuple[dict[str, np.ndarray], dict[str, np.ndarr
     lost = {name: np.zeros(scenario.slots, int) for name in scenario.receivers}
     k = 0
     while k < scenario.slots:
-        windows = dict.fromkeys(scenario.receivers, 0)
-        journal = telemetry.read_journal(wire.Reader(*bench.journal.hear()), k, windows, scenario.trials)
+        windows, extent = dict.fromkeys(scenario.receivers, 0), telemetry.Extent(scenario.slots, 8, *shape)
+        journal = telemetry.read_journal(wire.Reader(*bench.journal.hear()), k, windows, extent)
         rows = slice(k, k + journal.count)
         for name in scenario.receivers:
             assert np.array_equal(journal.links[name].delivered, gammas[name][rows])

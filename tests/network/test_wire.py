@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -15,16 +17,24 @@ from hypothesis.extra.numpy import arrays
 
 from emulator.errors import EvedropError, Gap, MalformedMessage, RunError
 from emulator.model.account import COUNTED_BURSTS, Account
+from emulator.model.digest import Blocks
 from emulator.model.links.link import REASONS
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
 from emulator.network import packets, telemetry, wire
+from emulator.network.access import writer_of
 from emulator.network.wire import Reader
 from emulator.runs.joined import Joiner
+from tests.network.readers import EXAMPLES, READERS, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)
 SIZES = st.integers(1, 19)
+
+
+def extent(n: int, trials: int, recorded: int = 1) -> telemetry.Extent:
+    """What messages of a run of many slots are held to."""
+    return telemetry.Extent(2**41, 5, n, trials, recorded)
 
 
 @settings(deadline=None)
@@ -99,7 +109,7 @@ def test_leaving(data: st.DataObject, k: int, n: int, trials: int) -> None:
     P = data.draw(arrays(float, (n, n, trials), elements=FINITE))
     message = Reader("t", telemetry.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
     assert telemetry.is_leaving(message)
-    found, belief = telemetry.read_leaving(message, (n, trials))
+    found, belief = telemetry.read_leaving(message, extent(n, trials))
     assert (found, belief.x_hat.tobytes(), belief.P.tobytes()) == (k, x_hat.tobytes(), P.tobytes())
     assert not belief.action.any()
 
@@ -110,32 +120,37 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     """Truth reads back."""
     x = data.draw(arrays(float, (count, n, trials), elements=FINITE))
     nu = data.draw(arrays(bool, (count, trials)))
-    found = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, (n, trials))
+    found = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, extent(n, trials))
     assert (found.first, found.count, found.x.tobytes()) == (k, count, x.tobytes())
     assert np.array_equal(found.nu, nu)
 
 
 @settings(deadline=None)
-@given(st.data(), SLOTS, st.integers(1, 3), SIZES, st.integers(1, 5))
+@given(st.data(), st.integers(0, 4000), st.integers(1, 3), SIZES, st.integers(1, 5))
 def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) -> None:
-    """A report reads back, with any number of blocks' digests."""
+    """A report reads back, with the digests of the blocks that end in it."""
     recorded = data.draw(st.integers(1, trials))
+    slots, window = k + count + data.draw(st.integers(0, 2)), data.draw(st.integers(0, 9))
+    blocks = Blocks(slots, data.draw(st.sets(st.integers(k, k + count), max_size=2)))
+    late = data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials), elements=st.integers(0, window))))
     report = telemetry.Report(
         k,
         data.draw(arrays(float, (count, n, trials), elements=FINITE)),
         data.draw(arrays(np.uint8, (count, trials), elements=st.integers(0, 3))),
         data.draw(arrays(float, (count, n, n, recorded), elements=FINITE)),
         data.draw(arrays(float, (count, 2), elements=FINITE)),
-        data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials)))),
-        {b: data.draw(arrays(np.uint8, (trials, 32))) for b in data.draw(st.sets(st.integers(0, 2**24), max_size=2))},
+        late,
+        {block: data.draw(arrays(np.uint8, (trials, 32))) for block in blocks.ended(k, k + count)},
+        None if late is None else late // 2,
     )
-    found = telemetry.read_report(Reader("r", report.pack()), k, (n, trials), recorded)
+    of_run = replace(extent(n, trials, recorded), slots=slots)
+    found = telemetry.read_report(Reader("r", report.pack()), k, of_run, blocks, window)
     for name in ("x_hat", "action", "P", "trace"):
         assert getattr(found, name).tobytes() == getattr(report, name).tobytes()
     assert {b: d.tobytes() for b, d in found.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
     assert found.count == count
-    assert (found.late is None) == (report.late is None)
-    assert found.late is None or np.array_equal(found.late, report.late)
+    for name in ("late", "late_used"):
+        assert np.array_equal(getattr(found, name), getattr(report, name))
 
 
 def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Account:
@@ -152,17 +167,23 @@ def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Accoun
 def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
     """A journal reads back, receiver by receiver, reason by reason."""
     windows = {"legitimate": 0, "eve": 3, "mallory": 1000}
-    links = {
-        name: Account(
-            data.draw(arrays(bool, (count, trials))),
-            {reason: data.draw(arrays(np.uint32, count)) for reason in REASONS},
-            data.draw(arrays(np.uint16, (count, trials))) if window else None,
-            data.draw(arrays(np.uint32, 64)),
-            data.draw(arrays(np.uint32, window + 2, fill=st.just(0))),
+    links = {}
+    for name, window in windows.items():
+        delivered = data.draw(arrays(bool, (count, trials)))
+        most = (trials - delivered.sum(axis=1)).astype(np.uint32)
+        unsent = data.draw(arrays(np.uint32, count, elements=st.integers(0, trials))) % (most + 1)
+        lost = {reason: np.zeros(count, np.uint32) for reason in REASONS}
+        lost[data.draw(st.sampled_from(REASONS))] = most - unsent
+        links[name] = Account(
+            delivered,
+            lost,
+            data.draw(arrays(np.uint16, (count, trials), elements=st.integers(0, window))) if window else None,
+            data.draw(arrays(np.uint32, 64, elements=st.integers(0, count * trials))),
+            np.array([delivered.sum(), *[0] * (window + 1)], np.uint32),
+            unsent,
         )
-        for name, window in windows.items()
-    }
-    found = telemetry.read_journal(Reader("j", telemetry.Journal(k, count, links).pack()), k, windows, trials)
+    raw = telemetry.Journal(k, count, links).pack()
+    found = telemetry.read_journal(Reader("j", raw), k, windows, extent(1, trials))
     assert (found.first, found.count, set(found.links)) == (k, count, set(links))
     for name, link in links.items():
         for column in ("delivered", "bursts", "delays"):
@@ -174,51 +195,84 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
         assert link.late is None or np.array_equal(found.links[name].late, link.late)
 
 
-READERS = {
-    "packet": lambda raw: packets.read_uplink(Reader("key", raw), 0, (2, 3)),
-    "mark": lambda raw: packets.is_hold(Reader("key", raw)) and Reader("key", raw).slot(0),
-    "delivery": lambda raw: packets.read_delivery(Reader("key", raw), 0, (2, 3)),
-    "progress": lambda raw: wire.read_progress("key", raw),
-    "control": lambda raw: Reader("key", raw).text("do"),
-    "go": lambda raw: (Reader("key", raw).names("absent"), Reader("key", raw).integer("until")),
-    "change": lambda raw: (
-        Reader("key", raw).text("link"),
-        Reader("key", raw).map("settings"),
-        Reader("key", raw).flag("cut"),
-    ),
-    "truth": lambda raw: telemetry.read_truth(Reader("key", raw), 0, (2, 3)),
-    "report": lambda raw: telemetry.read_report(Reader("key", raw), 0, (2, 3), 1),
-    "leaving": lambda raw: telemetry.read_leaving(Reader("key", raw), (2, 3)),
-    "journal": lambda raw: telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, 3),
+def refused(read: Callable[[bytes], Any], raw: bytes) -> MalformedMessage | Gap | None:
+    """How a reader refuses a message; None if it takes it."""
+    try:
+        read(raw)
+    except (MalformedMessage, Gap) as error:
+        return error
+    return None
+
+
+def parts() -> st.SearchStrategy[Any]:
+    """Anything that msgpack can carry, with the lengths of arrays that readers expect among the bytes."""
+    names = sorted({field for name in EXAMPLES for field in fields_of(name)})
+    leaves = st.one_of(
+        st.integers(-(2**63), 2**64 - 1),
+        st.sampled_from([None, True, 0.5, float("nan"), "", "start", "eve", "evedrop/r1/uplink"]),
+        st.sampled_from([0, 1, 2, 3, 4, 6, 8, 16, 24, 48, 96, 192, 256]).map(bytes),
+        st.sampled_from([1, 6, 12, 24, 48, 96]).map(lambda size: b"\xff" * size),
+        st.binary(max_size=9),
+    )
+    keys = st.one_of(st.sampled_from([*names, *REASONS, "eve", "legitimate", "lost", "bursts"]), st.integers(-1, 2**63))
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(keys, inner, max_size=4)),
+        max_leaves=8,
+    )
+
+
+@settings(deadline=None, max_examples=400)
+@given(st.data(), st.sampled_from(sorted(READERS)))
+def test_anything_else_is_an_error_of_ours(data: st.DataObject, name: str) -> None:
+    """Whatever arrives, a reader gives values or raises one of the two errors of messages, which names the key and its writer."""
+    key, read = READERS[name]
+    fields = fields_of(name)
+    for field in data.draw(st.sets(st.sampled_from(sorted(fields)), max_size=2)):
+        fields[field] = data.draw(parts())
+    for field in data.draw(st.sets(st.sampled_from(sorted(fields)), max_size=1)):
+        del fields[field]
+    raw = data.draw(st.one_of(st.just(msgpack.packb(fields)), st.binary(max_size=60), parts().map(msgpack.packb)))
+    error = refused(read, raw)
+    assert error is None or key in str(error)
+    assert error is None or error.at_fault == (writer_of(key),)
+    assert error is None or len(str(error)) < 1500
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_examples_are_read(name: str) -> None:
+    """The message that a reader's fuzzing begins with is one that it takes, and without any one byte it is not another error."""
+    assert READERS[name][1](EXAMPLES[name]) is not None
+    for place in range(len(EXAMPLES[name])):
+        with contextlib.suppress(MalformedMessage, Gap):
+            READERS[name][1](EXAMPLES[name][:place] + EXAMPLES[name][place + 1 :])
+
+
+BOMBS = {
+    "a list of lists": b"\xdd\x00\x98\x96\x80" + b"\x90" * 10**7,
+    "a list of maps in a map": b"\x81\xa1k\xdd\x00\x98\x96\x80" + b"\x80" * 10**7,
+    "lists one after the other": b"\x90" * 10**7,
+    "lists of lists of lists": b"\x81\xa1k"
+    + b"\xdc\x01\x00"
+    + (b"\xdc\x01\x00" + (b"\x9f" + b"\x90" * 15) * 256) * 256,
+    "a long list that is cut": b"\xdd\xff\xff\xff\xff",
+    "a long text that is cut": b"\x81\xa1k\xdb\xff\xff\xff\xff",
+    "lists without an end": b"\x91" * 10**6,
 }
-FIELDS = ("k", "c", "z", "x", "nu", "gamma", "late", "x_hat", "action", "P", "trace", "digests", "links", "do", "absent",
-          "until", "link", "settings", "cut", "hold")  # fmt: skip
-LINK = st.dictionaries(
-    st.sampled_from(["delivered", "lost", "late", "bursts", "delays"]),
-    st.one_of(st.just(1), st.binary(max_size=9), st.dictionaries(st.sampled_from(REASONS), st.just(bytes(4)))),
-)
-VALUES = st.one_of(
-    st.integers(-3, 2**63 - 1),
-    st.sampled_from([None, True, 0.5, "", "start", [], {}, float("nan")]),
-    st.sampled_from([0, 1, 4, 6, 8, 16, 24, 48, 80]).map(bytes),
-    st.binary(max_size=9),
-    st.dictionaries(st.sampled_from(["a", "b", 0]), st.one_of(LINK, st.just(bytes(96))), max_size=3),
-    st.lists(
-        st.dictionaries(st.sampled_from(["k", "gamma", "z"]), st.sampled_from([0, 1, b"\1", bytes(16)])), max_size=2
-    ),
-)
+"""Messages of some megabytes that are much larger once they are read."""
 
 
-@settings(deadline=None)
-@given(
-    st.sampled_from(sorted(READERS)),
-    st.one_of(st.binary(max_size=60), st.dictionaries(st.sampled_from(FIELDS), VALUES)),
-)
-def test_anything_else_is_an_error_of_ours(name: str, raw: bytes | dict[str, object]) -> None:
-    """Whatever arrives, a reader gives values or raises one of the two errors of messages: no other gets through."""
-    payload = raw if isinstance(raw, bytes) else msgpack.packb(raw)
-    with contextlib.suppress(MalformedMessage, Gap):
-        READERS[name](payload)
+@pytest.mark.parametrize("what", BOMBS)
+def test_a_large_message_is_refused_before_it_is_larger(what: str) -> None:
+    """However it is made, reading it takes some megabytes more than it has at most, and the error shows a part of it alone."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(MalformedMessage, match="not msgpack") as found:
+            Reader("evedrop/r1/telemetry/eve", BOMBS[what])
+        assert tracemalloc.get_traced_memory()[1] < 4e6 + (len(BOMBS[what]) if "after" in what else 0)
+    finally:
+        tracemalloc.stop()
+    assert len(str(found.value)) < 1000
 
 
 def test_errors_say_what_was_found_where_and_what_to_do() -> None:
@@ -243,14 +297,14 @@ def test_unknown_actions_are_refused(value: int) -> None:
         0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2)), None, {}
     )
     with pytest.raises(MalformedMessage, match=f"action {value}; expected actions from 0 to 3"):
-        telemetry.read_report(Reader("key", report.pack()), 0, (1, 1), 1)
+        telemetry.read_report(Reader("key", report.pack()), 0, extent(1, 1), Blocks(9))
 
 
 def test_a_journal_without_a_receiver_is_refused() -> None:
     """Every receiver must be in every journal message."""
     raw = telemetry.Journal(0, 1, {"a": account_of(np.ones((1, 3), bool))}).pack()
     with pytest.raises(MalformedMessage, match="b = None; expected a map b"):
-        READERS["journal"](raw)
+        telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3))
 
 
 @pytest.mark.parametrize("reasons", [[], ["eaten"], ["lost", "eaten"]])
@@ -261,7 +315,7 @@ def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
     with pytest.raises(
         MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['corrupted', 'cut', 'down', "
     ):
-        READERS["journal"](raw)
+        telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3))
 
 
 TELEMETRY = {
@@ -277,7 +331,7 @@ TELEMETRY = {
 @pytest.mark.parametrize("what", TELEMETRY)
 def test_observer_notices_gaps_and_doubles(what: str, second: int) -> None:
     """Truth, report or journal that does not begin where the last one ended is a gap."""
-    joiner = Joiner({"a": 0}, (1, 3), 1)
+    joiner = Joiner(extent(1, 3), {"a": 0}, {"a": Blocks(9)})
     take = {
         "truth": lambda raw: joiner.truth(Reader("key", raw)),
         "report": lambda raw: joiner.report("a", Reader("key", raw)),

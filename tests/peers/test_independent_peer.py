@@ -14,7 +14,7 @@ import pytest
 from independent_legitimate import Estimator
 
 from emulator import montecarlo
-from emulator.model.digest import BeliefLog, RunDigest
+from emulator.model.digest import BeliefLog, Blocks, RunDigest
 from emulator.model.process import Trajectory
 from emulator.model.receiver import Heard
 from emulator.model.schemes import SCHEMES
@@ -79,7 +79,8 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
         if digests is not None:
             blocks |= dict([digests])
         peer.receive(packets.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
-    report = telemetry.read_report(wire.Reader("telemetry", peer.report()), 0, (model.n, 9), 2)
+    extent = telemetry.Extent(slots, slots, model.n, 9, 2)
+    report = telemetry.read_report(wire.Reader("telemetry", peer.report()), 0, extent, Blocks(slots))
     assert np.array_equal(report.x_hat, [one.x_hat for one in beliefs])
     assert np.array_equal(report.action, [one.action for one in beliefs])
     assert np.array_equal(report.P, [one.P[:, :, :2] for one in beliefs])

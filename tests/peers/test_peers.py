@@ -13,14 +13,17 @@ import msgpack
 import numpy as np
 import pytest
 
+import emulator.network.mailbox
 import peers.following
 import peers.sensor
 from emulator.brief import Brief, Flow
 from emulator.errors import Gap, MalformedMessage
+from emulator.model.digest import Blocks
 from emulator.network import packets, telemetry, wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
 from emulator.network.resending import Kept
+from emulator.network.whereabouts import Place
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
@@ -29,6 +32,7 @@ from peers.sensor import Window, sense
 from tests.conftest import LIMIT
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
+EXTENT = telemetry.Extent(SLOTS, 300, 2, 3)
 
 
 def scenario_of(**changes: Any) -> Scenario:
@@ -111,6 +115,7 @@ class FakeSession:
     def __init__(self, stage: Stage, keys: Keys) -> None:
         self._stage = stage
         self.keys = keys
+        self.place = Place()
 
     def __enter__(self) -> Self:
         return self
@@ -191,13 +196,13 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     end, blocks = 0, {}
     for key, payload in put:
         if key == keys.telemetry(name):
-            report = telemetry.read_report(wire.Reader(key, payload), end, (2, 3), 1)
+            report = telemetry.read_report(wire.Reader(key, payload), end, EXTENT, Blocks(SLOTS))
             end, blocks = end + report.count, {**blocks, **report.digests}
             lost = (np.arange(end - report.count, end) % 3)[:, None] == np.arange(3)
             assert np.array_equal(report.action == 0, lost)
         else:
             assert key == keys.progress(name)
-            assert wire.read_progress(key, payload) == end
+            assert wire.read_progress(key, payload, SLOTS) == end
     assert end == SLOTS
     assert set(blocks) == {0}
 
@@ -214,7 +219,7 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
         RECEIVERS[name](brief)
         end, x_hat, P, blocks = 0, [], [], {}
         for payload in stage.all(Keys("r").telemetry(name)):
-            report = telemetry.read_report(wire.Reader("", payload), end, (2, 3), 1)
+            report = telemetry.read_report(wire.Reader("", payload), end, replace(EXTENT, slots=600), Blocks(600))
             end += report.count
             x_hat.append(report.x_hat)
             P.append(report.P)
@@ -341,7 +346,7 @@ class Sensing:
             if (k + 1) % BATCH == 0 or k + 1 == SLOTS:
                 key, payload = self.next()
                 assert key == self.keys.telemetry("sensor")
-                told += telemetry.read_truth(wire.Reader(key, payload), told, (2, 3)).count
+                told += telemetry.read_truth(wire.Reader(key, payload), told, EXTENT).count
                 assert told == k + 1
 
     def progress(self, name: str, k: int) -> None:
@@ -358,14 +363,18 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     sensing.packets(0, WINDOW)
     everybody = [*brief.part["receivers"], "observer"]
     assert len(everybody) == 5
-    for name in everybody[:-1]:
-        sensing.progress(name, 40)
     sent = WINDOW
-    for done in (4, 8, 20):  # the observer alone is behind: each of its reports lets exactly as many slots through
+    for done in (
+        4,
+        8,
+        20,
+        32,
+        40,
+    ):  # the observer alone is behind: each of its reports lets exactly as many slots through
+        for name in everybody[:-1]:
+            sensing.progress(name, sent)
         sensing.progress("observer", done)
-        sensing.packets(sent, sent := done + WINDOW)
-    sensing.progress("observer", SLOTS)
-    sensing.packets(WINDOW + 20, SLOTS)
+        sensing.packets(sent, sent := min(SLOTS, done + WINDOW))
     stage.commands.put(wire.control("end"))
     sensing.thread.join(LIMIT)
     assert stage.put.get(timeout=LIMIT) == ("closed", b"")
@@ -401,7 +410,7 @@ class WouldWaitError(Exception):
 class News(SimpleQueue[tuple[str, bytes]]):
     """A queue that says so instead of waiting."""
 
-    def get(self, *_: Any) -> tuple[str, bytes]:
+    def get(self, *_: Any, **__: Any) -> tuple[str, bytes]:
         """The next news that is there."""
         if self.empty():
             raise WouldWaitError
@@ -413,7 +422,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
     slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
-    monkeypatch.setattr(peers.sensor, "SimpleQueue", News)
+    monkeypatch.setattr(emulator.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
     window = Window(session, followers, 10, Kept(print))  # type: ignore[arg-type]
@@ -428,23 +437,25 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
 
     reaches(10)
     for name in set(followers) - {slowest}:
-        report(name, 1000)
+        report(name, 10)
         reaches(10)
     report(slowest, 7)
     reaches(17)
     report(slowest, 3)  # progress never goes back
     reaches(17)
-    report(slowest, 2000)
-    reaches(1010)
+    report(slowest, 17)
+    reaches(20)
 
 
-def test_sensor_refuses_malformed_progress(stage: Stage) -> None:
-    """Progress that is not as documented is an error that names its key."""
+@pytest.mark.parametrize("k", [1.5, -1, 3, 2**63])
+def test_sensor_refuses_malformed_progress(k: float, stage: Stage) -> None:
+    """Progress that is not as documented, or beyond what was sent, is an error that names its key and its sender."""
     session = stage.session(briefs()["sensor"])
     window = Window(session, ("a",), 1, Kept(print))  # type: ignore[arg-type]
-    stage.funnels[session.keys.progress("a")](msgpack.packb({"k": 1.5}))
-    with pytest.raises(MalformedMessage, match=r"progress/a: k = 1.5"):
-        window.wait(1)
+    stage.funnels[session.keys.progress("a")](msgpack.packb({"k": k}))
+    with pytest.raises(MalformedMessage, match=rf"progress/a: k = {k}.*Check that a speaks") as found:
+        window.wait(2)
+    assert found.value.at_fault == ("a",)
 
 
 @pytest.mark.parametrize("window", range(2, 40))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,33 @@ def test_without_the_solver_one_line_says_what_to_install(
     assert cli.main(["check", "microgrid"]) == 0
     assert cli.main(["list"]) == 0
     assert "microgrid-mpc" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("raise ImportError('libosqp.so: cannot open')", "importing osqp raised ImportError: libosqp.so: cannot open"),
+        ("raise OSError('wrong ELF class')", "importing osqp raised OSError: wrong ELF class"),
+        (
+            "import numpy.no_such_module",
+            "importing osqp raised ModuleNotFoundError: No module named 'numpy.no_such_module'",
+        ),
+        ("OSQP = object", "importing osqp raised AttributeError: module 'osqp' has no attribute 'SolverStatus'"),
+        ("def", "importing osqp raised SyntaxError: "),
+    ],
+)
+def test_a_broken_solver_is_told_in_one_line(
+    text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is there and cannot be used: why, and what to do; status 2."""
+    (tmp_path / "osqp.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "osqp", raising=False)
+    assert cli.main(["check", "microgrid-mpc"]) == 2
+    told = capsys.readouterr().err
+    assert f"controller.strategy: is mpc, whose solver is broken ({said}" in told
+    assert "expected pip install --force-reinstall osqp first, or the strategy lqr" in told
+    assert "Traceback" not in told
 
 
 def test_a_house_needs_a_plant() -> None:

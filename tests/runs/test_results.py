@@ -12,8 +12,9 @@ from pydantic import BaseModel
 
 from emulator import scenario
 from emulator.api import montecarlo
-from emulator.runs import results as module
-from emulator.runs.results import _BYTES, ACTIONS, DIGESTS, JOURNAL, Results, _Table, load_results
+from emulator.runs import growing
+from emulator.runs.growing import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish
+from emulator.runs.results import ACTIONS, DIGESTS, JOURNAL, Results, load_results
 from emulator.scenario import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -86,29 +87,38 @@ def masks(rows: int, width: int) -> list[np.ndarray]:
     return [np.arange(rows), np.zeros(rows, np.int8), *(np.full(rows, 8 * width) for _ in JOURNAL.names[2:-1]), mask]
 
 
+def journal(folder: Path, parts: list[list[np.ndarray]]) -> pq.ParquetFile:
+    """The Parquet file of a journal that was written in a round for each part."""
+    unfinished = Unfinished(folder)
+    stream = Stream(folder / UNFINISHED / "journal-0.arrows", JOURNAL, {"link": ("legitimate",)})
+    for columns in parts:
+        stream.add(columns)
+        unfinished.round("", 0, {"journal": stream})
+    stream.close()
+    unfinished.close()
+    finish(folder)
+    return pq.ParquetFile(folder / "journal.parquet")
+
+
 def test_wide_rows_are_not_held_back_by_their_number(tmp_path: Path) -> None:
-    """A journal of 300 000 trials: no row group is larger than it should be, nor is what waits in memory."""
-    table = _Table(tmp_path / "journal.parquet", JOURNAL, {"link": ("legitimate",)})
-    waiting = 0
-    for _ in range(20):
-        table.add(masks(100, 37_500))
-        waiting = max(waiting, sum(array.nbytes for held in table._held for array in held))
-    table.close()
-    assert waiting < _BYTES
-    file = pq.ParquetFile(tmp_path / "journal.parquet")
+    """A journal of 300 000 trials: no row group is larger than it should be."""
+    file = journal(tmp_path, [masks(100, 37_500) for _ in range(20)])
     sizes = [file.metadata.row_group(i).num_rows * 37_500 for i in range(file.num_row_groups)]
     assert sum(sizes) == 2000 * 37_500
-    assert max(sizes) <= _BYTES
+    assert max(sizes) <= BATCH_BYTES
+
+
+def test_narrow_rows_are_put_together(tmp_path: Path) -> None:
+    """Many small rounds are few row groups."""
+    file = journal(tmp_path, [masks(100, 1) for _ in range(700)])
+    assert [file.metadata.row_group(i).num_rows for i in range(file.num_row_groups)] == [65_600, 4_400]
 
 
 def test_rows_that_come_at_once_are_parted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """More bytes than a row group's offsets can count are several row groups, and read back as they were."""
-    monkeypatch.setattr(module, "_BYTES", 1000)
-    table = _Table(tmp_path / "journal.parquet", JOURNAL, {"link": ("legitimate",)})
+    monkeypatch.setattr(growing, "BATCH_BYTES", 1000)
     columns = masks(10, 400)
-    table.add(columns)
-    table.close()
-    assert pq.ParquetFile(tmp_path / "journal.parquet").num_row_groups >= 5
+    assert journal(tmp_path, [columns]).num_row_groups >= 5
     found = pq.read_table(tmp_path / "journal.parquet")
     assert found["slot"].to_pylist() == list(range(10))
     assert found["delivered_mask"].to_pylist() == [row.tobytes() for row in columns[-1]]

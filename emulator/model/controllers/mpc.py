@@ -84,6 +84,10 @@ class Mpc(Controller):
             return [
                 ("strategy", "is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first")
             ]
+        why = _broken()
+        if why is not None:
+            remedy = "expected pip install --force-reinstall osqp first, or the strategy lqr"
+            return [("strategy", f"is mpc, whose solver is broken ({why}); {remedy}")]
         if not np.all(assignment.input_weights + assignment.rate_weights > 0.0):
             return [
                 ("input_weights", "leave an input without weight; expected input_weights, or rate_weights, above 0")
@@ -103,6 +107,16 @@ class Mpc(Controller):
                 decided[:, r] = programme.first(found.x, self._u[:, r])
         self._u = decided
         return decided
+
+
+def _broken() -> str | None:
+    """Why the solver, which is installed, cannot be used; None if it can."""
+    try:
+        osqp = import_module("osqp")
+        _ = osqp.OSQP, int(osqp.SolverStatus.OSQP_SOLVED)
+    except Exception as error:  # a broken extension module raises anything
+        return f"importing osqp raised {type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+    return None
 
 
 class _Programme:

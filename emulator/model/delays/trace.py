@@ -12,7 +12,8 @@ from emulator.model.delays.checks import is_number
 from emulator.model.delays.delay import LONGEST, DelayModel
 from emulator.model.process import Floats
 
-MOST_DELAYS = 10_000_000
+MOST_DELAYS = 900_000
+"""Of all links of a scenario together: its results hold them in their copy of the scenario."""
 
 
 class Trace(DelayModel):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
+from math import prod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +12,8 @@ import numpy as np
 from emulator.model.links.link import Chain, Fate, LossModel
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes
+
+_MOST_STATES = 1024  # of the chain of all links: more of them, and its transitions would fill the memory
 
 
 class Pooled(LossModel):
@@ -38,10 +41,11 @@ class Pooled(LossModel):
 
     @property
     def chain(self) -> Chain | None:
-        """The states of all links side by side; None if the losses of one follow no chain."""
+        """The states of all links side by side; None if the losses of one follow no chain, or these are too many."""
         chains = [model.chain for model in self._models]
         known = [chain for chain in chains if chain is not None]
-        return reduce(_both, known) if len(known) == len(chains) else None
+        small = prod(len(chain.law) for chain in known) <= _MOST_STATES
+        return reduce(_both, known) if small and len(known) == len(chains) else None
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """Of each packet, by the links' own: `pooled`."""

@@ -1,0 +1,126 @@
+"""Reading files that somebody names: regular files alone, and no more of them than can be of use.
+
+A pipe or a device may never end, and some megabytes of a compressed file may stand for many gigabytes. Every reader here
+stops as soon as it has read more than its limit, and says which limit that is.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import stat
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+LINE_CHARACTERS = 65_536
+"""The longest line of a table."""
+
+
+class Unreadable(ValueError):
+    """A file that cannot be read, or has more in it than can be of use; the message is a phrase to put in brackets."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How much of a table is read at most, after decompression."""
+
+    lines: int
+    characters: int
+
+    @classmethod
+    def of_rows(cls, rows: int) -> Limit:
+        """Room for this many rows of numbers, and for comments and empty lines beside them."""
+        return cls(2 * rows + 10_000, 16 * 2**20 + 1024 * rows)
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is anything of this name, a link to nothing included; False for a name that nothing can have."""
+    try:
+        return os.path.lexists(path)
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder of this name; False for a name that nothing can have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def shown(path: object) -> str:
+    """A path for a message or a table, in which bytes that are not UTF-8 are written in hexadecimal."""
+    return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def opened(path: Path) -> BinaryIO:
+    """A regular file, open for reading. Raises Unreadable if there is none, or if it is anything else."""
+    try:
+        # Opening a pipe that nobody writes to would wait for ever.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError) as error:
+        raise Unreadable(why_of(error)) from error
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            raise Unreadable("it is a folder" if stat.S_ISDIR(mode) else "it is a pipe or a device, not a file")
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def contents(path: Path, most: int) -> bytes:
+    """All bytes of a regular file. Raises Unreadable, also if it has more than `most` bytes."""
+    try:
+        with opened(path) as file:
+            found = file.read(most + 1)
+    except OSError as error:
+        raise Unreadable(why_of(error)) from error
+    if len(found) > most:
+        raise Unreadable(f"it has more than {most} bytes")
+    return found
+
+
+def text_of(path: Path, most: int) -> str:
+    """The text of a regular file in UTF-8, without a byte order mark. Raises Unreadable as `contents` does."""
+    try:
+        return contents(path, most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise Unreadable(f"it is not text in UTF-8: {error.reason} at byte {error.start}") from error
+
+
+def lines_of(path: Path, limit: Limit) -> Iterator[str]:
+    """The lines of a text file, decompressed if its name ends in .gz, with their line ends.
+
+    Raises Unreadable once a line, or all of them, are more than the limit.
+    """
+    lines = characters = 0
+    try:
+        with opened(path) as raw, gzip.open(raw) if path.suffix == ".gz" else raw as file:
+            text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+            while line := text.readline(LINE_CHARACTERS + 1):
+                lines += 1
+                characters += len(line)
+                if len(line) > LINE_CHARACTERS:
+                    raise Unreadable(f"line {lines} has more than {LINE_CHARACTERS} characters")
+                if lines > limit.lines or characters > limit.characters:
+                    most = f"{limit.lines} lines" if lines > limit.lines else f"{limit.characters} characters"
+                    raise Unreadable(f"it has more than {most}, comments and empty lines included")
+                yield line
+    except UnicodeDecodeError as error:
+        raise Unreadable(f"it is not text in UTF-8 after line {lines}: {error.reason}") from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise Unreadable(why_of(error)) from error
+
+
+def why_of(error: Exception) -> str:
+    """An error of the file system in some words."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return next(iter(str(error).splitlines()), type(error).__name__)

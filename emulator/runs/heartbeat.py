@@ -1,0 +1,57 @@
+"""The observer's news to its launcher, and its heartbeat among them.
+
+The launcher gives up an observer that says nothing for half a minute. So the heartbeat has a thread of its own: it does not
+stop while the observer imports, computes or writes, however long that takes on a busy machine.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Self, final
+
+_BEAT_SECONDS = 1.0
+_LINE = threading.Lock()  # one line at a time
+
+
+def set_news_apart() -> None:
+    """Let the file descriptor 1 be standard error from now on: Zenoh logs there, in the middle of the news."""
+    sys.stdout.flush()
+    sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+
+
+def tell(event: str, **news: Any) -> None:
+    """Write a line to standard output for the launcher; nobody has to read it."""
+    left = memoryview(json.dumps({"event": event, **news}, ensure_ascii=False).encode() + b"\n")
+    with _LINE, suppress(OSError, ValueError, AttributeError):  # a launcher that is gone, or no standard output
+        while left:
+            left = left[os.write(sys.stdout.fileno(), left) :]
+
+
+@final
+class Heartbeat:
+    """Says that this process lives, every second while the block runs."""
+
+    def __init__(self, seconds: float = _BEAT_SECONDS) -> None:
+        self._seconds = seconds
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _beat(self) -> None:
+        while not self._over.wait(self._seconds):
+            tell("alive")

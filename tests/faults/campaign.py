@@ -1,0 +1,209 @@
+"""Disturb live runs at random, seeded, and hold what becomes of them against what is promised.
+
+    python -m tests.faults.campaign --seed 1 --count 100
+
+Each case has a number, and its scenario, faults and moments are drawn from that: the same number is the same case. Folders of
+cases in which something promised does not hold are kept. Source: docs/testing.md, faults.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from emulator.runs.results import load_results
+from tests.faults import ours
+from tests.faults.cases import PATIENT_SECONDS, Case, case_of
+from tests.faults.disturbed import Disturbed, disturbed
+from tests.faults.judge import OUTCOMES, misses, outcome_of
+from tests.faults.kinds import KINDS, Fault
+from tests.faults.moments import Usual
+from tests.faults.reference import Reference, in_memory, unlike, with_journal
+from tests.faults.variants import Variant
+
+_LIMIT_SECONDS = 75.0
+"""Within which a run must have ended after its last fault; the longest outage comes on top."""
+
+
+_HEADS = {"kind": "fault", "target": "target"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a case."""
+
+    case: Case
+    hits: tuple[Fault, ...]
+    """The faults that hit something: some come when the run is over."""
+    outcome: str
+    misses: tuple[str, ...]
+    seconds: float
+
+    def __str__(self) -> str:
+        late = len(self.case.faults) - len(self.hits)
+        some = f" ({late} too late)" if late else ""
+        return f"{self.case.seed:6d}  {self.outcome:18} {self.seconds:5.1f} s  {self.case}{some}"
+
+
+@dataclass
+class Campaign:
+    """Cases in a folder. Final."""
+
+    folder: Path
+    small_disks: bool
+    _known: dict[str, tuple[Reference, Usual]] = field(default_factory=dict)
+
+    def carry_out(self, case: Case) -> Verdict:
+        """Run a case to its end."""
+        reference, usual = self.known(case.variant)
+        before = frozenset(one.pid for one in ours.descendants())
+        folder = self.folder / str(case.seed)
+        hits: list[Fault] = []
+        begun = time.monotonic()
+        with disturbed(case.variant, folder, case.options, case.wired, case.fills and self.small_disks) as run:
+            hung = _follow(run, case, usual, hits)
+            seconds = time.monotonic() - begun
+            if hung:
+                run.launcher.kill()
+            run.launcher.wait()
+            found = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
+            ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
+        ours.reap()
+        outcome = OUTCOMES[-1] if found else outcome_of(run.launcher.returncode)
+        verdict = Verdict(case, tuple(hits), outcome, tuple(found), seconds)
+        if not found:
+            shutil.rmtree(folder)
+        return verdict
+
+    def known(self, variant: Variant) -> tuple[Reference, Usual]:
+        """What an undisturbed run of a variant comes to, and how long it takes."""
+        if variant.name not in self._known:
+            folder = self.folder / variant.name
+            folder.mkdir()
+            reference = in_memory(variant.scenario(folder), folder / "memory")
+            with disturbed(variant, folder / "live", ["--set", f"longest_outage={PATIENT_SECONDS}"]) as run:
+                run.launcher.wait()
+                ended = time.monotonic()
+                run.over.wait(0.1)  # for the last news to be read
+                if run.launcher.returncode:
+                    raise SystemExit(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")
+                results = load_results(run.out)
+                wrong = list(unlike(results.summary, reference))
+                if wrong:
+                    raise SystemExit(f"an undisturbed run of {variant.name} is not as in memory: {'; '.join(wrong)}")
+                assert run.started is not None
+                assert run.finished is not None
+                usual = Usual(run.started - run.begun, run.finished - run.started, ended - run.finished)
+                self._known[variant.name] = with_journal(reference, results.journal), usual
+            ours.reap()
+        return self._known[variant.name]
+
+
+def _follow(run: Disturbed, case: Case, usual: Usual, hits: list[Fault]) -> str | None:
+    """Let the faults strike, and wait for the launcher's end; what is wrong if it does not come."""
+
+    def strike(fault: Fault) -> None:
+        if fault.strike(run, usual):
+            hits.append(fault)
+
+    threads = [threading.Thread(target=strike, args=(fault,)) for fault in case.faults]
+    for thread in threads:
+        thread.start()
+    lasting = sum(fault.seconds or 0.0 for fault in case.faults)
+    limit = usual.start + usual.run + usual.finish + lasting + case.longest_outage + _LIMIT_SECONDS
+    hung = None
+    try:
+        run.launcher.wait(limit)
+    except subprocess.TimeoutExpired:
+        hung = f"the run did not end within {limit:.0f} s"
+    run.over.set()
+    for thread in threads:
+        thread.join()
+    return hung
+
+
+def tally(verdicts: Sequence[Verdict]) -> str:
+    """How many faults of each kind came to which end, and each target, as tables in Markdown."""
+    parts = []
+    for head in ("kind", "target"):
+        counts = Counter((getattr(fault, head), verdict.outcome) for verdict in verdicts for fault in verdict.hits)
+        names = [name for name in KINDS if any(key[0] == name for key in counts)] if head == "kind" else []
+        names += sorted({key[0] for key in counts} - set(names))
+        lines = [f"| {_HEADS[head]} | {' | '.join(OUTCOMES)} | all |", "|---" * (len(OUTCOMES) + 2) + "|"]
+        for name in names:
+            row = [counts[name, outcome] for outcome in OUTCOMES]
+            lines.append(f"| {name} | {' | '.join(map(str, row))} | {sum(row)} |")
+        sums = [sum(counts[name, outcome] for name in names) for outcome in OUTCOMES]
+        lines.append(f"| all | {' | '.join(map(str, sums))} | {sum(sums)} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)
+
+
+@contextmanager
+def campaign(folder: Path | None = None) -> Iterator[Campaign]:
+    """A campaign in a folder, by default a temporary one, which is removed if nothing is kept in it."""
+    ours.adopt_orphans()
+    ours.heed_signals()
+    small_disks = ours.mounts_of_our_own()
+    made = folder or Path(tempfile.mkdtemp(prefix="faults-"))
+    made.mkdir(parents=True, exist_ok=True)
+    one = Campaign(made, small_disks)
+    try:
+        yield one
+    finally:
+        kept = [path for path in made.iterdir() if path.name.isdecimal()]
+        if not kept and folder is None:
+            shutil.rmtree(made)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Carry out some cases; 1 if something promised did not hold."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.campaign", description=__doc__.partition("\n")[0])
+    parser.add_argument("--seed", type=int, nargs="+", default=[1], help="numbers of the first cases")
+    parser.add_argument("--count", type=int, default=1, help="how many cases from each number on")
+    parser.add_argument("--list", action="store_true", help="print the cases and run none")
+    parser.add_argument("--keep", type=Path, help="a folder for what is kept; default a temporary one")
+    options = parser.parse_args(arguments)
+    cases = [case_of(seed) for first in options.seed for seed in range(first, first + options.count)]
+    if options.list:
+        for case in cases:
+            say(f"{case.seed:6d}  {case}")
+        return 0
+    verdicts: list[Verdict] = []
+    with campaign(options.keep) as one:
+        try:
+            for case in cases:
+                verdicts.append(one.carry_out(case))
+                say(str(verdicts[-1]))
+                for miss in verdicts[-1].misses:
+                    say(f"        {miss}")
+        except KeyboardInterrupt:
+            say("interrupted")
+    missed = [verdict for verdict in verdicts if verdict.misses]
+    say(f"\n{tally(verdicts)}\n")
+    say(f"{sum(len(verdict.hits) for verdict in verdicts)} faults in {len(verdicts)} runs, {len(missed)} with a miss")
+    for verdict in missed:
+        say(
+            f"    make test-faults SEED={verdict.case.seed}    what is left of it: {one.folder / str(verdict.case.seed)}"
+        )
+    return 1 if missed or len(verdicts) < len(cases) else 0
+
+
+def say(line: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

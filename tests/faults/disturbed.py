@@ -1,0 +1,208 @@
+"""A live run that is disturbed: its launcher, its processes, the cables between them, what it tells, and its disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from tests.faults import ours
+from tests.faults.variants import Variant
+from tests.proxy import Cable
+
+_WITHIN = Path(__file__).with_name("within")
+_DISK_BYTES = 24 * 2**20
+_ROOT = Path(__file__).parents[2]
+
+
+class Disturbed:
+    """A run of a variant in a folder of its own. Made by `disturbed`."""
+
+    def __init__(self, variant: Variant, folder: Path, options: list[str], wired: set[str], small_disk: bool) -> None:
+        """wired: processes that reach their router through a cable; small_disk: whether the results have a disk of their own."""
+        self.variant, self.folder, self._wired = variant, folder, wired
+        self.temporary = folder / "temporary"
+        self.temporary.mkdir(parents=True)
+        self.disk = folder / "disk"
+        self.disk.mkdir()
+        self._mounted = small_disk and _mount(self.disk)
+        self.out = self.disk / "run"
+        self.renamed = self.disk / "renamed"
+        self.over = threading.Event()
+        """Set when the launcher has ended."""
+        self.started: float | None = None
+        """When the run was started, by the monotonic clock."""
+        self.finished: float | None = None
+        """When its last slot was or will be done, as far as can be told."""
+        self.done = 0
+        """How many slots it said are done."""
+        self.cables: dict[tuple[int, str], Cable] = {}
+        self._shards: dict[str, int] = {}
+        self._lock = threading.Lock()
+        self._asked = socket.socket(socket.AF_UNIX)
+        self._asked.bind(str(folder / "asked"))
+        self._asked.listen(64)
+        threading.Thread(target=self._answer, daemon=True).start()
+        self.begun = time.monotonic()
+        with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as err:
+            self.launcher = subprocess.Popen(
+                [sys.executable, "-m", "emulator", "run", variant.path(folder), *variant.options, *options, "--out", self.out],
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
+                env={
+                    **os.environ,
+                    "TMPDIR": str(self.temporary),
+                    "PYTHONPATH": f"{_WITHIN}{os.pathsep}{_ROOT}",
+                    "EVEDROP_CAMPAIGN": str(folder),
+                    "COLUMNS": "160",
+                },
+            )  # fmt: skip
+        threading.Thread(target=self._listen, daemon=True).start()
+        self._slots = variant.scenario(folder).slots
+
+    def _answer(self) -> None:
+        """Tell the launcher what each process is to take for its router's endpoint."""
+        with suppress(OSError):
+            while True:
+                near, _ = self._asked.accept()
+                with near, suppress(OSError, ValueError):
+                    told = json.loads(near.makefile().readline())
+                    near.sendall(self._endpoint(told).encode())
+
+    def _endpoint(self, told: dict[str, Any]) -> str:
+        with self._lock:
+            firsts = {**self._shards, told["private"]: told["first"]}
+            self._shards = firsts
+        router = str(told["router"])
+        if told["role"] == "router" or told["process"] not in self._wired:
+            return router
+        port = int(router.rpartition(":")[2])
+        key = (int(told["first"]), str(told["process"]))
+        if key not in self.cables:
+            self.cables[key] = Cable(port)
+        return re.sub(r"\d+$", self.cables[key].endpoint.rpartition(":")[2], router)
+
+    def _listen(self) -> None:
+        """Follow what the run tells."""
+        news, read = self.folder / "news", 0
+        while not self.over.is_set():
+            with suppress(OSError), news.open() as file:
+                file.seek(read)
+                for line in file:
+                    if not line.endswith("\n"):
+                        break
+                    read += len(line.encode())
+                    self._take(json.loads(line))
+            self.over.wait(0.02)
+
+    def _take(self, told: dict[str, Any]) -> None:
+        if told["event"] == "started":
+            self.started = told["at"]
+        elif told["event"] == "progress":
+            self.done = max(self.done, int(told["done"]))
+            if told["rate"]:
+                self.finished = told["at"] + (self._slots - told["done"]) / told["rate"]
+        elif told["event"] == "ended":
+            self.finished = min(told["at"], self.finished or told["at"])
+
+    @property
+    def firsts(self) -> list[int]:
+        """The first trial of each shard, in order, as far as they are known."""
+        with self._lock:
+            return sorted(set(self._shards.values()))
+
+    def pids(self, name: str, shard: int = 0) -> list[int]:
+        """The living processes of a name in a shard: one, or none."""
+        if name == "launcher":
+            return [] if self.over.is_set() else [self.launcher.pid]
+        if name == "viewer":
+            return [one.pid for one in ours.descendants() if one.is_viewer]
+        firsts = self.firsts
+        return [
+            one.pid
+            for one in ours.descendants()
+            if one.brief is not None
+            and one.brief.stem == name
+            and self._shards.get(str(one.brief.parent)) == (firsts[shard] if shard < len(firsts) else None)
+        ]
+
+    def wires(self, name: str, shard: int = 0) -> list[Cable]:
+        """The cables of a process, or of `everybody`."""
+        firsts = self.firsts
+        if shard >= len(firsts):
+            return []
+        return [
+            cable
+            for (first, process), cable in list(self.cables.items())
+            if first == firsts[shard] and name in (process, "everybody")
+        ]
+
+    def fill(self) -> bool:
+        """Leave no room on the disk of the results; whether it has one."""
+        if not self._mounted:
+            return False
+        with (self.disk / "filler").open("ab", buffering=0) as file, suppress(OSError):
+            piece = bytes(1 << 16)
+            while True:
+                file.write(piece)
+        with (self.disk / "filler").open("ab", buffering=0) as file, suppress(OSError):
+            while True:
+                file.write(b"\0")
+        return True
+
+    def text(self, name: str) -> str:
+        """What the launcher wrote: `stdout` or `stderr`."""
+        return (self.folder / name).read_text(errors="replace")
+
+    def close(self) -> None:
+        """Let go of all but the files."""
+        self.over.set()
+        self._asked.close()
+        for cable in self.cables.values():
+            cable.close()
+        if self._mounted:
+            self._keep()
+
+    def _keep(self) -> None:
+        """Move the results from their small disk to where they are kept."""
+        (self.disk / "filler").unlink(missing_ok=True)
+        kept = self.folder / "kept"
+        shutil.copytree(self.disk, kept, symlinks=True)
+        subprocess.run(["umount", "--lazy", self.disk], check=True)
+        self.disk.rmdir()
+        kept.rename(self.disk)
+
+
+def _mount(folder: Path) -> bool:
+    """Mount a small disk, in the campaign's own mount namespace."""
+    command = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_BYTES}", "none", str(folder)]
+    return subprocess.run(command, check=False, capture_output=True).returncode == 0
+
+
+@contextmanager
+def disturbed(
+    variant: Variant,
+    folder: Path,
+    options: list[str] | None = None,
+    wired: set[str] | None = None,
+    small_disk: bool = False,
+) -> Iterator[Disturbed]:
+    """A run that has been started; when the block ends its cables and its disk are gone."""
+    run = Disturbed(variant, folder, options or [], wired or set(), small_disk)
+    try:
+        yield run
+    finally:
+        run.close()

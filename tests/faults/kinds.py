@@ -1,0 +1,209 @@
+"""The faults: what each does, and what a run promises when it happens."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from tests.faults.disturbed import Disturbed
+from tests.faults.moments import Moment, Usual
+
+SIGNALS = {"hang up": signal.SIGHUP, "interrupt": signal.SIGINT, "terminate": signal.SIGTERM}
+RESULTS = "results"
+EVERYBODY = "everybody"
+_APPEARS_SECONDS = 5.0
+_PATIENT_SECONDS = (
+    20.0  # of the longest outage, where short interruptions must not end a run, however busy the machine is
+)
+_FILE_BYTES = 4096  # of the largest file, where no disk can be filled
+_ROUTERS = ("router", "relay")
+_UNWRITTEN = (
+    "results cannot be written",
+    "results of the shards cannot be made one",
+    "cannot be written",
+    "cannot be started",
+)
+_NETWORK = ("flap", "cut", "silence")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a case."""
+
+    kind: str
+    target: str
+    """A process, `everybody` of the network, or the `results`."""
+    moment: Moment
+    shard: int = 0
+    seconds: float | None = None
+    """How long it lasts; None for good, or where it does not last."""
+    count: int = 1
+    """How often a connection flaps."""
+
+    def __str__(self) -> str:
+        lasts = "" if self.seconds is None else f" {self.seconds:.1f} s"
+        often = f" {self.count} times" if self.kind == "flap" else ""
+        good = " for good" if self.seconds is None and self.kind in ("stop", "cut", "silence") else ""
+        where = f" (shard {self.shard + 1})" if self.shard else ""
+        return f"{self.kind} {self.target}{where}{often}{lasts}{good} at {self.moment}"
+
+    def strike(self, run: Disturbed, usual: Usual) -> bool:
+        """Wait for the moment and do it; whether it hit anything."""
+        return self.moment.wait(run, usual) and _STRIKES[self.kind](self, run)
+
+    def survived(self, longest_outage: float) -> bool:
+        """Whether the run must go on to the end as if nothing had happened."""
+        if self.target == "viewer":
+            return True
+        # On a busy machine a router takes its time to be back, and so do connections.
+        patient = longest_outage >= _PATIENT_SECONDS
+        if self.kind in (*_NETWORK, "stop"):
+            return patient and self.seconds is not None
+        return patient and self.kind == "kill" and self.target in _ROUTERS
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """What a failure that this fault causes may name."""
+        if self.target == RESULTS:
+            return _UNWRITTEN
+        if self.target == EVERYBODY:
+            return (*_ROUTERS, "observer")
+        # Whose own connection is gone cannot tell who is at fault: to it all others vanish behind the router.
+        return (self.target, *(_ROUTERS if self.target in ("observer", *_ROUTERS) else ()))
+
+
+_T = TypeVar("_T")
+
+
+def _awaited(look: Callable[[], list[_T]], run: Disturbed) -> list[_T]:
+    """What there is, as soon as there is something, within some seconds."""
+    found: list[_T] = []
+    for _ in range(int(_APPEARS_SECONDS / 0.02)):
+        found = look()
+        if found or run.over.wait(0.02):
+            break
+    return found
+
+
+def _process(fault: Fault, run: Disturbed) -> list[int]:
+    """The target's process id, as soon as there is one."""
+    return _awaited(lambda: run.pids(fault.target, fault.shard), run)
+
+
+def _heeds(pid: int) -> bool:
+    """Whether a process has come to the first line of ours, which has it heed signals: what Python did before is not a run's."""
+    with suppress(OSError, StopIteration):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
+        return bool(caught >> (signal.SIGTERM - 1) & 1)
+    return False
+
+
+def _send(number: signal.Signals) -> Callable[[Fault, Disturbed], bool]:
+    def strike(fault: Fault, run: Disturbed) -> bool:
+        hit = False
+        if fault.target == "launcher" and fault.kind in SIGNALS:
+            _awaited(lambda: [True] if _heeds(run.launcher.pid) else [], run)
+        for pid in _process(fault, run):
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+                hit = True
+        return hit
+
+    return strike
+
+
+def _stop(fault: Fault, run: Disturbed) -> bool:
+    found = _process(fault, run)
+    for pid in found:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGSTOP)
+    run.over.wait(fault.seconds)  # for good: until the launcher has ended, which ends or frees it
+    for pid in found:
+        if pid in run.pids(fault.target, fault.shard):
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+    return bool(found)
+
+
+def _flap(fault: Fault, run: Disturbed) -> bool:
+    hit = False
+    _awaited(lambda: run.wires(fault.target, fault.shard), run)
+    for _ in range(fault.count):
+        for wire in run.wires(fault.target, fault.shard):
+            hit = hit or wire.connections > 0
+            wire.cut()
+            wire.heal()
+        if run.over.wait((fault.seconds or 0.0) / fault.count):
+            break
+    return hit
+
+
+def _cut(fault: Fault, run: Disturbed) -> bool:
+    return _held(fault, run, "cut")
+
+
+def _silence(fault: Fault, run: Disturbed) -> bool:
+    return _held(fault, run, "silence")
+
+
+def _held(fault: Fault, run: Disturbed, how: str) -> bool:
+    wires = _awaited(lambda: run.wires(fault.target, fault.shard), run)
+    for wire in wires:
+        getattr(wire, how)()
+    run.over.wait(fault.seconds)
+    for wire in wires:
+        wire.heal()
+    return bool(wires)
+
+
+def _fill(fault: Fault, run: Disturbed) -> bool:
+    """Fill the disk; without one of our own, no file of those who write results may grow any more."""
+    del fault
+    if run.fill():
+        return True
+    hit = False
+    for name in ("observer", "launcher"):
+        for shard in range(run.variant.shards):
+            for pid in run.pids(name, shard):
+                with suppress(ProcessLookupError):
+                    _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+                    resource.prlimit(pid, resource.RLIMIT_FSIZE, (_FILE_BYTES, hard))
+                    hit = True
+    return hit
+
+
+def _rename(fault: Fault, run: Disturbed) -> bool:
+    del fault
+    with suppress(OSError):
+        os.rename(run.out, run.renamed)
+        return True
+    return False
+
+
+def _remove(fault: Fault, run: Disturbed) -> bool:
+    del fault
+    there = run.out.exists()
+    shutil.rmtree(run.out, ignore_errors=True)
+    return there
+
+
+_STRIKES: Mapping[str, Callable[[Fault, Disturbed], bool]] = {
+    "kill": _send(signal.SIGKILL),
+    **{kind: _send(number) for kind, number in SIGNALS.items()},
+    "stop": _stop,
+    "flap": _flap,
+    "cut": _cut,
+    "silence": _silence,
+    "fill the disk": _fill,
+    "rename": _rename,
+    "remove": _remove,
+}
+KINDS = tuple(_STRIKES)

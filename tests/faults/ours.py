@@ -1,0 +1,100 @@
+"""The processes of a run as the system knows them: all that descend from the campaign, whoever their parent is by now."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+_SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER
+_NEW_MOUNTS = 0x00020000  # CLONE_NEWNS
+
+
+def adopt_orphans() -> None:
+    """From now on a process whose parent dies becomes our child, so that none gets out of sight."""
+    if ctypes.CDLL(None, use_errno=True).prctl(_SUBREAPER, 1, 0, 0, 0):
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
+
+
+def mounts_of_our_own() -> bool:
+    """Enter a mount namespace of our own, which ends with us; whether we may. No other thread may run yet."""
+    if os.geteuid() or ctypes.CDLL(None, use_errno=True).unshare(_NEW_MOUNTS):
+        return False
+    return subprocess.run(["mount", "--make-rprivate", "/"], check=False, capture_output=True).returncode == 0
+
+
+def heed_signals() -> None:
+    """Let the runs heed signals that we were started to ignore: a job in the background, or under nohup."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)  # which a process that is started does not inherit
+
+
+@dataclass(frozen=True)
+class Process:
+    """A living process of the run."""
+
+    pid: int
+    words: tuple[str, ...]
+    """Its command line."""
+
+    @property
+    def brief(self) -> Path | None:
+        """The brief it was started with, if it is a process of the network."""
+        last = self.words[-1] if self.words else ""
+        return Path(last) if last.endswith(".json") and "/evedrop-" in last else None
+
+    @property
+    def is_viewer(self) -> bool:
+        """Whether it is Rerun's viewer."""
+        return bool(self.words) and Path(self.words[0]).name == "rerun"
+
+
+def descendants() -> Iterator[Process]:
+    """All living processes that descend from us."""
+    children: dict[int, list[int]] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
+            if state not in "ZX":
+                children.setdefault(int(parent), []).append(int(folder.name))
+    waiting = list(children.get(os.getpid(), []))
+    while waiting:
+        pid = waiting.pop()
+        waiting += children.get(pid, [])
+        with suppress(OSError):
+            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
+            yield Process(pid, tuple(words))
+
+
+def none_left(before: frozenset[int], seconds: float) -> list[Process]:
+    """Wait until no descendant is left but those before; those that still are after so many seconds."""
+    deadline = time.monotonic() + seconds
+    while True:
+        found = [one for one in descendants() if one.pid not in before]
+        if not found or time.monotonic() > deadline:
+            return found
+        time.sleep(0.05)
+
+
+def end_all(processes: list[Process]) -> None:
+    """End what a failed case has left."""
+    for one in processes:
+        with suppress(OSError):
+            os.kill(one.pid, signal.SIGKILL)
+    for one in processes:
+        with suppress(OSError):
+            os.waitpid(one.pid, 0)
+
+
+def reap() -> None:
+    """Collect orphans that have ended."""
+    with suppress(ChildProcessError):
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass

@@ -1,0 +1,137 @@
+"""What a run must come to: the same trials in memory, and an undisturbed live run, which is held against them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from emulator import montecarlo
+from emulator.runs.results import Results
+from emulator.scenario import Scenario
+
+KEYS: Mapping[str, tuple[str, ...]] = {
+    "slots": ("slot", "peer"),
+    "trials": ("slot", "peer", "trial"),
+    "inputs": ("slot", "trial"),
+    "journal": ("slot", "link"),
+    "digests": ("peer", "trial", "block"),
+}
+"""Table → what names a row of it."""
+_COUNTS = {"slots": "trials", "journal": "offered"}  # of how many trials a row is
+_ROUNDED = 1e-9  # of figures that a live run adds up in another order
+_SHOWN = 3  # rows that are wrong, of a table
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Rows by their keys, and the summary in memory."""
+
+    summary: Mapping[str, Any]
+    tables: Mapping[str, Mapping[tuple[Any, ...], Row]]
+    shards: int = 1
+
+    def wrong_rows(self, name: str, table: pa.Table) -> Iterator[str]:
+        """Rows of a table on disk that differ from those that are right; rows that must not be there."""
+        known, found = self.tables.get(name), 0
+        if known is None:
+            return
+        seen = set[tuple[Any, ...]]()
+        for row in table.to_pylist():
+            key = _key(name, row)
+            wanted = known.get(key)
+            why = (
+                "twice"
+                if key in seen
+                else "must not be there"
+                if wanted is None
+                else _difference(name, row, wanted, self.shards)
+            )
+            seen.add(key)
+            if why is not None:
+                found += 1
+                if found <= _SHOWN:
+                    yield f"{name} {key}: {why}"
+        if found > _SHOWN:
+            yield f"{name}: {found} wrong rows in all"
+
+
+def in_memory(scenario: Scenario, folder: Path) -> Reference:
+    """The same trials in memory."""
+    results = montecarlo(scenario, trials=scenario.trials, out=folder)
+    tables = {name: _rows(name, table) for name, table in tables_of(results, journal=False)}
+    return Reference(results.summary, tables, scenario.shards)
+
+
+def with_journal(reference: Reference, journal: pa.Table) -> Reference:
+    """A reference that knows the journal of an undisturbed live run as well."""
+    return replace(reference, tables={**reference.tables, "journal": _rows("journal", journal)})
+
+
+def tables_of(results: Results, journal: bool = True) -> Iterator[tuple[str, pa.Table]]:
+    """The tables of a results folder that there are."""
+    for name in KEYS:
+        if name != "journal" or journal:
+            table = getattr(results, name)
+            if table is not None:
+                yield name, table
+
+
+def _key(name: str, row: Row) -> tuple[Any, ...]:
+    return tuple(row[column] for column in KEYS[name])
+
+
+def _rows(name: str, table: pa.Table) -> dict[tuple[Any, ...], Row]:
+    return {_key(name, row): row for row in table.to_pylist()}
+
+
+def _difference(name: str, row: Row, wanted: Row, shards: int) -> str | None:
+    """Why a row is not the one that it must be; None if it is."""
+    counts = _COUNTS.get(name)
+    if shards > 1 and counts is not None and row[counts] < wanted[counts]:
+        return None  # some shards were cut short: of fewer trials
+    for column, value in row.items():
+        expected = wanted[column]
+        if name == "slots":
+            if "quantile" in column:  # in memory alone
+                continue
+            same = _near(value, expected)
+        else:
+            same = repr(value) == repr(expected)  # to the last bit, NaN and −0 included
+        if not same:
+            return f"{column} is {value}, not {expected}"
+    return None
+
+
+def _near(value: Any, expected: Any) -> bool:
+    """Whether two figures are the same but for rounding; where there is nothing it is None or NaN."""
+    if _nothing(value) or _nothing(expected):
+        return _nothing(value) and _nothing(expected)
+    if isinstance(value, float) and isinstance(expected, float):
+        return value == expected or math.isclose(value, expected, rel_tol=_ROUNDED, abs_tol=1e-300)
+    return bool(value == expected)
+
+
+def _nothing(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def unlike(summary: Mapping[str, Any], reference: Reference) -> Iterator[str]:
+    """What of a whole run's summary is not as in memory."""
+    wanted = reference.summary
+    for entry in ("slots", "trials"):
+        if summary[entry] != wanted[entry]:
+            yield f"{entry} is {summary[entry]}, not {wanted[entry]}"
+    for name, peer in wanted["peers"].items():
+        if summary["peers"][name]["digest"] != peer["digest"]:
+            yield f"the digest of {name} is {summary['peers'][name]['digest']}, not {peer['digest']}"
+        if summary["links"][name] != wanted["links"][name]:
+            yield f"the account of {name}'s link differs"
+    if wanted.get("controller") is not None and summary["controller"]["digest"] != wanted["controller"]["digest"]:
+        yield "the digest of the controller differs"

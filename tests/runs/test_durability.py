@@ -1,0 +1,255 @@
+"""What was measured is on disk and can be read: after kill -9 of everything, on a full disk, in a folder that was renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.errors import UsageError
+from emulator.runs.growing import UNFINISHED, goes_on, last_round
+from emulator.runs.results import Results, ResultsWriter, load_results
+from emulator.runs.score import SlotSums
+from emulator.view.replay import replay
+from tests.conftest import Evedrop, Live, wait_until
+
+ENDLESS = ("--slots", "1000000")
+
+
+def kill_all(live: Live) -> None:
+    """Kill -9 of the command and of all its processes, at once."""
+    found = [live.process.pid, *live.left()]
+    for pid in found:
+        os.kill(pid, signal.SIGSTOP)  # so that none can notice that another one is gone
+    for pid in found:
+        os.kill(pid, signal.SIGKILL)
+    live.process.communicate()
+    wait_until(lambda: not live.left(), "no process left of the run")
+
+
+def cut_short(live: Live) -> int:
+    """Check that the folder of a live run that was killed opens, and says where it ends; how many slots it has."""
+    results = live.results
+    slots: int = results.summary["slots"]
+    assert str(results.summary["ended"]).startswith(f"cut short at slot {slots}, for its run was killed")
+    receivers = len(results.summary["peers"])
+    for table in (results.slots, results.trials, results.journal):
+        assert table.num_rows == slots * receivers
+        assert set(table["slot"].to_pylist()) == set(range(slots))
+    assert results.digests.num_rows >= receivers * (slots // 256 - 1)
+    return slots
+
+
+def test_a_run_of_which_everything_was_killed_can_be_read(evedrop: Evedrop) -> None:
+    """`load_results`, `view`, `view --table` and `diff` open what there is, say that it is cut short, and where."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    wait_until(lambda: last_round(live.folder).slots >= 600, "slots on disk")
+    assert goes_on(live.folder)
+    assert str(live.results.summary["ended"]).startswith("the run goes on, at slot ")
+    kill_all(live)
+    slots = cut_short(live)
+    done = evedrop("view", "run", "--table")
+    assert done.status == 0
+    assert done.out.startswith(f"cut short at slot {slots}, for its run was killed")
+    assert "legitimate" in done.out
+    assert replay(live.folder, evedrop.folder / "again.rrd").stat().st_size > 10_000
+    whole = evedrop("montecarlo", "eavesdroppers", "--trials", "1", "--slots", str(slots), "--out", "memory")
+    assert whole.status in {0, 1}
+    same = evedrop("diff", "run", "memory")
+    assert (same.status, same.err) == (0, "")
+    assert f"run: cut short at slot {slots}" in same.out
+    assert "no difference in" in same.out
+
+
+MOMENTS: dict[str, Callable[[Live], object]] = {
+    "a folder": lambda live: live.folder.exists(),
+    "streams": lambda live: (live.folder / UNFINISHED).exists(),
+    "first slots": lambda live: last_round(live.folder).slots > 0,
+    "figures": lambda live: (live.folder / UNFINISHED / "summary.json").exists(),
+    "parquet": lambda live: (
+        (live.folder / UNFINISHED / "slots.parquet").exists() or (live.folder / "slots.parquet").exists()
+    ),
+    "end": lambda live: (live.folder / "summary.json").exists(),
+}
+
+
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=[] if what == "parquet" else [pytest.mark.long]) for what in MOMENTS]
+)
+def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
+    """From its first file to its last: the folder opens with whole tables, or says in a line why there is nothing."""
+    live = evedrop.live("eavesdroppers", "--slots", "20000" if what == "figures" else "3000")
+    wait_until(lambda: MOMENTS[what](live), what)
+    kill_all(live)
+    if not last_round(live.folder).at and not (live.folder / "summary.json").exists():
+        assert what in {"a folder", "streams"}
+        with pytest.raises(UsageError, match=r"run the scenario again|give the --out of a run"):
+            load_results(live.folder)
+        return
+    results = live.results
+    if results.summary["ended"] != "complete":
+        cut_short(live)
+    else:
+        assert results.trials.num_rows == 4 * 3000
+    if what in {"parquet", "end"}:
+        assert results.summary["slots"] == 3000
+    assert evedrop("view", "run", "--table").status == 0
+
+
+def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
+    """All results are in it, whole, and the command says where it is."""
+    live = evedrop.live("eavesdroppers", "--slots", "4000")
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    other = live.folder.rename(evedrop.folder / "other")
+    done = live.end()
+    assert done.status == 0, done.err
+    assert f"the results folder was renamed while the run went on; it is {other}" in done.err
+    assert f"results: {other}" in done.out
+    live.nothing_left()
+    assert not live.folder.exists()
+    results = load_results(other)
+    assert results.summary["ended"] == "complete"
+    assert results.trials.num_rows == results.journal.num_rows == 4 * 4000
+    assert {path.name for path in other.iterdir()} == {
+        "scenario.toml", "summary.json", "slots.parquet", "trials.parquet", "journal.parquet", "digests.parquet", "logs",
+    }  # fmt: skip
+
+
+@pytest.mark.long
+def test_a_folder_that_is_removed_is_an_error_that_says_so(evedrop: Evedrop) -> None:
+    """Exit 3 with the folder and what to do, no traceback, nothing left."""
+    live = evedrop.live("eavesdroppers", "--slots", "4000")
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    shutil.rmtree(live.folder.rename(evedrop.folder / "gone"))
+    done = live.end()
+    assert done.status == 3
+    assert "the folder was removed while the run went on" in done.err
+    assert "Traceback" not in done.err
+    live.nothing_left()
+
+
+ON_SMALL_DISK = """
+import subprocess, sys
+disk, size, *command = sys.argv[1:]
+if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], stderr=subprocess.DEVNULL).returncode:
+    sys.exit(77)
+status = subprocess.run([sys.executable, "-m", "emulator", *command]).returncode
+subprocess.run(["cp", "-r", f"{disk}/run", f"{disk}-copy"], check=True)
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize("size", ["256k", pytest.param("1m", marks=pytest.mark.long)])
+def test_a_full_disk_ends_the_run_and_what_fitted_can_be_read(evedrop: Evedrop, size: str) -> None:
+    """On a disk that is really full: a clear line, exit 3, nothing left, and the tables hold what there was room for."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        pytest.skip("only root may mount a small disk")
+    (evedrop.folder / "disk").mkdir()
+    command = ["run", "eavesdroppers", *ENDLESS, "--view", "off", "--out", "disk/run"]
+    process = subprocess.Popen(
+        ["unshare", "--mount", sys.executable, "-c", ON_SMALL_DISK, "disk", size, *command],
+        cwd=evedrop.folder, env=evedrop.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    live = Live(process, evedrop.temporary, evedrop.folder / "disk-copy")
+    done = live.end()
+    if done.status in {1, 77} and "Traceback" not in done.err:
+        pytest.skip("this machine lets nobody mount")
+    assert done.status == 3
+    assert "the results cannot be written" in done.err.splitlines()[0]
+    assert "Traceback" not in done.err
+    live.nothing_left()
+    results = live.results
+    slots = results.summary["slots"]
+    assert slots > 0
+    assert results.summary["ended"] != "complete"
+    for table in (results.slots, results.trials, results.journal):
+        assert table.num_rows == 4 * slots
+    assert evedrop("view", "disk-copy", "--table").status == 0
+
+
+def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
+    """Kill -9 of Monte Carlo: the trials that were done, with statistics, digests and the recorded one."""
+    live = evedrop.started("montecarlo", "eavesdroppers", "--trials", "100000", "--slots", "400", "--workers", "1")
+    wait_until((live.folder / UNFINISHED / "summary.json").exists, "figures on disk")
+    kill_all(live)
+    results = live.results
+    trials = results.summary["trials"]
+    assert trials >= 500
+    assert f"cut short at {trials} of 100000 trials, for its run was killed" in results.summary["ended"]
+    assert set(results.slots["trials"].to_pylist()) == {trials}
+    assert results.slots.num_rows == results.trials.num_rows == 4 * 400
+    assert results.digests.num_rows == 4 * 2 * trials
+    assert f"{trials:,} trials" in evedrop("view", "run", "--table").out
+
+
+def test_the_points_of_a_killed_sweep_are_on_disk(evedrop: Evedrop) -> None:
+    """The table is there while the sweep goes on, whole at any moment."""
+    over = ("--over", "encoding.state_probability=0.1:0.9:0.001", "--trials", "100", "--slots", "200", "--workers", "1")
+    live = evedrop.started("sweep", "eavesdroppers", *over)
+    wait_until((live.folder / "sweep.parquet").exists, "a table")
+    kill_all(live)
+    assert pq.read_table(live.folder / "sweep.parquet").num_rows >= 4
+    assert json.loads((live.folder / "sweep.json").read_text())["scenario"] == "eavesdroppers"
+
+
+@pytest.mark.long
+def test_the_schemes_of_a_killed_comparison_are_on_disk(evedrop: Evedrop) -> None:
+    """compare.json is there while the others are played."""
+    live = evedrop.started("compare", "acknowledged", "--trials", "4000", "--slots", "97", "--workers", "1")
+    wait_until(lambda: (live.folder / "compare.json").exists() or live.process.poll() is not None, "schemes")
+    kill_all(live)
+    assert json.loads((live.folder / "compare.json").read_text())["schemes"]
+
+
+NAMES = ("legitimate", "smart")
+
+
+def sums(count: int) -> SlotSums:
+    """Of so many slots of one trial."""
+    return SlotSums(*(np.ones(count) for _ in fields(SlotSums)))
+
+
+@settings(max_examples=40)
+@given(rounds=st.lists(st.integers(1, 40), min_size=1, max_size=6), data=st.data())
+def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -> None:
+    """Of a round that was being written when the writer ended nothing is read, and everything of those before."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        writer = ResultsWriter(folder, NAMES, 2)
+        kept = [(0, sizes(folder))]
+        for count in rounds:
+            first = kept[-1][0]
+            for receiver in NAMES:
+                writer.slot_rows(first, receiver, sums(count), np.zeros(count))
+            writer._round()
+            kept.append((first + count, sizes(folder)))
+        writer._held.close()
+        writer._unfinished.close()
+        for stream in writer._streams.values():
+            stream.close()
+        whole = data.draw(st.integers(0, len(rounds) - 1), label="whole rounds")
+        slots, before = kept[whole]
+        for file, size in kept[whole + 1][1].items():
+            most = size - 1 if file == "rounds" else size
+            os.truncate(folder / UNFINISHED / file, data.draw(st.integers(before[file], most), label=file))
+        assert last_round(folder).slots == slots
+        rows = Results(folder, {}).slots.to_pylist()
+        assert [row["slot"] for row in rows if row["peer"] == "smart"] == list(range(slots))
+
+
+def sizes(folder: Path) -> dict[str, int]:
+    """File → its size, of an unfinished results folder."""
+    return {path.name: path.stat().st_size for path in (folder / UNFINISHED).iterdir()}

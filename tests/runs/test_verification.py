@@ -1,0 +1,267 @@
+"""What the observer makes of reports: honest ones pass, and each way to contradict is found out, with both values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.errors import Contradiction, MalformedMessage
+from emulator.model.account import COUNTED_BURSTS, Account
+from emulator.model.digest import BeliefLog, Blocks
+from emulator.model.links.link import REASONS
+from emulator.model.receiver import Belief
+from emulator.network.telemetry import Extent, Journal, Report, read_journal, read_report
+from emulator.network.wire import Reader
+from emulator.runs.joined import ReceiverSlots, Slots
+from emulator.runs.verification import Verifier
+
+TRIALS, N, SLOTS, RECORDED = 4, 2, 600, 2
+CUTS = (300, 310)
+
+
+def beliefs(slots: int = SLOTS, trials: int = TRIALS) -> list[Belief]:
+    """Any beliefs, large and small ones beside each other."""
+    rng = np.random.default_rng(5)
+    P = rng.standard_normal((slots, N, N, trials)) * np.exp(4.0 * rng.standard_normal((slots, 1, 1, trials)))
+    x_hat, action = rng.standard_normal((slots, N, trials)), rng.integers(0, 4, (slots, trials), np.uint8)
+    return [Belief(x_hat[k], P[k], action[k]) for k in range(slots)]
+
+
+def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[Report]:
+    """The reports of a receiver that ends them at the ends of batches and of blocks."""
+    log, made, first = BeliefLog(N, trials, SLOTS, CUTS), [], 0
+    found = beliefs(trials=trials)
+    for k, belief in enumerate(found):
+        digests = log.add(k, belief)
+        if (k + 1) % batch and k + 1 < SLOTS and digests is None:
+            continue
+        rows = found[first : k + 1]
+        traces = np.array([np.trace(one.P) for one in rows])
+        made.append(
+            Report(
+                first,
+                np.array([one.x_hat for one in rows]),
+                np.array([one.action for one in rows]),
+                np.ascontiguousarray(np.array([one.P for one in rows])[..., :recorded]),
+                np.stack([traces.sum(axis=1), (traces**2).sum(axis=1)], axis=1),
+                None,
+                {} if digests is None else dict([digests]),
+            )
+        )
+        first = k + 1
+    return made
+
+
+def verified(given: list[Report], recorded: int = RECORDED) -> None:
+    """Have all reports checked."""
+    verifier = Verifier({"eve": Blocks(SLOTS, CUTS)}, recorded, 10)
+    for report in given:
+        verifier.report("eve", report)
+
+
+@pytest.mark.parametrize("recorded", [1, 2, TRIALS])
+@pytest.mark.parametrize("batch", [1, 7, 256, 600])
+def test_an_honest_receiver_passes(batch: int, recorded: int) -> None:
+    """However its slots are batched, with blocks that an outage cuts, and whether some or all trials are recorded."""
+    verified(reports(batch, recorded), recorded)
+
+
+def changed(place: int, **how: Callable[[Any], Any]) -> list[Report]:
+    """Reports of which one has other columns."""
+    made = reports(100)
+    made[place] = replace(made[place], **{name: change(getattr(made[place], name)) for name, change in how.items()})
+    return made
+
+
+def at(where: tuple[int, ...], change: Callable[[float], float]) -> Callable[[np.ndarray], np.ndarray]:
+    """An array with one number changed."""
+
+    def done(array: np.ndarray) -> np.ndarray:
+        copy = array.copy()
+        copy[where] = change(copy[where])
+        return copy
+
+    return done
+
+
+LIES = {
+    "x_hat by one bit": (changed(1, x_hat=at((3, 0, 1), lambda x: np.nextafter(x, 9.0))), "slots 0 to 255 of trial 11"),
+    "P by one bit": (changed(1, P=at((3, 0, 1, 0), lambda x: np.nextafter(x, 9.0))), "slots 0 to 255 of trial 10"),
+    "gamma": (changed(0, action=at((0, 0), lambda code: 0 if code else 2)), "slots 0 to 255 of trial 10"),
+    "digest": (
+        changed(2, digests=lambda blocks: {k: at((1, 31), lambda byte: byte ^ 1)(one) for k, one in blocks.items()}),
+        "slots 0 to 255 of trial 11",
+    ),
+    "less squares than are known": (changed(0, trace=lambda trace: trace * [1.0, 1e-9]), "its sums of tr P"),
+    "a sum that the squares do not allow": (
+        changed(0, trace=lambda trace: trace + np.array([1e9, 0.0])),
+        "its sums of tr P",
+    ),
+}
+"""What is not as it was → the reports, and what is said of them."""
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_a_receiver_that_contradicts_itself_is_found_out(what: str) -> None:
+    """One bit of one recorded trial is enough, and so are sums that no trials have."""
+    given, said = LIES[what]
+    with pytest.raises(Contradiction, match=f"eve contradicts itself: .*{said}") as found:
+        verified(given)
+    assert found.value.at_fault == ("eve",)
+
+
+def test_what_is_not_recorded_rests_on_its_own_word() -> None:
+    """The digest of a trial that is not recorded cannot be computed: this is what `own_word` in the summary says."""
+    verified(
+        changed(2, digests=lambda blocks: {k: at((3, 0), lambda byte: byte ^ 1)(one) for k, one in blocks.items()})
+    )
+
+
+def test_traces_of_recorded_trials_are_theirs() -> None:
+    """Where all trials are recorded the sums are known to within rounding."""
+    made = reports(100, TRIALS)
+    made[0] = replace(made[0], trace=made[0].trace * [1.0 + 1e-6, 1.0])
+    with pytest.raises(Contradiction, match="its sums of tr P"):
+        verified(made, TRIALS)
+
+
+@given(st.floats(-1e150, 1e150), st.floats(-1e300, 1e300))
+def test_any_sums_are_judged(first: float, second: float) -> None:
+    """Whatever numbers are claimed as sums, they pass or are a contradiction."""
+    report = replace(reports(1)[0], trace=np.array([[first, second]]))
+    try:
+        Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 0).report("eve", report)
+    except Contradiction:
+        return
+    assert second >= 0.0
+    assert abs(first) <= np.sqrt(TRIALS * second) * (1.0 + 1e-6)
+
+
+def test_a_receiver_leaves_with_what_it_reported() -> None:
+    """Its last word before an outage, from which it is carried on, is what its report of the slot before says."""
+    verifier, found = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 0), beliefs()
+    last = found[299]
+    verifier.left("eve", 300, last._replace(x_hat=at((1, 3), lambda x: x + 1.0)(last.x_hat)))
+    *before, of_last = [report for report in reports(100) if report.first < 300]
+    for report in before:
+        verifier.report("eve", report)
+    with pytest.raises(Contradiction, match=r"before slot 300, with which it goes away, its x_hat of trial 3 is"):
+        verifier.report("eve", of_last)
+
+
+def slots_of(**changes: Any) -> Slots:
+    """Two slots from 8 on, in which everybody says the same."""
+    delivered = np.array([[True, False, True, True], [False, True, True, True]])
+    receiver = ReceiverSlots(
+        np.zeros((2, N, TRIALS)),
+        np.where(delivered, 2, 0).astype(np.uint8),
+        np.zeros((2, N, N, 1)),
+        np.zeros((2, 2)),
+        delivered,
+        {},
+        np.zeros((2, TRIALS), np.uint16),
+        np.zeros((2, TRIALS), np.uint16),
+        np.zeros((2, TRIALS), np.uint16),
+    )
+    sent = changes.pop("sent", None)
+    return Slots(8, np.zeros((2, N, TRIALS)), np.zeros((2, TRIALS), bool), {"eve": replace(receiver, **changes)}, sent)
+
+
+CLAIMS = {
+    "received": ({"action": np.array([[2, 0, 2, 2], [0, 0, 2, 2]], np.uint8)}, "eve contradicts router: of slot 9, trial 11, it "
+                 r"says that it received nothing \(action 0\), and the journal that it was delivered"),
+    "lost": ({"action": np.array([[2, 3, 2, 2], [0, 2, 2, 2]], np.uint8)}, "eve contradicts router: of slot 8, trial 11, it "
+             r"says that it received the packet \(action 3\), and the journal that it was not delivered"),
+    "late": ({"late": np.eye(2, TRIALS, dtype=np.uint16)}, "eve contradicts router: of slot 8, trial 10, it says that 1 late "
+             "packets came, and the journal 0"),
+    "sent": ({"sent": np.ones((2, TRIALS), bool) & (np.arange(TRIALS) > 0)}, "sensor contradicts router: of slot 8 it says that "
+             "1 trials sent nothing, and the journal 0"),
+}  # fmt: skip
+"""What somebody claims against the journal → the columns, and what is said of it."""
+
+
+def test_slots_in_which_all_say_the_same_pass() -> None:
+    """Nobody is accused."""
+    Verifier({}, 1, 10).joined(slots_of())
+    Verifier({}, 1, 10).joined(slots_of(sent=np.ones((2, TRIALS), bool)))
+
+
+@pytest.mark.parametrize("what", CLAIMS)
+def test_who_contradicts_the_journal_is_found_out(what: str) -> None:
+    """In one trial of one slot, recorded or not: the process, the slot, the trial and both values are named."""
+    changes, said = CLAIMS[what]
+    with pytest.raises(Contradiction, match=said):
+        Verifier({}, 1, 10).joined(slots_of(**changes))
+
+
+EXTENT = Extent(SLOTS, 300, N, TRIALS, RECORDED)
+WRONG = {
+    "a block that does not end": (
+        {"digests": {1: np.zeros((4, 32), np.uint8)}},
+        r"digests of block 1; expected none: no block",
+    ),
+    "a block of no run": ({"digests": {2**63: np.zeros((4, 32), np.uint8)}}, "digests of block 9223372036854775808"),
+    "a block before the run": ({"digests": {-5: np.zeros((4, 32), np.uint8)}}, "digests of block -5"),
+    "late without a window": ({"late": np.ones((100, 4), np.uint16)}, "late of 1; expected numbers from 0 to 0"),
+    "used that never came": ({"late_used": np.zeros((100, 4), np.uint16)}, "more in late_used than in late"),
+    "another shape": ({"x_hat": np.zeros((100, N, 3))}, "x_hat of 4800 bytes; expected 6400 bytes"),
+    "more slots than a batch": ({"x_hat": np.zeros((301, N, 4))}, "c = 301; expected an integer c from 1 to 300"),
+}
+"""What is wrong with a report → its columns, and what is said of it."""
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_report_that_no_run_has_is_refused(what: str) -> None:
+    """Blocks, slots, shapes and counts are held to what the run has."""
+    changes, said = WRONG[what]
+    raw = replace(reports(100)[0], **changes).pack()
+    with pytest.raises(MalformedMessage, match=f"telemetry/eve: {said}") as found:
+        read_report(Reader("evedrop/r/telemetry/eve", raw), 0, EXTENT, Blocks(SLOTS, CUTS))
+    assert found.value.at_fault == ("eve",)
+
+
+def test_digests_that_are_due_are_missed() -> None:
+    """A report without the digests of a block that ends in it is refused, or its figures could never be verified."""
+    raw = replace(reports(100)[2], digests={}).pack()
+    with pytest.raises(
+        MalformedMessage, match=r"digests of blocks \[\]; expected those of \[0\], which end in these slots"
+    ):
+        read_report(Reader("evedrop/r/telemetry/eve", raw), 200, EXTENT, Blocks(SLOTS, CUTS))
+
+
+@pytest.mark.parametrize("first", [600, 2**40])
+def test_nothing_follows_the_last_slot(first: int) -> None:
+    """A report of slots after the run's last is refused, even where it is the next one."""
+    raw = replace(reports(100)[0], first=first).pack()
+    with pytest.raises(MalformedMessage, match="c = 100; expected an integer c from 1 to"):
+        read_report(Reader("evedrop/r/telemetry/eve", raw), first, EXTENT, Blocks(SLOTS, CUTS))
+
+
+JOURNALS = {
+    "more fates than packets": ({"lost": {**dict.fromkeys(REASONS, np.zeros(1, np.uint32)), "cut": np.ones(1, np.uint32)}},
+                                r"5 fates of eve's packets of slot 7; expected 4 of them"),
+    "fewer fates than packets": ({"delivered": np.array([[True, True, False, True]])},
+                                 r"3 fates of eve's packets of slot 7; expected 4 of them"),
+    "more bursts than packets": ({"bursts": np.full(COUNTED_BURSTS, 5, np.uint32)}, "bursts of 5; expected numbers from 0 to 4"),
+    "more delays than packets": ({"delays": np.full(2, 3, np.uint32)}, "more delays than packets of eve; expected at most 4"),
+}  # fmt: skip
+"""What is wrong with a journal → the columns of its link, and what is said of it."""
+
+
+@pytest.mark.parametrize("what", JOURNALS)
+def test_a_journal_that_does_not_add_up_is_refused(what: str) -> None:
+    """Every packet has one fate; a journal in which one has none, or two, is malformed."""
+    changes, said = JOURNALS[what]
+    no_loss = dict.fromkeys(REASONS, np.zeros(1, np.uint32))
+    bursts, delays = np.zeros(COUNTED_BURSTS, np.uint32), np.array([4, 0], np.uint32)
+    link = replace(Account(np.ones((1, 4), bool), no_loss, None, bursts, delays), **changes)
+    raw = Journal(7, 1, {"eve": link}).pack()
+    with pytest.raises(MalformedMessage, match=said) as found:
+        read_journal(Reader("evedrop/r/journal", raw), 7, {"eve": 0}, EXTENT)
+    assert found.value.at_fault == ("router",)
