@@ -272,7 +272,7 @@ PARTS: Mapping[str, Check] = {
             "operator": text,
             "operator_identity": maybe(_IDENTITY),
             "shard": flag,
-            "classes": anything,
+            "classes": named(anything),
         },
         strict=False,
     ),
