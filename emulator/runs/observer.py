@@ -50,6 +50,7 @@ from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
 from emulator.runs.stall import Stall, patience_of
 from emulator.runs.stand_in import StandIn
+from emulator.runs.status import status_of
 from emulator.runs.steering import Steering
 from emulator.runs.summary_file import unwritten
 from emulator.runs.verification import Verifier, extent_of
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
-_ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
+_ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone
 
 
 def observe(brief: Brief, serve: str | None = None) -> int:
@@ -101,7 +102,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
                 tell("finishing")
             observation.settle(how)
     except OSError as error:
-        status, how = RunError.exit_status, unwritten(error)
+        status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)
     except NoAnswer as error:  # of a class that the operator's change of a link has a question for
         status, how = RunError.exit_status, f"an eavesdropper's class could not say what theory expects of it: {error}"
     except Exception as error:  # a mistake of ours must not cost what was measured
@@ -211,7 +212,7 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
-                    self._writer.checkpoint(self._at, self._so_far)
+                    self._save()
                     self._look(conductor)
             except EvedropError as error:
                 self._suspects = conductor.missing
@@ -287,23 +288,10 @@ class Observation:
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
 
     def _status(self, conductor: Conductor) -> dict[str, Any]:
-        """How the run is doing, as docs/protocol.md has it."""
-        steering, now = self._steering, time.monotonic()
+        """How the run is doing."""
         before, done = self._recent
-        links = {}
-        for name, tally in self._keeper.totals.tallies.items():
-            account = tally.link
-            fraction = account["delivered"] / account["offered"] if account["offered"] else None
-            links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
-        return {
-            "slot": self._joiner.done,
-            "slots": self._scenario.slots,
-            "slots_per_second": 0.0 if steering.paused else (self._joiner.done - done) / max(now - before, 1e-3),
-            "state": "paused" if steering.paused else "running" if steering.at is None else "held",
-            "processes": conductor.processes,
-            "links": links,
-            "events": steering.events,
-        }
+        rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)
+        return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.totals)
 
     def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
         message = Reader(conductor.keys[source], payload)
@@ -389,6 +377,14 @@ class Observation:
     def _at(self) -> str:
         """How far the run came."""
         return f"slot {self._joiner.done}"
+
+    def _save(self) -> None:
+        """Have on disk what was measured, from time to time. Raises RunError if it cannot be written."""
+        try:
+            with suppress(NoAnswer):  # which is told at the end; rows are written before figures are asked for
+                self._writer.checkpoint(self._at, self._so_far)
+        except OSError as error:
+            raise RunError(unwritten(error)) from error
 
     def _so_far(self) -> dict[str, Any]:
         """The summary of a run that goes on."""
