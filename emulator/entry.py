@@ -34,9 +34,10 @@ def leave(_number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def heed_signals() -> None:
-    """End at once at a signal, until something else is said."""
+    """End at once at a signal, until something else is said; also at one that came while the interpreter started."""
     for number in heeded():
         signal.signal(number, leave)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)  # whoever launched us may have blocked them
 
 
 def program() -> NoReturn:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
-from queue import SimpleQueue
 
 from emulator.brief import Brief
 from emulator.errors import RunError
@@ -15,14 +14,16 @@ from emulator.model.receiver import Flags
 from emulator.model.schemes import scheme_of
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.network.access import OBSERVER, SENSOR
+from emulator.network.mailbox import Mailbox
 from emulator.network.packets import Beside, hold, once_more, read_acknowledgement, uplink
 from emulator.network.reporting import TruthReporter
 from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
 from emulator.network.telemetry import held
-from emulator.network.wire import Reader, read_progress
+from emulator.network.wire import Reader, read_progress, shown
 from peers.loop import Actuator
 
+_PROGRESS_BYTES = 16 * 2**20  # of one follower: far more than are ever under way
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
 
@@ -37,10 +38,15 @@ class Window:
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
-        self._news: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
         self._keys = {name: session.keys.progress(name) for name in followers}
+        self._news = Mailbox(self._keys, _PROGRESS_BYTES)
         for name, key in self._keys.items():
-            session.funnel(key, lambda payload, name=name: self._news.put((name, payload)))  # type: ignore[misc]
+            session.funnel(key, lambda payload, name=name: self._news.put(name, payload))  # type: ignore[misc]
+
+    @property
+    def followers(self) -> tuple[str, ...]:
+        """Everybody who reports progress."""
+        return tuple(self._done)
 
     def wait(self, k: int) -> None:
         """Return when slot k may be sent."""
@@ -49,7 +55,8 @@ class Window:
                 *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
             ):
                 name, payload = self._news.get()
-            self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
+            if isinstance(payload, bytes):
+                self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
             self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:
@@ -97,7 +104,10 @@ class Holds:
         with self._session.place.waiting(self._session.keys.control(SENSOR)):
             while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
                 pass
-        self._window.go_on(k, command.names("absent"))
+        absent = command.names("absent")
+        if not set(absent) <= set(self._window.followers):
+            raise command.malformed(f"absent = {shown(absent)}", f"some of {', '.join(self._window.followers)}")
+        self._window.go_on(k, absent)
         self._holds = {slot for slot in self._holds if slot > k}
         if command.has("until"):
             self._holds.add(command.integer("until"))

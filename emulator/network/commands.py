@@ -26,9 +26,11 @@ class Commands:
     """
 
     def __init__(
-        self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]]
+        self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]], patience: float
     ) -> None:
+        """patience: seconds that a round which the sensor tells of is waited for."""
         self._session, self._knock, self._waiting = session, knock, tuple(waiting)
+        self._patience = patience
         self._orders: SimpleQueue[tuple[int, Reader] | None] = SimpleQueue()
         self._news = threading.Condition()
         self._asked = Round()
@@ -91,7 +93,9 @@ class Commands:
         Nor if it has ended the run meanwhile.
         """
         with self._news:
-            self._news.wait_for(lambda: self.over() or self._asked.number >= number)
+            # Sensor and router are told at the same time; a round of which we hear nothing for so long there is not.
+            if not self._news.wait_for(lambda: self.over() or self._asked.number >= number, self._patience):
+                return None
             if self._ended or self._asked.number > number:
                 return None
             self._heeded = number

@@ -17,8 +17,6 @@ from zenoh.handlers import FifoChannel
 from emulator.network.envelope import Dropped, head_of
 from emulator.network.whereabouts import Place
 
-_INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
-
 
 class Declared(Protocol):
     """Anything that is declared on every session of a process."""
@@ -35,8 +33,9 @@ class InboxClosedError(Exception):
 class Inbox:
     """A subscription to one exact key, read in order with `recv`."""
 
-    def __init__(self, key: str, dropped: Dropped, place: Place) -> None:
-        """place: of the process, which is there waiting while it reads."""
+    def __init__(self, key: str, dropped: Dropped, place: Place, room: int) -> None:
+        """place: of the process, which is there waiting while it reads; room: for so many messages."""
+        self._room = room
         self._key, self._head, self._dropped, self._place = key, head_of(key), dropped, place
         self._waits = (key,)
         self._subscribers: SimpleQueue[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None] = SimpleQueue()
@@ -44,7 +43,7 @@ class Inbox:
 
     def declare(self, session: zenoh.Session) -> None:
         """Subscribe; what arrived before is read first."""
-        self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(_INBOX_MESSAGES)))
+        self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(self._room)))
 
     def close(self) -> None:
         """There will be no other session."""

@@ -11,7 +11,7 @@ routes them once more, to the same fates, as a router does that was started anew
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
@@ -24,6 +24,7 @@ from emulator.model.acknowledgements import WayBack
 from emulator.model.link import Change, Course, Fates, Link, streams_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
+from emulator.model.registry import NotRegistered
 from emulator.model.transit import Late, Transit
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
 from emulator.network.commands import Anew, Commands
@@ -46,7 +47,7 @@ from emulator.network.postman import Postman
 from emulator.network.resending import Due
 from emulator.network.session import Session, router_config
 from emulator.network.telemetry import Journal
-from emulator.network.wire import Reader, packed_flags
+from emulator.network.wire import Reader, packed_flags, shown
 
 
 class Downlink:
@@ -245,7 +246,7 @@ class Routing:
         # To its own uplink, so that whoever waits there wakes: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
         waiting = [] if self._way_back is None else [self._way_back.sent]
-        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting)
+        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting, brief.flow.longest_outage)
         self._stale = False
         """Whether what comes is of no interest until it is said to come once more."""
         self._begin(0, 0)
@@ -340,9 +341,8 @@ class Routing:
         if anew is None:  # it has asked once more since
             self._stale = True
             return
-        for name, changes in anew.map("links").items():
-            listed = tuple(_change(Reader(anew.key, b"", one)) for one in changes)
-            self._courses[name] = replace(self._courses[name], changes=listed)
+        for name, changes in read_links(anew, self._courses, self._brief.slots).items():
+            self._courses[name] = replace(self._courses[name], changes=changes)
         self._begin(start, done)
 
     def _journal(self, end: int) -> None:
@@ -361,18 +361,41 @@ class Routing:
         self._flush()
         while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
             if command.text("do") == "change":
-                self._amend(command.text("link"), k, tuple(_change(one) for one in command.maps("changes")))
+                self._amend(command, k)
 
-    def _amend(self, name: str, k: int, changes: tuple[Change, ...]) -> None:
-        """Change a link from slot k on."""
-        self._downlinks[name].amend(k, changes)
+    def _amend(self, command: Reader, k: int) -> None:
+        """Change a link from slot k on, as the conductor says."""
+        name = command.choice("link", self._courses)
+        changes = read_changes(command, "changes", self._brief.slots)
+        try:
+            self._downlinks[name].amend(k, changes)
+        except (KeyError, TypeError, ValueError, NotRegistered) as error:
+            raise command.malformed(
+                f"settings that are none ({error!r:.80})", f"settings of the link of {name}"
+            ) from error
         course = self._courses[name]
         self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
 
 
-def _change(found: Reader) -> Change:
-    settings = found.map("settings") if found.has("settings") else None
-    return Change(found.integer("at"), settings, found.flag("cut") if found.has("cut") else None)
+def read_changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
+    """The changes of a link in a run of so many slots, in a field of a command."""
+    return tuple(
+        Change(
+            one.integer("at", 0, slots),
+            one.map("settings") if one.has("settings") else None,
+            one.flag("cut") if one.has("cut") else None,
+        )
+        for one in found.maps(name)
+    )
+
+
+def read_links(command: Reader, names: Collection[str], slots: int) -> dict[str, tuple[Change, ...]]:
+    """Receiver → all changes of its link, of those that an `again` names."""
+    links = command.nested("links")
+    for name in command.map("links"):
+        if name not in names:
+            raise command.malformed(f"the link {shown(name)}", f"one of {', '.join(names)}")
+    return {name: read_changes(links, name, slots) for name in command.map("links")}
 
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:

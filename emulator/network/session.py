@@ -31,6 +31,8 @@ from emulator.network.declared import Funnel, Inbox, Outlet, Question, Questions
 from emulator.network.envelope import Dropped
 from emulator.network.heartbeat import Heartbeat
 from emulator.network.lifeline import Lifeline
+from emulator.network.limits import low_pass
+from emulator.network.mailbox import allowance
 from emulator.network.resending import Kept
 from emulator.network.whereabouts import Place
 from emulator.network.wire import Reader, over, refusal
@@ -40,15 +42,17 @@ _POLL_SECONDS = 0.004
 _LEASE_SECONDS = 4.0  # a connection over which nothing comes for so long is lost
 _HEARD_SECONDS = 2.0  # for readers to be found again once a connection is back
 _NEVER_MS = 86_400_000
+_ANSWER_BYTES = 64 * 2**20  # for the operator
+_WINDOWS = 8  # that an inbox has room for: what was sent again in some rounds waits there too
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
 
 
-def _transport(identity: Identity | None, listens: bool = False) -> dict[str, Any]:
+def _transport(identity: Identity | None, largest: int, listens: bool = False) -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
     link: dict[str, Any] = {
         "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
-        "rx": {"buffer_size": 1 << 20},
+        "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
     if identity is not None:
         from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
@@ -84,6 +88,7 @@ class Credentials(Protocol):
 
 def client_config(entry: Credentials) -> dict[str, Any]:
     """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
+    largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
     return {
         "mode": "client",
@@ -94,7 +99,7 @@ def client_config(entry: Credentials) -> dict[str, Any]:
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(entry.identity), "auth": auth},
+        "transport": {**_transport(entry.identity, largest), "auth": auth},
     }
 
 
@@ -112,14 +117,16 @@ def _once(door: Door) -> zenoh.Config:
 
 
 def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
-    """Configuration of a router: it listens, asks for user and password, and denies what is not granted."""
+    """Configuration of a router: it listens, asks for user and password, and drops what is not granted or too large."""
+    transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
         "mode": "router",
         **({"id": brief.part["zid"]} if brief.role == "router" and brief.part["zid"] is not None else {}),
         "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(brief.identity, listens=True), "auth": {"usrpwd": {"dictionary_file": users_file}}},
+        "transport": {**transport, "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
+        "low_pass_filter": low_pass(brief.run, brief.part["limits"]),
     }
 
 
@@ -166,6 +173,9 @@ class Session:
         """Seconds that are waited for the others."""
         self.place = Place()
         """Where this process is, to be kept up to date as it works."""
+        self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
+        """Bytes that one sender may have waiting to be read."""
+        self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router)
@@ -230,7 +240,7 @@ class Session:
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key, to be read in order with `recv`."""
-        return self._connection.add(Inbox(key, self._dropped, self.place))
+        return self._connection.add(Inbox(key, self._dropped, self.place, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""

@@ -23,6 +23,7 @@ from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROU
 from emulator.runs.environment import lock_step_environment, own_environment
 from emulator.runs.folder import private_opener
 from emulator.runs.held import HeldFolder
+from emulator.runs.signals import held_back
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -138,7 +139,7 @@ class Children:
         try:
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
-            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
                 process = subprocess.Popen(
                     [sys.executable, "-P", "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 from emulator.errors import Interrupted, RunError
 from emulator.network.access import OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.network.declared import Question
+from emulator.network.mailbox import Mailbox
 from emulator.network.session import Session
 from emulator.network.wire import Reader, control, is_over, progress, read_over
 
@@ -52,7 +53,6 @@ class Conductor:
         """reporters: who reports besides router and sensor: the receivers, and a controller."""
         self._session = session
         self._stop = stop
-        self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
         """Whether we are connected to a relay, and not to the router itself."""
@@ -62,10 +62,11 @@ class Conductor:
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
+        self._news = Mailbox(self.keys, session.allowance)
         for source, key in self.keys.items():
-            session.funnel(key, lambda payload, source=source: self._news.put((source, payload)))  # type: ignore[misc]
+            session.funnel(key, lambda payload, source=source: self._news.put(source, payload))  # type: ignore[misc]
         for name in self._present:
-            session.watch(name, lambda there, name=name: self._news.put((name, there)))  # type: ignore[misc]
+            session.watch(name, lambda there, name=name: self._news.put(name, there))  # type: ignore[misc]
         self.misdelivered: dict[str, int] = {}
         """Process → how many messages it dropped because they name another key, of those that have confirmed their end."""
         self.absent: set[str] = set()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from emulator.entry import INTERRUPTED, heeded, leave
+from emulator.entry import INTERRUPTED, SIGNALS, heeded, leave
 
 _Handler = Callable[[int, FrameType | None], object]
 
@@ -31,6 +31,19 @@ def raise_on_signals() -> Iterator[None]:
 
     with _handled(interrupt):
         yield
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Have processes that are started while the block runs get signals when they have handlers, and not before.
+
+    An interpreter that is still starting would end with a traceback; `emulator.entry` lets through what has come meanwhile.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -238,3 +240,33 @@ def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
     found = read_refusal(reader, "sensor")
     assert found.at_fault == ("naive",)
     assert str(found) == "malformed message on evedrop/r1/progress/naive: ?[2Jx? (refused by sensor)"
+
+
+BOMB = """
+from emulator.network.reporting import BeliefReporter
+def add(self, k, *rest, honest=BeliefReporter.add):
+    if k % 500 == 0:
+        for _ in range(5):
+            self._put(k, bytes([0xdd, 0, 0x98, 0x96, 0x80]) + bytes([0x90]) * 10**7)
+            self._put_progress(k, bytes([0x90]) * 10**7)
+    honest(self, k, *rest)
+BeliefReporter.add = add
+"""
+
+
+def test_messages_of_megabytes_harm_nobody(evedrop: Evedrop) -> None:
+    """What is larger than any message of the run the router drops; the run goes on to its end, and nobody grows by it."""
+    live = evedrop.live("eavesdroppers", "--slots", "1200", "--json", env=with_rogue(evedrop, "naive", BOMB))
+    largest = dict.fromkeys(("observer", "sensor", "router"), 0.0)
+    while live.process.poll() is None:
+        for name, pid in live.children().items():
+            with suppress(OSError, IndexError):
+                peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+                if name in largest and peak is not None:
+                    largest[name] = max(largest[name], int(peak[1]) / 1000)
+    done = live.end()
+    assert done.status in {0, 1}, done.err
+    assert done.summary["slots"] == 1200
+    assert 0.0 < largest["observer"] < 500.0
+    assert 0.0 < largest["sensor"] < 200.0
+    assert 0.0 < largest["router"] < 250.0

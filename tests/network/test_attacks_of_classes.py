@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
+from emulator.model.answers import Answers, NoAnswer
 from emulator.model.eavesdroppers import ANSWERS
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.eavesdroppers.stand_in import StandIns
+from emulator.model.process import Process
 from emulator.runs.results import load_results
+from emulator.streams import Batch
 from tests.conftest import Evedrop, Live, wait_until
 
 SEED = 7318529640182736451
@@ -159,8 +168,7 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
     (evedrop.folder / "spy.toml").write_text(SCENARIO)
     wrong = {
         "os._exit(7)": "the process that was to answer for it ended (status",
-        "return 0.5, float('nan')": "use_probabilities() is [0.5, nan]; expected two probabilities",
-        "return 2.0, 1.0": "use_probabilities() is [2.0, 1.0]; expected two probabilities",
+        "return 0.5, float('nan')": "expected a probability",
         "raise OSError('no way')": "OSError: no way, spy.py line",
     }
     for body, said in wrong.items():
@@ -174,3 +182,45 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
         assert said in done.err
         assert not (evedrop.folder / "run").exists()
     ANSWERS.forget()
+
+
+FACTS = {"parameters": {}, "pools_links": False, "takes": True, "own_outcomes": True}
+SHARES = {"predicted": 0.5, "state": 0.5, "misled": 0.0, "decoded": 0.0, "leaked": 0.0, "initial": 0.5}
+LIES: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+    "mistakes": ("none", lambda kind: kind.mistakes({})),
+    "streams": ([7], lambda kind: kind.streams({})),
+    "betrayed": (-1, lambda kind: kind.betrayed({})),
+    "follows_gamma": ("yes", lambda kind: kind.follows_gamma({})),
+    "use_probabilities": ([0.5, 1.5], lambda kind: kind.use_probabilities({})),
+    "outcomes_at": ({**SHARES, "state": 0.7}, lambda kind: kind.outcomes({}, 0.5)(0.5)),
+}
+
+
+def said_by(lies: dict[str, Any]) -> Any:
+    """What stands for a class that gives these answers, whatever it should say."""
+    answers = Answers()
+    truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
+    said = {**truth, "outcomes": True, "outcomes_at": SHARES, **lies}
+    given = {"class": ["STRATEGIES"], "outcomes": ["STRATEGIES", {}, 0.5], "outcomes_at": ["STRATEGIES", {}, 0.5, 0.5]}
+    known = {
+        json.dumps(["spy:Spy", do, *given.get(do, ["STRATEGIES", {}])]): {"is": answer}
+        for do, answer in {"class": FACTS, **said}.items()
+    }
+    answers.learn(known)
+    return StandIns(answers, "STRATEGIES")("spy:Spy")
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_an_answer_that_is_none_is_refused(lie: str) -> None:
+    """Each answer has a form and a range; one of another is an error that quotes it, not a figure."""
+    answer, asked = LIES[lie]
+    asked(said_by({}))
+    with pytest.raises(NoAnswer, match="; expected "):
+        asked(said_by({lie: answer}))
+
+
+def test_a_stand_in_runs_nowhere() -> None:
+    """What stands for a class cannot be put to work in its place."""
+    process = Process(np.eye(1), np.eye(1), np.eye(1))
+    with pytest.raises(TypeError, match="runs in the eavesdropper's process alone"):
+        said_by({})(Knowledge(process, 1.0, {}, {}), Batch(1, 1))

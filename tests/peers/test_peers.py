@@ -13,6 +13,7 @@ import msgpack
 import numpy as np
 import pytest
 
+import emulator.network.mailbox
 import peers.following
 import peers.sensor
 from emulator.brief import Brief, Flow
@@ -409,7 +410,7 @@ class WouldWaitError(Exception):
 class News(SimpleQueue[tuple[str, bytes]]):
     """A queue that says so instead of waiting."""
 
-    def get(self, *_: Any) -> tuple[str, bytes]:
+    def get(self, *_: Any, **__: Any) -> tuple[str, bytes]:
         """The next news that is there."""
         if self.empty():
             raise WouldWaitError
@@ -421,7 +422,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
     slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
-    monkeypatch.setattr(peers.sensor, "SimpleQueue", News)
+    monkeypatch.setattr(emulator.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
     window = Window(session, followers, 10, Kept(print))  # type: ignore[arg-type]

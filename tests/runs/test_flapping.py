@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +14,7 @@ import pytest
 from emulator.runs.ports import free_port
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.proxy import cable
+from tests.resets import reset_connections
 from tests.runs.test_recovery import scenario_in
 
 SLOTS = 1500
@@ -42,20 +45,48 @@ def flaps(seed: int, bursts: int = 2) -> list[float]:
     return waits
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, SEEDS))])
-def test_connections_that_flap_change_nothing(seed: int, tmp_path: Path) -> None:
-    """All connections with the router are cut in bursts and back at once: digests and links are those in memory."""
-    _, scenario = scenario_in(tmp_path, slots=SLOTS, pace=0.002, more=OTHERS)
+def disturbed(seed: int, folder: Path, how: str) -> None:
+    """A run in which all connections with the router are cut in bursts, and back at once, is as if nothing had been."""
+    _, scenario = scenario_in(folder, slots=SLOTS, pace=0.002, more=OTHERS)
     port = free_port()
     with ExitStack() as stack:
         wire = stack.enter_context(cable(port))
-        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
-        run.write(**dict.fromkeys(("sensor", *scenario.receivers, "observer"), wire.endpoint))
+        run = stack.enter_context(by_hand(scenario, folder, f"tcp/127.0.0.1:{port}"))
+        everybody = ("sensor", *scenario.receivers, "observer")
+        run.write(**(dict.fromkeys(everybody, wire.endpoint) if how == "proxy" else {}))
         run.start()
         run.running(more_than=100)
         for wait in flaps(seed):
             time.sleep(wait)  # when it is cut is what is tested
-            wire.flap()
+            if how == "proxy":
+                wire.flap()
+            else:
+                reset_connections(run.processes["router"].pid, port)
+        assert run.done() < SLOTS, "the run must not end before it is disturbed"
         assert set(run.statuses().values()) == {0}
-        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        as_if_undisturbed(run.summary, scenario, folder / "memory")
         assert run.summary["outages"]
+
+
+def may_reset() -> bool:
+    """Whether this process may reset the connections of one that it has started."""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        try:
+            reset_connections(child.pid, 1)
+        except PermissionError:
+            return False
+        finally:
+            child.kill()
+    return True
+
+
+def test_connections_that_flap_change_nothing(tmp_path: Path) -> None:
+    """Cut by a proxy between the router and everybody else: digests and links are those in memory."""
+    disturbed(0, tmp_path, "proxy")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_connections_that_are_reset_change_nothing(seed: int, tmp_path: Path) -> None:
+    """Reset at the router's own end, which makes Zenoh mistake keys most often; by the proxy where that is not permitted."""
+    disturbed(seed, tmp_path, "reset" if may_reset() else "proxy")

@@ -233,3 +233,17 @@ def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Sign
             wait_until(lambda name=name: heeds(run.processes[name].pid), f"{name} with handlers")  # type: ignore[misc]
             run.processes[name].send_signal(number)
             assert run.processes[name].wait(60) == 130
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
+def test_a_signal_waits_until_a_process_of_a_run_heeds_it(evedrop: Evedrop, number: signal.Signals) -> None:
+    """Sent while its interpreter starts, before any line of ours: it ends with 130, without a traceback, and is named."""
+    begin = "import os, sys\nif sys.orig_argv[-1].endswith('/naive.json'):\n    os.kill(os.getpid(), NUMBER)\n"
+    (evedrop.folder / "sitecustomize.py").write_text(begin.replace("NUMBER", str(int(number))))
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    live = evedrop.live("eavesdroppers", *ENDLESS, env=environment)
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith("evedrop: naive was interrupted by a signal")
+    assert "Traceback" not in done.err
+    live.nothing_left()

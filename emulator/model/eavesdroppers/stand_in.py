@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from emulator.model.answers import Answers, NoAnswer
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketTaker
+from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from emulator.model.registry import NotRegistered
 from emulator.model.theory import Outcomes, OutcomesAt
-from emulator.streams import Batch
 
 _ROUNDING = 1e-9
 _SHARES = ("predicted", "state", "misled", "decoded", "leaked")
@@ -58,9 +57,9 @@ class _Elsewhere(Eavesdropper):
     _ask: ClassVar[Callable[..., Any]]
     _own_outcomes: ClassVar[bool]
 
-    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
-        super().__init__(knowledge, batch)
-        raise TypeError(f"{type(self).__name__} runs in the eavesdropper's process alone; take Registry.imported there")
+    def __new__(cls, *_: object) -> Self:
+        """Raises TypeError: this stands for a class that must not run here."""
+        raise TypeError(f"{cls.__name__} runs in the eavesdropper's process alone; take Registry.imported there")
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
