@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import subprocess
 import sys
@@ -10,9 +11,16 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import zenoh
 
+from emulator.brief import read_brief
+from emulator.network.access import Keys
+from emulator.network.envelope import enclosed
+from emulator.network.session import client_config
+from emulator.network.wire import control
 from emulator.runs.ports import free_port
 from tests.by_hand import as_if_undisturbed, by_hand
+from tests.conftest import wait_until
 from tests.proxy import cable
 from tests.resets import reset_connections
 from tests.runs.test_recovery import scenario_in
@@ -90,3 +98,26 @@ def test_connections_that_flap_change_nothing(tmp_path: Path) -> None:
 def test_connections_that_are_reset_change_nothing(seed: int, tmp_path: Path) -> None:
     """Reset at the router's own end, which makes Zenoh mistake keys most often; by the proxy where that is not permitted."""
     disturbed(seed, tmp_path, "reset" if may_reset() else "proxy")
+
+
+def test_a_message_of_another_key_is_dropped_counted_and_sent_again(tmp_path: Path) -> None:
+    """A delivery that arrives on another receiver's key changes no figure: the summary says who dropped how many."""
+    _, scenario = scenario_in(tmp_path, slots=SLOTS, pace=0.002)
+    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        run.running(more_than=100)
+        # The observer may write there: its credentials stand in for a connection that takes one key for the other.
+        observer = read_brief(tmp_path / "briefs" / "observer.json")
+        keys = Keys(observer.run)
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(observer)))) as session:
+            for name in ("smart", "sensor"):
+                publisher = session.declare_publisher(keys.control(name))
+                wait_until(lambda publisher=publisher: publisher.matching_status.matching, f"{name} to read")
+                publisher.put(enclosed(keys.downlink("legitimate"), control("end")))
+            publisher.put(enclosed(Keys("another").control("sensor"), control("end")))
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert run.summary["misdelivered"]["smart"] == 1
+        assert 1 <= run.summary["misdelivered"]["sensor"] <= 2
+        assert "dropped a message that came on" in run.log("smart").read_text()
