@@ -268,7 +268,6 @@ PARTS: Mapping[str, Check] = {
             "scenario": named(anything),
             "results": text,
             "recording": flag,
-            "live": maybe(text),
             "operator": text,
             "classes": named(named(anything)),
             "operator_identity": maybe(_IDENTITY),

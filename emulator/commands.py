@@ -276,12 +276,15 @@ def view(options: argparse.Namespace) -> int:
             recording = replay(options.run)
         if options.picture is None:
             viewer = open_run(options.run, options.view, stand, recording)
-            print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
+            where = f" at {viewer.address}, to whoever has this address" if viewer.address else ""
+            print(f"the run is shown{where}; Ctrl-C ends it", flush=True)
+            if viewer.warning is not None:
+                print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
             _hold(viewer)
             return 0
-        from emulator.view.picture import picture
+        from emulator.view.picture import picture_apart
 
-        for complaint in picture(recording, options.picture, slot=options.slot):
+        for complaint in picture_apart(recording, options.picture, options.slot):
             print(complaint, file=sys.stderr)
     return 0
 

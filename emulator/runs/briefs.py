@@ -141,7 +141,6 @@ class Observation:
 
     results: Path
     recording: bool
-    live: str | None
     shard: bool = False
     """Whether the run is a shard of a larger one: it leaves its score to be merged, and is not steered by itself."""
 
@@ -254,7 +253,6 @@ def briefs_of(
                 "scenario": scenario.model_dump(mode="json"),
                 "results": str(observation.results),
                 "recording": observation.recording,
-                "live": observation.live,
                 "operator": users[OPERATOR],
                 "shard": observation.shard,
                 "operator_identity": asdict(identities[OPERATOR]) if identities else None,
@@ -309,7 +307,7 @@ def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path
             f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
             "itself, with its own --first-trial and --trials"
         )
-    made = briefs_of(scenario, places, Observation(results, True, None), ends_with_stdin=False, patience=patience)
+    made = briefs_of(scenario, places, Observation(results, True), ends_with_stdin=False, patience=patience)
     try:
         new_folder(folder)
         return [brief.write(folder) for brief in made.values()]

@@ -11,7 +11,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from emulator.control import remove_control
@@ -95,18 +95,19 @@ def launch_one(
         make_private(folder / "logs")
         viewer = None
         try:
-            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None, shard))
+            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", shard))
             observer = briefs.pop(OBSERVER)
             with Children(held, private, scenario.controller is not None) as children:
                 for brief in briefs.values():
                     children.start(brief)
-                # The others find their feet while the viewer does; only the observer must know it.
-                viewer = Viewer.start(view, folder / "logs")
+                # The others find their feet while the viewer does.
+                viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
-                    observer = replace(observer, part={**observer.part, "live": viewer.url})
-                    tell({"event": "view", "address": viewer.address})
+                    tell({"event": "view", "address": viewer.address, "warning": viewer.warning})
                 children.start(observer)
                 status = _supervise(children, stop, tell)
+                if viewer is not None:
+                    viewer.complete()
         except BaseException as error:
             if viewer is not None:
                 viewer.stop()

@@ -148,7 +148,6 @@ class Observation:
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
-        self._live: str | None = brief.part["live"]
         self._showing: Showing | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = time.monotonic()
@@ -173,9 +172,8 @@ class Observation:
 
     def show(self, stand: Stand) -> Viewer:
         """A viewer for browsers, which the run will be streamed to."""
-        viewer = Viewer.serve(stand, self.folder / "logs")
+        viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
         tell("view", address=viewer.address)
-        self._live = viewer.url
         return viewer
 
     def writer(self) -> ResultsWriter:
@@ -189,9 +187,8 @@ class Observation:
             conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
-                self._recording = open_recording(
-                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._live
-                )
+                path = self.folder / "recording.rrd"
+                self._recording = open_recording(self._scenario, self._brief.run, path)
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             patience = self._brief.flow.longest_outage
             self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}

@@ -94,8 +94,11 @@ class ProgressLine:
     def tell(self, news: News) -> None:
         """Take one piece of news."""
         kind = news["event"]
-        if kind == "view" and news["address"] and not self._quiet:
-            self.console.print(f"live view: {news['address']}", soft_wrap=True)
+        if kind == "view" and not self._quiet:
+            if news["address"]:
+                self.console.print(f"live view, for whoever has this address: {news['address']}", soft_wrap=True)
+            if news.get("warning"):
+                self.console.print(f"warning: {news['warning']}", soft_wrap=True)
         elif kind == "started":
             self._progress.update(self._task, description="running")
         elif kind == "held":

@@ -144,8 +144,9 @@ def processes_of(pid: int) -> dict[str, int]:
     found = {}
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         arguments = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
-        if arguments[1:3] == [b"-m", b"emulator"] and arguments[4].endswith(b".json"):
-            found[Path(arguments[4].decode()).stem] = int(child)
+        *options, path, _ = arguments if len(arguments) > 1 else (b"", b"")
+        if b"emulator" in options and path.endswith(b".json"):
+            found[Path(path.decode()).stem] = int(child)
     return found
 
 
