@@ -75,7 +75,7 @@ def _routed_latency(slots: int, rate: float) -> tuple[float, float]:
     """A real router process from a real brief, with senders and receivers that only look at the clock."""
     scenario = load("eavesdroppers", {"slots": slots, "pace": 1.0 / rate})
     with tempfile.TemporaryDirectory() as folder:
-        observation = Observation(Path(folder), False, None)
+        observation = Observation(Path(folder), False)
         briefs = briefs_of(scenario, f"tcp/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
         paths = {name: str(brief.write(Path(folder))) for name, brief in briefs.items()}
         router = subprocess.Popen([sys.executable, "-m", "emulator", "router", paths[ROUTER]])
@@ -145,7 +145,7 @@ def _watch(brief: Brief) -> None:
                 import msgpack  # noqa: PLC0415
 
                 slots += msgpack.unpackb(news[1])["c"]
-        conductor.end()
+        conductor.end(30.0)
 
 
 def memory(slots: int) -> None:

@@ -138,7 +138,7 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
 
 def made(scenario: Scenario) -> dict[str, Brief]:
     """The briefs of a scenario."""
-    return briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    return briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
 
 
 def test_who_is_given_which_keys() -> None:

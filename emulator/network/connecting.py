@@ -74,7 +74,7 @@ class Waiting:
         try:
             return connect()
         except (OSError, zenoh.ZError) as error:
-            self.look(_reason(error))
+            self.look(_reason(error) if isinstance(error, OSError) else "Zenoh could not connect")
             raise
 
 

@@ -99,7 +99,7 @@ class Bench:
     """A router process, and sessions with everybody else's credentials in the test's hands."""
 
     def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
-        observation = Observation(folder / "results", False, None)
+        observation = Observation(folder / "results", False)
         listen = f"{protocol}/127.0.0.1:{free_port()}"
         places = loopback_places(listen, None, scenario.relayed)
         made = briefs_of(scenario, places, observation, ends_with_stdin=False)

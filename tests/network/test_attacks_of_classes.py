@@ -30,7 +30,8 @@ from pathlib import Path
 from emulator.model.eavesdroppers.naive import Naive
 
 SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its constants are no find
-OURS = ("emulator.scenario", "emulator.runs", "emulator.network.router", "peers.sensor", "peers.legitimate")
+RUNS = tuple(f"emulator.runs.{{name}}" for name in ("briefs", "children", "launcher", "observer", "results", "scorekeeper"))
+OURS = (*RUNS, "emulator.scenario", "emulator.network.router", "peers.sensor", "peers.legitimate")
 
 
 def held(value):

@@ -43,7 +43,7 @@ class Stage:
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         port = free_port()
         self.cable: Cable = stack.enter_context(cable(port))
-        observation = Observation(folder / "results", False, None)
+        observation = Observation(folder / "results", False)
         self.briefs = briefs_of(scenario_of(), self.cable.endpoint, observation, ends_with_stdin=False)
         with users_file({"operator": "password", **{one.user: one.password for one in self.briefs.values()}}) as users:
             config = {

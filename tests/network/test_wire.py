@@ -71,7 +71,7 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
                 data.draw(arrays(float, (n, trials), elements=FINITE)),
             ),
         )
-        for _ in range(count)
+        for _ in range(min(count, 2 * (k + 1)))
     )
     raw = packets.delivery(k, bytes((trials + 7) // 8), b"", late)
     heard, found = packets.read_delivery(Reader("d", raw), k, (n, trials))

@@ -59,7 +59,7 @@ def scenario_of(**changes: Any) -> Scenario:
 
 def briefs(**changes: Any) -> dict[str, Brief]:
     """Briefs with a small window."""
-    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 
 
