@@ -145,7 +145,7 @@ def _watch(brief: Brief) -> None:
                 import msgpack  # noqa: PLC0415
 
                 slots += msgpack.unpackb(news[1])["c"]
-        conductor.end()
+        conductor.end(30.0)
 
 
 def memory(slots: int) -> None:

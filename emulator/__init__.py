@@ -7,10 +7,11 @@ Names are loaded when they are used: a peer imports this package too, and needs 
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
+# Not from typing, whose import would take longer than all else before a command heeds signals; type checkers know the name.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from emulator.api import compare, design, montecarlo, run
     from emulator.runs.results import load_results
 
@@ -27,5 +28,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
+        import importlib  # noqa: PLC0415 - as above
+
         return getattr(importlib.import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

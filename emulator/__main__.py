@@ -1,5 +1,5 @@
 """`python -m emulator` is the command `evedrop`."""
 
-from emulator.cli import program
+from emulator.entry import program
 
 program()

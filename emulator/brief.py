@@ -36,6 +36,8 @@ class Flow:
     """Telemetry, journal and progress are sent at least this often."""
     longest_outage: float = 30.0
     """Seconds for which a process may be cut off before that ends the run."""
+    largest_message: int = 2**30
+    """Bytes of the largest message of the run: more is not taken in."""
 
 
 @dataclass(frozen=True)

@@ -127,6 +127,8 @@ def _key(path: str, found: Any) -> Iterator[str]:
         yield f"{path} is no key, expected {KEY_BYTES} bytes in hexadecimal"
 
 
+KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
+"""Of the keys of a run, as they come after its name."""
 _MATRIX = listed(listed(number))
 _NUMBERS = listed(number)
 _LIMITS = listed(maybe(number))
@@ -152,7 +154,9 @@ ENTRIES = table(
         "trials": whole(1, _MOST_TRIALS),
         "first_trial": whole(0, _LAST_TRIAL),
         "recorded": whole(1, _MOST_TRIALS),
-        "flow": table({"window": whole(1), "batch": whole(1)}, {"longest_outage": positive}),
+        "flow": table(
+            {"window": whole(1), "batch": whole(1)}, {"longest_outage": positive, "largest_message": whole(1)}
+        ),
         "model": table(
             {"A": _MATRIX, "Q": _MATRIX, "initial_covariance": _MATRIX, "state_probability": number},
             {"header": whole(0, 64), "singular_noise": flag},
@@ -193,12 +197,20 @@ PARTS: Mapping[str, Check] = {
             ),
             "controller": _WIRING,
             "zid": maybe(text),
+            "limits": table(dict.fromkeys(KINDS, whole(1))),
         },
         _OWN,
         strict=False,
     ),
     "relay": table(
-        {"users": named(text), "receivers": listed(text), "listen": text, "zid": text, "controller": _WIRING},
+        {
+            "users": named(text),
+            "receivers": listed(text),
+            "listen": text,
+            "zid": text,
+            "controller": _WIRING,
+            "limits": table(dict.fromkeys(KINDS, whole(1))),
+        },
         strict=False,
     ),
     "sensor": table(
@@ -256,8 +268,8 @@ PARTS: Mapping[str, Check] = {
             "scenario": named(anything),
             "results": text,
             "recording": flag,
-            "live": maybe(text),
             "operator": text,
+            "classes": named(named(anything)),
             "operator_identity": maybe(_IDENTITY),
             "shard": flag,
         },

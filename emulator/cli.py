@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any
 
 from emulator import commands, operate, roles
+from emulator.entry import program
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.files import shown
+from emulator.output import OUTPUT, finish, named_output, say, silence
+
+__all__ = ["is_role", "main", "program"]  # the last for an installation of an earlier version
 
 Command = Callable[[argparse.Namespace], int]
-T = TypeVar("T")
-
-_OUTPUT = "standard output"
 _ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
 
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
 
-def program() -> NoReturn:
-    """Run the command line, and end."""
-    status = main()
-    if sys.argv[1:2] and sys.argv[1] in _ROLES:
-        # Threads of a process may still be in Zenoh, and an interpreter that ends meanwhile aborts (Python 3.11).
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError, AttributeError):
-                stream.flush()
-        os._exit(status)
-    raise SystemExit(status)
+def is_role(arguments: Sequence[str]) -> bool:
+    """Whether these begin with the name of a process of a run."""
+    return bool(arguments) and arguments[0] in _ROLES
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,27 +33,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command: Command = options.command
     try:
         _check_names(options)
-        with _named_output():
+        with named_output():
             status = command(options)
             if sys.stdout is not None:  # a shell may have closed it
                 sys.stdout.flush()
         return status
     except EvedropError as error:
-        _finish()
-        print(f"evedrop: {error}", file=sys.stderr)
+        finish()
+        say(str(error))
         return error.exit_status
     except KeyboardInterrupt:
-        _finish()
+        finish()
         return Interrupted.exit_status
     except OSError as error:
-        if error.filename == _OUTPUT:
-            _silence()
-        if isinstance(error, BrokenPipeError) and error.filename == _OUTPUT:
+        if error.filename == OUTPUT:
+            silence()
+        if isinstance(error, BrokenPipeError) and error.filename == OUTPUT:
             return 0
         if error.filename is None:
-            print(f"evedrop: {error}; free what the system lacks and try again", file=sys.stderr)
+            say(f"{error}; free what the system lacks and try again")
             return RunError.exit_status
-        print(f"evedrop: {error.filename}: {error.strerror}; free some room, or look at its rights", file=sys.stderr)
+        say(f"{error.filename}: {error.strerror}; free some room, or look at its rights")
         return UsageError.exit_status
 
 
@@ -78,55 +70,6 @@ def _check_names(options: argparse.Namespace) -> None:
             raise UsageError(
                 f"{shown(text)}: {what} is not named in UTF-8, as results and messages are; use another name"
             )
-
-
-@contextlib.contextmanager
-def _named_output() -> Iterator[None]:
-    """Have errors of standard output say that they are: no other may be taken for one."""
-    if sys.stdout is None:
-        yield
-    else:
-        with contextlib.redirect_stdout(_Named(sys.stdout, _OUTPUT)):
-            yield
-
-
-class _Named:
-    """A stream whose errors have a file name. Final."""
-
-    def __init__(self, stream: TextIO, name: str) -> None:
-        self._stream = stream
-        self._name = name
-
-    def write(self, text: str) -> int:
-        return self._tried(lambda: self._stream.write(text))
-
-    def flush(self) -> None:
-        self._tried(self._stream.flush)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def _tried(self, act: Callable[[], T]) -> T:
-        try:
-            return act()
-        except OSError as error:
-            error.filename = self._name
-            raise
-
-
-def _finish() -> None:
-    """Write what is left for standard output; nobody need take it, for something else has gone wrong."""
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:
-        _silence()
-
-
-def _silence() -> None:
-    """Have nothing more written to standard output, not even at the interpreter's end."""
-    if sys.stdout is not None:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Commands:
@@ -168,7 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     add("compare", commands.compare, "every scheme against every adversary", _scenario, _entries, _output, _compares)
     add("design", commands.design, "admissible μ_d, secrecy, optimum, per eavesdropper", _scenario, _set, _designs)
     add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
-    add("view", commands.view, "open a finished run", _argument("run", "RUN"), _finished_view, _served)
+    add("view", commands.view, "open a finished run", _argument("run", "RUN"), finished_view, _served)
     add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
     add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
     add("check", commands.check, "validate scenarios, or classes of your own", _scenarios, _set, _classes)
@@ -289,7 +232,7 @@ def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's, of a scenario with two")
 
 
-def _finished_view(parser: argparse.ArgumentParser) -> None:
+def finished_view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(

@@ -259,13 +259,14 @@ def view(options: argparse.Namespace) -> int:
         print_results(options.run)
         return 0
     from emulator.runs.results import load_results
+    from emulator.runs.signals import raise_on_signals
     from emulator.runs.viewer import Stand, open_run
 
     stand = None if options.serve is None else Stand.of(options.serve)
     results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
     if results is not None:
         print(f"evedrop: {results.remark}", file=sys.stderr)
-    with tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+    with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
         recording = options.run / "recording.rrd"
         if results is not None or not recording.is_file():
             from emulator.view.replay import replay
@@ -275,12 +276,15 @@ def view(options: argparse.Namespace) -> int:
             recording = replay(options.run)
         if options.picture is None:
             viewer = open_run(options.run, options.view, stand, recording)
-            print(f"the run is shown{f' at {viewer.address}' if viewer.address else ''}; Ctrl-C ends it", flush=True)
+            where = f" at {viewer.address}, to whoever has this address" if viewer.address else ""
+            print(f"the run is shown{where}; Ctrl-C ends it", flush=True)
+            if viewer.warning is not None:
+                print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
             _hold(viewer)
             return 0
-        from emulator.view.picture import picture
+        from emulator.view.picture import picture_apart
 
-        for complaint in picture(recording, options.picture, slot=options.slot):
+        for complaint in picture_apart(recording, options.picture, options.slot):
             print(complaint, file=sys.stderr)
     return 0
 

@@ -9,6 +9,7 @@ EvedropError                    exit status
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
 │   ├── Gap                     3   a slot is missing, doubled or out of order
+│   ├── Refusal                 3   another process could not read a message
 │   ├── Contradiction           3   what a process says does not fit what it, or another one, has said
 │   └── Silence                 3   a process is on the network and does nothing
 └── Interrupted               130   the user ended the run; results so far are written
@@ -87,6 +88,7 @@ class MalformedMessage(RunError):
             f"malformed message on {key}: {found}; expected {expected}. "
             f"Its {len(payload)} bytes: {shown}. Check that {sender or 'its sender'} speaks docs/protocol.md"
         )
+        self.key = key
         self.at_fault = (sender,) if sender else ()
 
 
@@ -98,7 +100,18 @@ class Gap(RunError):
             f"gap on {key}: slot {found} arrived where slot {expected} was due. No link loses whole messages, "
             f"so a process or the transport did; look at the logs of {sender or 'the sender'} and of the router"
         )
+        self.key = key
         self.at_fault = (sender,) if sender else ()
+
+
+class Refusal(RunError):
+    """Another process could not read a message, and has said so before it ended."""
+
+    def __init__(self, process: str, key: str, sender: str, why: str) -> None:
+        """process: who refused it; key, sender: of the message; why: what the process said."""
+        self.at_fault = (sender,)
+        about = "" if key in why else f"malformed message on {key}: "
+        super().__init__(f"{about}{why} (refused by {process})")
 
 
 class Contradiction(RunError):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import signal
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -42,7 +41,10 @@ def process(options: argparse.Namespace) -> int:
     from emulator.modules import look_in
 
     os.umask(0o077)  # whatever it writes is of the run, and nobody else's business
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from emulator.runs.signals import leave_on_signals
+
+    if options.role != "observer":  # which ends in order
+        leave_on_signals()
     brief = read_brief(options.brief, options.role)
     if getattr(options, "out", None) is not None:
         brief = replace(brief, part={**brief.part, "results": str(options.out)})

@@ -35,7 +35,8 @@ def steer(brief: Brief) -> None:
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):
-            message = due.take(lambda: Reader(key, inbox.recv().payload.to_bytes()), k)
+            session.place.slot = k
+            message = due.take(lambda: Reader(key, inbox.recv()), k)
             x = read_known(message, name, k, (process.n, brief.trials))
             began = time.perf_counter()
             u = controller.decide(k, x, disturbances[k])

@@ -13,4 +13,4 @@ def eavesdrop(brief: Brief) -> None:
     knowledge = Knowledge(
         brief.model.process, brief.model.state_probability, brief.part["parameters"], brief.stream_keys
     )
-    follow(brief, STRATEGIES[brief.part["strategy"]](knowledge, brief.batch))
+    follow(brief, STRATEGIES.imported(brief.part["strategy"])(knowledge, brief.batch))

@@ -13,10 +13,11 @@ from emulator.brief import Brief
 from emulator.model.follower import Follower
 from emulator.model.receiver import Belief, Receiver
 from emulator.model.transit import Arrival
+from emulator.network.declared import Inbox
 from emulator.network.packets import acknowledgement, is_hold, read_acknowledgement, read_delivery
 from emulator.network.reporting import BeliefReporter
 from emulator.network.resending import Due
-from emulator.network.session import Inbox, Session
+from emulator.network.session import Session
 from emulator.network.telemetry import leaving
 from emulator.network.wire import Reader
 from peers.loop import Consultation
@@ -50,7 +51,8 @@ def follow(
         session.ready()
         k = brief.first
         while k < brief.slots:
-            message = Reader(downlink, deliveries.recv().payload.to_bytes())
+            session.place.slot = k
+            message = Reader(downlink, deliveries.recv())
             found = message.integer("k")
             if is_hold(message):
                 if found != k:
@@ -116,7 +118,7 @@ class Answers:
 
     def _go_on(self, deliveries: Inbox, key: str) -> None:
         for delivery in deliveries:
-            message = Reader(key, delivery.payload.to_bytes())
+            message = Reader(key, delivery)
             if not is_hold(message):
                 self.had(message.integer("k"), message)
 

@@ -43,7 +43,7 @@ class Decided:
     def of(self, k: int) -> tuple[Floats, Flags]:
         """The inputs (m, R) of slot k, and where their decision failed, (R,); slots come in order."""
         if k % self._period == 0:
-            message = self._due.take(lambda: Reader(self._key, self._inbox.recv().payload.to_bytes()), k)
+            message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
             self._now = read_decided(message, k, self._shape)
         return self._now
 

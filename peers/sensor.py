@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
-from queue import SimpleQueue
 
 from emulator.brief import Brief
 from emulator.errors import RunError
@@ -15,14 +14,16 @@ from emulator.model.receiver import Flags
 from emulator.model.schemes import scheme_of
 from emulator.model.schemes.scheme import Encoder, Packet, Scheme
 from emulator.network.access import OBSERVER, SENSOR
+from emulator.network.mailbox import Mailbox
 from emulator.network.packets import Beside, hold, once_more, read_acknowledgement, uplink
 from emulator.network.reporting import TruthReporter
 from emulator.network.resending import Due, Kept
 from emulator.network.session import Session
 from emulator.network.telemetry import held
-from emulator.network.wire import Reader, read_progress
+from emulator.network.wire import Reader, read_progress, shown
 from peers.loop import Actuator
 
+_PROGRESS_BYTES = 16 * 2**20  # of one follower: far more than are ever under way
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
 
@@ -33,20 +34,29 @@ class Window:
     """
 
     def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: Kept) -> None:
-        self._window, self._sent = window, sent
+        self._window, self._sent, self._place = window, sent, session.place
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
-        self._news: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
         self._keys = {name: session.keys.progress(name) for name in followers}
+        self._news = Mailbox(self._keys, _PROGRESS_BYTES)
         for name, key in self._keys.items():
-            session.funnel(key, lambda payload, name=name: self._news.put((name, payload)))  # type: ignore[misc]
+            session.funnel(key, lambda payload, name=name: self._news.put(name, payload))  # type: ignore[misc]
+
+    @property
+    def followers(self) -> tuple[str, ...]:
+        """Everybody who reports progress."""
+        return tuple(self._done)
 
     def wait(self, k: int) -> None:
         """Return when slot k may be sent."""
         while k >= self._limit:
-            name, payload = self._news.get()
-            self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
+            with self._place.waiting(
+                *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
+            ):
+                name, payload = self._news.get()
+            if isinstance(payload, bytes):
+                self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
             self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:
@@ -55,8 +65,13 @@ class Window:
         self._absent = absent
         self._measure()
 
+    @property
+    def _followed(self) -> list[str]:
+        """Everybody who is waited for."""
+        return [name for name in self._done if name not in self._absent]
+
     def _measure(self) -> None:
-        done = min(done for name, done in self._done.items() if name not in self._absent)
+        done = min(self._done[name] for name in self._followed)
         self._limit = done + self._window
         self._sent.forget(done)
 
@@ -86,9 +101,13 @@ class Holds:
         self.reporter.flush(k)
         self._telemetry(k, held(k))
         # It may be told more than once, and of a hold before this one.
-        while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
-            pass
-        self._window.go_on(k, command.names("absent"))
+        with self._session.place.waiting(self._session.keys.control(SENSOR)):
+            while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
+                pass
+        absent = command.names("absent")
+        if not set(absent) <= set(self._window.followers):
+            raise command.malformed(f"absent = {shown(absent)}", f"some of {', '.join(self._window.followers)}")
+        self._window.go_on(k, absent)
         self._holds = {slot for slot in self._holds if slot > k}
         if command.has("until"):
             self._holds.add(command.integer("until"))
@@ -107,7 +126,7 @@ class Acknowledgements:
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
-        message = self._due.take(lambda: Reader(self._key, self._inbox.recv().payload.to_bytes()), k)
+        message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
         acknowledged = read_acknowledgement(message, k, self._trials)
         self._encoder.acknowledged(k, acknowledged)
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
@@ -133,6 +152,7 @@ def sense(brief: Brief) -> None:
         session.wait_for("start")
         start = time.monotonic()
         for k in range(brief.slots):
+            session.place.slot = k
             window.wait(k)
             # In real time a hold may be asked for at any moment before the slot is due; of one slot there is one at most.
             while not (wanted := holds.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from emulator import montecarlo
 from emulator.brief import read_brief
+from emulator.network.endpoint import Endpoint
 from emulator.runs.briefs import write_briefs
 from emulator.runs.ports import places_at
 from emulator.runs.results import load_results
@@ -39,9 +41,11 @@ class ByHand:
     """Where the second router listens, if there is one."""
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     _done: list[int] = field(default_factory=list)
+    _elsewhere: bool = False
 
     def write(self, **endpoints: str) -> None:
         """Write the briefs; endpoints: process → where it finds the router, if that is elsewhere."""
+        self._elsewhere = bool(endpoints)
         places = places_at(self.endpoint, insecure=self.insecure, relay=self.relay)
         for path in write_briefs(self.scenario, places, self.folder / "run", self.folder / "briefs", int(LONG)):
             if path.stem in endpoints:
@@ -55,7 +59,11 @@ class ByHand:
         return ("router", *relay, "sensor", *self.scenario.digested, "observer")
 
     def start(self, *names: str) -> None:
-        """Start these processes, or all."""
+        """Start these processes, or all; the router first if others find it through a proxy, which lets them in without it."""
+        if not names and self._elsewhere:
+            self.start("router")
+            wait_until(self._listens, "a router that listens", LONG)
+            names = self.names[1:]
         for name in names or self.names:
             path = self.folder / "briefs" / f"{name}.json"
             command = [sys.executable, "-m", "emulator", read_brief(path).role, str(path)]
@@ -80,6 +88,12 @@ class ByHand:
                 if news["event"] == "ended":
                     break
             lines.read()  # the table, for people
+
+    def _listens(self) -> bool:
+        place = Endpoint.of(self.endpoint).nearby
+        with suppress(OSError), socket.create_connection((place.host, place.port)):
+            return True
+        return False
 
     def log(self, name: str) -> Path:
         """What a process wrote."""

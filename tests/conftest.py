@@ -114,10 +114,16 @@ class Live:
 
     def done(self) -> int:
         """How much it says it has done, in the unit of its progress line: slots of a run, trial-slots of a study."""
+        return max((int(line.split()[0]) for line in self._told()), default=0)
+
+    def told(self, event: str) -> int:
+        """How often it has told of an event."""
+        return sum(line.split()[1] == event for line in self._told())
+
+    def _told(self) -> list[str]:
         if self._news is None or not self._news.exists():
-            return 0
-        whole = self._news.read_text().rpartition("\n")[0]  # the last line may be half written
-        return max(map(int, whole.split()), default=0)
+            return []
+        return self._news.read_text().rpartition("\n")[0].splitlines()  # the last line may be half written
 
     def running(self, more_than: int = 0) -> None:
         """Wait until it says that more than so much is done: what it measured is more than nothing."""
@@ -152,6 +158,8 @@ class Live:
 
 
 TELLING = """
+from emulator.entry import heed_signals
+heed_signals()
 import resource, sys
 from pathlib import Path
 from emulator.cli import main
@@ -163,7 +171,7 @@ if largest:
 
 def tell(line, told):
     with news.open("a") as file:
-        file.write(f"{told.get('done', 0)}\\n")
+        file.write(f"{told.get('done', 0)} {told['event']}\\n")
     show(line, told)
 
 ProgressLine.tell = tell

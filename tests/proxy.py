@@ -1,13 +1,15 @@
-"""A cable that can be pulled: a TCP proxy that closes its connections, or goes silent without closing them."""
+"""A cable that can be pulled: a TCP proxy that closes its connections, or goes silent without closing them, or flaps."""
 
 from __future__ import annotations
 
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 _PIECE = 1 << 16
+_RESET = struct.pack("ii", 1, 0)
 
 
 class Cable:
@@ -45,6 +47,15 @@ class Cable:
         self._accepts = False
         self._close()
 
+    def flap(self) -> None:
+        """Reset all connections, those that are just being opened too, and take new ones at once."""
+        for end in self._ends:
+            # Both ends are told by a reset, and what is on the way is lost, as when a system drops its connections.
+            with suppress(OSError):
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        for end in self._close():
+            end.close()
+
     def silence(self) -> None:
         """Pass nothing on any more; nobody is told."""
         self._flows.clear()
@@ -62,11 +73,12 @@ class Cable:
         self._listener.close()
         self._close()
 
-    def _close(self) -> None:
+    def _close(self) -> list[socket.socket]:
         ends, self._ends = self._ends, []
         for end in ends:
             with suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
+        return ends
 
     def _accept(self) -> None:
         with suppress(OSError):

@@ -138,7 +138,7 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
 
 def made(scenario: Scenario) -> dict[str, Brief]:
     """The briefs of a scenario."""
-    return briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    return briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
 
 
 def test_who_is_given_which_keys() -> None:
@@ -221,7 +221,17 @@ def test_model_is_the_only_thing_all_share() -> None:
     }
 
 
-OPTIONAL = {"first", "patience", "identity", "modules", "header", "singular_noise", "longest_outage", "measurement"}
+OPTIONAL = {
+    "first",
+    "patience",
+    "identity",
+    "modules",
+    "header",
+    "singular_noise",
+    "longest_outage",
+    "largest_message",
+    "measurement",
+}
 """Entries that a brief may leave out, or whose meaning another one gives."""
 WITHIN = ("part.scenario", "part.assignment.parameters", "part.parameters", "part.scheme", "model.A", "model.Q")
 """Tables whose entries are those of the scenario, looked at by whoever makes something of them, and matrices."""

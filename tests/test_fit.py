@@ -317,5 +317,5 @@ def test_json_has_no_infinities(tmp_path: Path) -> None:
 
 def test_a_directory_is_no_recording(tmp_path: Path) -> None:
     """Said as what it is."""
-    with pytest.raises(TraceError, match="is no file; expected a CSV or Parquet file"):
+    with pytest.raises(TraceError, match="it is a folder"):
         fit(tmp_path)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from emulator.errors import ScenarioError
+from emulator.model.eavesdroppers import ANSWERS
 from emulator.runs.results import load_results
 from emulator.scenario import load
 from emulator.scenario.amended import with_event
@@ -46,8 +47,10 @@ link = { quality = 0.8 }
 def _imports_forgotten(tmp_path: Path) -> Iterator[None]:
     """What a test imports from its folder is no other test's."""
     before = list(sys.path)
+    ANSWERS.forget()
     yield
     sys.path[:] = before
+    ANSWERS.forget()
     for name, module in list(sys.modules.items()):
         if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
             del sys.modules[name]
@@ -256,20 +259,11 @@ def test_a_mistake_in_a_class_is_named_before_anything_starts(case: str, evedrop
     if kind == "link":
         given = {"legitimate.link": f'{{loss = {{model = "case_{case}:Mine"}}}}'}
     changes = [word for key, value in given.items() for word in ("--set", f"{key}={value}")]
-    with pytest.warns(RuntimeWarning) if case == "infinite" else _nothing():
-        done = evedrop("run", "mine.toml", "--view", "off", "--out", "run", *changes)
+    done = evedrop("run", "mine.toml", "--view", "off", "--out", "run", *changes)
     assert done.status == 2, done.err
     line = next(line for line in done.err.splitlines() if said in line)
     assert line.startswith(("  encoding.", f"  {ENTRY[kind]}: is"))
     assert not (evedrop.folder / "run").exists()
-
-
-class _nothing:  # noqa: N801 - a block that expects nothing
-    def __enter__(self) -> None:
-        """Nothing."""
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing."""
 
 
 @pytest.mark.parametrize("name", ["mine", "nowhere.at.all:Mine", "mine:", ":Mine", "__main__:Mine", "os:path"])
@@ -295,6 +289,17 @@ def test_one_name_is_one_module(evedrop: Evedrop) -> None:
     assert done.status == 2
     assert "another one of this name is loaded already" in done.err
     assert evedrop.process("check", "there/s.toml").status == 0
+
+
+@pytest.mark.parametrize("name", ["json", "wave", "zenoh"])
+@pytest.mark.parametrize("entry", ["encoding.scheme", "eavesdroppers.eve.strategy"])
+def test_a_module_called_like_an_installed_one_is_refused(name: str, entry: str, evedrop: Evedrop) -> None:
+    """Nothing in a folder of modules stands in place of Python's or a library's."""
+    (evedrop.folder / f"{name}.py").write_text(f"{HEAD}\n\nclass Mine(Plain):\n    pass\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO)
+    done = evedrop("check", "mine.toml", "--set", f"{entry}={name}:Mine")
+    assert done.status == 2
+    assert re.search(f"has a module {name} .*another one of this name is (loaded already|installed)", done.err)
 
 
 def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -> None:

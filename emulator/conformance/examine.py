@@ -75,10 +75,10 @@ def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterato
 def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
     registry = _REGISTRIES[option]
     try:
-        kind = registry[name]
+        kind = registry.imported(name)
         given = _given(kind, parameters)
         if "reads_as" in given:
-            given = {**_given(READERS[str(given["reads_as"])], parameters), **given}
+            given = {**_given(READERS.imported(str(given["reads_as"])), parameters), **given}
     except NotRegistered as error:
         why = error.why or f" is none; expected MODULE:CLASS, or {', '.join(registry.names)}"
         raise UsageError(f"--{option} {error.name}{why}") from error

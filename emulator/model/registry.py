@@ -10,10 +10,12 @@ import importlib
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
+
+from emulator.model.answers import NoAnswer
 
 T = TypeVar("T")
 
@@ -40,6 +42,8 @@ def is_own(name: object) -> bool:
 
 def place_of(error: BaseException, file: str | None = None) -> str:
     """An error in somebody's module in some words: what, and the last line of that file, or of any, that led to it."""
+    if isinstance(error, NoAnswer):
+        return str(error)
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if frame.filename == file] or [
         frame for frame in frames if "importlib" not in frame.filename and frame.filename != __file__
@@ -69,15 +73,23 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     """Name → class, of one kind. Final. To be gone through are the built-in ones alone; any other can be asked for.
 
     kind: as a message calls it; base: what every class inherits from; group: of the entry points of installed packages;
-    reserved: entries that a scenario's table has beside the class's parameters.
+    reserved: entries that a scenario's table has beside the class's parameters; stand_in: makes what stands for a class
+    that is not built in, which then runs only where it is asked for by `imported`.
 
     `[name]` raises NotRegistered, which is a KeyError.
     """
 
     def __init__(
-        self, kind: str, base: type[T], group: str, built_in: Mapping[str, type[T]], reserved: tuple[str, ...] = ()
+        self,
+        kind: str,
+        base: type[T],
+        group: str,
+        built_in: Mapping[str, type[T]],
+        reserved: tuple[str, ...] = (),
+        stand_in: Callable[[str], type[T]] | None = None,
     ) -> None:
         self.kind, self.base, self.group = kind, base, group
+        self._stand_in = stand_in
         self._built_in = built_in
         self._reserved = reserved
 
@@ -88,9 +100,17 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return len(self._built_in)
 
     def __getitem__(self, name: str) -> type[T]:
+        if name in self._built_in or self._stand_in is None:
+            return self.imported(name)
+        self._target(name)
+        return self._with_free_parameters(name, self._stand_in(name), "")
+
+    def imported(self, name: str) -> type[T]:
+        """The class itself, whose module is imported into this process. Raises NotRegistered."""
         if name in self._built_in:
             return self._built_in[name]
-        return self._checked(name, *self._found(name))
+        target, said = self._target(name)
+        return self._checked(name, *_imported(name, target, said))
 
     def foreign(self, name: str) -> bool:
         """Whether a class of this name is not built in, be there one or not."""
@@ -101,10 +121,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         """All that can be given short: built in, and of installed packages."""
         return sorted({*self._built_in, *_entry_points(self.group, tuple(sys.path))})
 
-    def _found(self, name: str) -> tuple[Any, str]:
-        """What a name stands for, and how messages begin."""
+    def _target(self, name: str) -> tuple[str, str]:
+        """The PACKAGE.MODULE:CLASS that a name stands for, and how messages begin."""
         if is_own(name):
-            return _imported(name, name, "")
+            return _importable(name, name, ""), ""
         targets = _entry_points(self.group, tuple(sys.path)).get(name, ())
         if not targets:
             raise NotRegistered(name)
@@ -112,7 +132,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             both = " and ".join(targets)
             raise NotRegistered(name, f", which two installed packages call so; expected one of {both} itself")
         said = f", which an installed package says is {targets[0]}"
-        return _imported(name, targets[0], said)
+        return _importable(name, targets[0], said), said
 
     def _checked(self, name: str, found: Any, said: str) -> type[T]:
         wanted = f"a class that inherits from {self.base.__module__}.{self.base.__name__}"
@@ -132,7 +152,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
                 f"{said}, whose parameters are no table; expected the entries it takes, each with an example, "
                 'such as parameters = {"threshold": 3}',
             )
-        taken = sorted(set(parameters) & set(self._reserved))
+        return self._with_free_parameters(name, found, said)
+
+    def _with_free_parameters(self, name: str, found: type[T], said: str) -> type[T]:
+        taken = sorted(set(getattr(found, "parameters", ())) & set(self._reserved))
         if taken:
             raise NotRegistered(
                 name, f"{said}, one of whose parameters is called {taken[0]}, as an entry of every {self.kind} is"
@@ -140,14 +163,19 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return found
 
 
-def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
+def _importable(name: str, target: str, said: str) -> str:
+    """A PACKAGE.MODULE:CLASS, if it is one that every process can import."""
     if not _OWN.fullmatch(target):
         raise NotRegistered(name, f"{said}; expected PACKAGE.MODULE:CLASS, such as mine:Masked")
-    module_name, _, class_name = target.partition(":")
-    if module_name == _NOT_IN_CHILDREN:
+    if target.partition(":")[0] == _NOT_IN_CHILDREN:
         raise NotRegistered(
             name, f"{said}, which other processes cannot import; expected a class in a module, a file of its own"
         )
+    return target
+
+
+def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
+    module_name, _, class_name = target.partition(":")
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:

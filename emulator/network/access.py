@@ -90,7 +90,7 @@ class Keys:
 
 def reader_of(key: str) -> str:
     """The process that reads a key; of inputs, which the legitimate estimator may read too, the one that always does."""
-    kind, _, name = key.split("/", 2)[2].partition("/")
+    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
     if kind == "ack":
         return ROUTER if name == "sent" else SENSOR
     readers = {

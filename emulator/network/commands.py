@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 
 from emulator.errors import EvedropError
+from emulator.network.access import ROUTER
 from emulator.network.session import Session
 from emulator.network.wire import Reader
 
@@ -25,9 +26,11 @@ class Commands:
     """
 
     def __init__(
-        self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]]
+        self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]], patience: float
     ) -> None:
+        """patience: seconds that a round which the sensor tells of is waited for."""
         self._session, self._knock, self._waiting = session, knock, tuple(waiting)
+        self._patience = patience
         self._orders: SimpleQueue[tuple[int, Reader] | None] = SimpleQueue()
         self._news = threading.Condition()
         self._asked = Round()
@@ -78,7 +81,8 @@ class Commands:
     def next(self) -> Reader:
         """The next command of the round at hand, not one of before. Raises Anew as `check` does."""
         while True:
-            order = self._orders.get()
+            with self._session.place.waiting(self._session.keys.control(ROUTER)):
+                order = self._orders.get()
             self.check()
             if order is not None and order[0] == self._heeded:
                 return order[1]
@@ -89,7 +93,9 @@ class Commands:
         Nor if it has ended the run meanwhile.
         """
         with self._news:
-            self._news.wait_for(lambda: self.over() or self._asked.number >= number)
+            # Sensor and router are told at the same time; a round of which we hear nothing for so long there is not.
+            if not self._news.wait_for(lambda: self.over() or self._asked.number >= number, self._patience):
+                return None
             if self._ended or self._asked.number > number:
                 return None
             self._heeded = number

@@ -8,10 +8,11 @@ from __future__ import annotations
 import json
 import socket
 import ssl
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import zenoh
 
@@ -19,6 +20,8 @@ from emulator.brief import Identity
 from emulator.errors import BriefError, RunError
 from emulator.network.endpoint import Endpoint
 
+WAITING_SECONDS = 3.0
+"""After which a process says that it still waits for its router, and again after each so many."""
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ATTEMPT_SECONDS = 3.0
 _UNKNOWN_HOST_SECONDS = 2.5  # a host that is just coming up may not be named yet
@@ -38,6 +41,45 @@ class Door:
     config: dict[str, Any]
     """Zenoh's; one attempt."""
     identity: Identity | None = None
+    process: str = "operator"
+    """Who asks to be let in."""
+
+
+@final
+class Waiting:
+    """Says every few seconds on standard error that a process waits for its router."""
+
+    def __init__(self, process: str, router: str) -> None:
+        self._process, self._router = process, router
+        self.begin()
+
+    def begin(self, again: bool = False) -> None:
+        """The waiting begins now. again: because a connection was lost."""
+        self._began = self._said = time.monotonic()
+        self._what = "lost the connection; waiting again" if again else "waiting"
+
+    def look(self, why: object) -> None:
+        """Say that it goes on, if it is time to; why: what came of the last attempt."""
+        now = time.monotonic()
+        if now - self._said >= WAITING_SECONDS:
+            self._said = now
+            sys.stderr.write(
+                f"evedrop: {self._process}: {self._what} for the router at {self._router}: no answer yet "
+                f"({now - self._began:.0f} s; {why})\n"
+            )
+            sys.stderr.flush()
+
+    def attempt(self, connect: Callable[[], zenoh.Session]) -> zenoh.Session:
+        """What `connect` returns; where that raises, the waiting goes on."""
+        try:
+            return connect()
+        except (OSError, zenoh.ZError) as error:
+            self.look(_reason(error) if isinstance(error, OSError) else "Zenoh could not connect")
+            raise
+
+
+def _reason(error: OSError | zenoh.ZError) -> object:
+    return (error.strerror or error) if isinstance(error, OSError) else "it did not answer as one"
 
 
 def connected(door: Door, patience: float, meanwhile: Callable[[], None] = lambda: None) -> zenoh.Session:
@@ -47,7 +89,7 @@ def connected(door: Door, patience: float, meanwhile: Callable[[], None] = lambd
     """
     endpoint = endpoint_of(door.router, door.identity)
     began = time.monotonic()
-    failures = Failures()
+    failures, waiting = Failures(), Waiting(door.process, door.router)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
@@ -57,7 +99,7 @@ def connected(door: Door, patience: float, meanwhile: Callable[[], None] = lambd
             return zenoh.open(zenoh.Config.from_json5(json.dumps(door.config)))
         except (OSError, zenoh.ZError) as error:
             failures.add(error, time.monotonic() - tried)
-            why = (error.strerror or error) if isinstance(error, OSError) else "it did not answer as one"
+            why = _reason(error)
             if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS:
                 raise BriefError(
                     f"the router's host {endpoint.host} is not known here ({why}); write it into /etc/hosts, or write the "
@@ -73,6 +115,7 @@ def connected(door: Door, patience: float, meanwhile: Callable[[], None] = lambd
                     f"no router answered at {door.router} within {patience:.0f} s ({why}); start it there, and see that no "
                     "firewall is between"
                 ) from error
+            waiting.look(why)
         time.sleep(pause)
         pause = min(longest, pause * 1.5)
 

@@ -14,6 +14,7 @@ import zenoh
 
 from emulator.control import Control
 from emulator.network.access import OBSERVER, Keys
+from emulator.network.envelope import enclosed, payload_of
 from emulator.network.session import client_config
 from emulator.network.wire import Reader, pack
 
@@ -91,7 +92,8 @@ def ask(control: Control, request: Request, patience: float) -> Answer | None:
     key = Keys(control.run).control(OBSERVER)
     # A run that goes on has a router: one attempt will do.
     with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
-        for reply in session.get(key, payload=request.pack(), timeout=patience):
-            if reply.ok is not None:
-                return read_answer(key, reply.ok.payload.to_bytes())
+        for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
+            answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())
+            if answer is not None:
+                return read_answer(key, answer)
     return None

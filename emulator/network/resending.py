@@ -35,6 +35,7 @@ class Kept:
     ) -> None:
         self._put, self._span, self._head, self._back = put, span, head, back
         self._messages: deque[tuple[int, bytes]] = deque()
+        self._forgotten = 0
         self._lock = threading.Lock()
 
     def __call__(self, k: int, payload: bytes) -> None:
@@ -48,12 +49,14 @@ class Kept:
     def forget(self, k: int) -> None:
         """Slots below k are done, and so many before them as are sent with them."""
         with self._lock:
+            self._forgotten = max(self._forgotten, k)
             while self._messages and self._messages[0][0] < k - self._back:
                 self._messages.popleft()
 
     def again(self, number: int, k: int) -> None:
         """Send once more what belongs to slots that are not done, those from k on; the last message in any case."""
         with self._lock:
+            k = max(k, self._forgotten)  # a round that is asked for late must not announce slots that are gone
             first = max(0, k - self._back)
             if self._head is not None:
                 self._put(self._head(number, k, first))

@@ -11,7 +11,7 @@ routes them once more, to the same fates, as a router does that was started anew
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
@@ -24,6 +24,7 @@ from emulator.model.acknowledgements import WayBack
 from emulator.model.link import Change, Course, Fates, Link, streams_of
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
+from emulator.model.registry import NotRegistered
 from emulator.model.transit import Late, Transit
 from emulator.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
 from emulator.network.commands import Anew, Commands
@@ -39,13 +40,14 @@ from emulator.network.packets import (
     packed_header,
     read_acknowledgement,
     read_beside,
+    read_once_more,
     read_uplink,
 )
 from emulator.network.postman import Postman
 from emulator.network.resending import Due
 from emulator.network.session import Session, router_config
 from emulator.network.telemetry import Journal
-from emulator.network.wire import Reader, packed_flags
+from emulator.network.wire import Reader, packed_flags, shown
 
 
 class Downlink:
@@ -174,7 +176,7 @@ class WayBackLink:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
         self._way = WayBack(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
         self._jammer: str | None = spec["jammer"]
-        self._trials = brief.trials
+        self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged
         self._due = Due(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
@@ -195,7 +197,8 @@ class WayBackLink:
 
     def _acknowledged(self, k: int, commands: Commands) -> Flags:
         while True:
-            payload = self.sent.get()
+            with self._place.waiting(self._key):
+                payload = self.sent.get()
             if payload is None:
                 commands.check()
                 continue
@@ -212,6 +215,7 @@ def route(brief: Brief) -> None:
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
         present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
+        session.conclude()
         until_all_left(present, session.linked)
 
 
@@ -242,7 +246,7 @@ class Routing:
         # To its own uplink, so that whoever waits there wakes: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
         waiting = [] if self._way_back is None else [self._way_back.sent]
-        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting)
+        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting, brief.flow.longest_outage)
         self._stale = False
         """Whether what comes is of no interest until it is said to come once more."""
         self._begin(0, 0)
@@ -261,7 +265,7 @@ class Routing:
         self._session.appear()
         while not self._commands.over():
             try:
-                self._take(Reader(self._session.keys.uplink, self._uplink.recv().payload.to_bytes()))
+                self._take(Reader(self._session.keys.uplink, self._uplink.recv()))
             except Anew:
                 self._stale = True
 
@@ -324,7 +328,7 @@ class Routing:
             downlink.deliver(k, z, whole, beside, known)
         if self._way_back is not None and not known:
             self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
-        self._k = k + 1
+        self._k = self._session.place.slot = k + 1
 
     def _flush(self) -> None:
         for burst in self._bursts:
@@ -332,14 +336,14 @@ class Routing:
 
     def _once_more(self, message: Reader) -> None:
         """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
-        anew = self._commands.anew(message.integer("n"))
+        number, done, start = read_once_more(message, self._brief.slots)
+        anew = self._commands.anew(number)
         if anew is None:  # it has asked once more since
             self._stale = True
             return
-        for name, changes in anew.map("links").items():
-            listed = tuple(_change(Reader(anew.key, b"", one)) for one in changes)
-            self._courses[name] = replace(self._courses[name], changes=listed)
-        self._begin(message.integer("k"), message.integer("again"))
+        for name, changes in read_links(anew, self._courses, self._brief.slots).items():
+            self._courses[name] = replace(self._courses[name], changes=changes)
+        self._begin(start, done)
 
     def _journal(self, end: int) -> None:
         """Journal all slots below `end`; of those that are journaled already, only remember what goes on after them."""
@@ -357,18 +361,41 @@ class Routing:
         self._flush()
         while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
             if command.text("do") == "change":
-                self._amend(command.text("link"), k, tuple(_change(one) for one in command.maps("changes")))
+                self._amend(command, k)
 
-    def _amend(self, name: str, k: int, changes: tuple[Change, ...]) -> None:
-        """Change a link from slot k on."""
-        self._downlinks[name].amend(k, changes)
+    def _amend(self, command: Reader, k: int) -> None:
+        """Change a link from slot k on, as the conductor says."""
+        name = command.choice("link", self._courses)
+        changes = read_changes(command, "changes", self._brief.slots)
+        try:
+            self._downlinks[name].amend(k, changes)
+        except (KeyError, TypeError, ValueError, NotRegistered) as error:
+            raise command.malformed(
+                f"settings that are none ({error!r:.80})", f"settings of the link of {name}"
+            ) from error
         course = self._courses[name]
         self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
 
 
-def _change(found: Reader) -> Change:
-    settings = found.map("settings") if found.has("settings") else None
-    return Change(found.integer("at"), settings, found.flag("cut") if found.has("cut") else None)
+def read_changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
+    """The changes of a link in a run of so many slots, in a field of a command."""
+    return tuple(
+        Change(
+            one.integer("at", 0, slots),
+            one.map("settings") if one.has("settings") else None,
+            one.flag("cut") if one.has("cut") else None,
+        )
+        for one in found.maps(name)
+    )
+
+
+def read_links(command: Reader, names: Collection[str], slots: int) -> dict[str, tuple[Change, ...]]:
+    """Receiver → all changes of its link, of those that an `again` names."""
+    links = command.nested("links")
+    for name in command.map("links"):
+        if name not in names:
+            raise command.malformed(f"the link {shown(name)}", f"one of {', '.join(names)}")
+    return {name: read_changes(links, name, slots) for name in command.map("links")}
 
 
 def _opened(brief: Brief, access: dict[str, Any]) -> Session:

@@ -1,8 +1,8 @@
-"""One Zenoh session of one process: how it is opened, what it declares, when it is ready, how it ends.
+"""What one process has on the network: how it connects, what it declares, when it is ready, how it ends.
 
 Nothing here relies on the transport not to lose: it blocks when full, and what goes down with a connection is seen as a gap
-in the slot numbers that every message carries, and sent once more. Zenoh opens a lost connection again by itself, and
-declares anew all that was declared.
+in the slot numbers that every message carries, and sent again. A process whose connection is lost opens another session
+and declares all of it there; each message names its key, and what arrives under another key is dropped.
 """
 
 from __future__ import annotations
@@ -15,38 +15,44 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 import zenoh
-from zenoh.handlers import FifoChannel
 
 from emulator.brief import Brief, Identity
-from emulator.errors import BriefError, MalformedMessage, RunError
+from emulator.errors import BriefError, Gap, MalformedMessage, RunError
 from emulator.launched import when_launcher_is_gone
-from emulator.network.access import OBSERVER, Keys, reader_of
-from emulator.network.connecting import Door, connected, endpoint_of
+from emulator.network.access import OBSERVER, ROUTER, Keys, reader_of
+from emulator.network.connecting import Door, Waiting, connected, endpoint_of
+from emulator.network.connection import Connection
+from emulator.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
+from emulator.network.envelope import Dropped
 from emulator.network.heartbeat import Heartbeat
+from emulator.network.lifeline import Lifeline
+from emulator.network.limits import low_pass
+from emulator.network.mailbox import allowance
 from emulator.network.resending import Kept
-from emulator.network.wire import Reader
+from emulator.network.whereabouts import Place
+from emulator.network.wire import Reader, over, refusal
 
 READY_SECONDS = 30.0
-_INBOX_MESSAGES = 65_536  # far above any window, so that the receiving thread never waits for a slow reader
 _POLL_SECONDS = 0.004
 _LEASE_SECONDS = 4.0  # a connection over which nothing comes for so long is lost
 _HEARD_SECONDS = 2.0  # for readers to be found again once a connection is back
+_NEVER_MS = 86_400_000
+_ANSWER_BYTES = 64 * 2**20  # for the operator
+_WINDOWS = 8  # that an inbox has room for: what was sent again in some rounds waits there too
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
 
-Inbox = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
 
-
-def _transport(identity: Identity | None, listens: bool = False) -> dict[str, Any]:
+def _transport(identity: Identity | None, largest: int, listens: bool = False) -> dict[str, Any]:
     # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
     link: dict[str, Any] = {
         "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
-        "rx": {"buffer_size": 1 << 20},
+        "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
     if identity is not None:
         from emulator.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
@@ -82,6 +88,7 @@ class Credentials(Protocol):
 
 def client_config(entry: Credentials) -> dict[str, Any]:
     """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
+    largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
     return {
         "mode": "client",
@@ -92,24 +99,34 @@ def client_config(entry: Credentials) -> dict[str, Any]:
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(entry.identity), "auth": auth},
+        "transport": {**_transport(entry.identity, largest), "auth": auth},
     }
 
 
 def door_of(entry: Credentials) -> Door:
     """The way in for a brief, or for the operator."""
-    return Door(entry.router, entry.run, client_config(entry), entry.identity)
+    return Door(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
+
+
+def _once(door: Door) -> zenoh.Config:
+    """The configuration of a session that is closed when its connection is lost: Zenoh is to connect it once at most."""
+    config = dict(door.config)
+    config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
+    config["transport"] = {**config["transport"], "unicast": {"open_timeout": int(_LEASE_SECONDS * 1000)}}
+    return zenoh.Config.from_json5(json.dumps(config))
 
 
 def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
-    """Configuration of a router: it listens, asks for user and password, and denies what is not granted."""
+    """Configuration of a router: it listens, asks for user and password, and drops what is not granted or too large."""
+    transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
         "mode": "router",
         **({"id": brief.part["zid"]} if brief.role == "router" and brief.part["zid"] is not None else {}),
         "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(brief.identity, listens=True), "auth": {"usrpwd": {"dictionary_file": users_file}}},
+        "transport": {**transport, "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
+        "low_pass_filter": low_pass(brief.run, brief.part["limits"]),
     }
 
 
@@ -136,26 +153,8 @@ def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -
         ) from error
 
 
-class Question:
-    """What somebody asks, to be answered once. Final."""
-
-    def __init__(self, key: str, query: zenoh.Query) -> None:
-        self._key, self._query = key, query
-        self.payload = b"" if query.payload is None else query.payload.to_bytes()
-
-    def answer(self, payload: bytes) -> None:
-        """Send the answer, if whoever asked is still there."""
-        with suppress(zenoh.ZError):
-            self._query.reply(self._key, payload)
-        self._query.drop()  # type: ignore[no-untyped-call]
-
-
-def _matched(publisher: zenoh.Publisher) -> bool:
-    return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
-
-
 class Session:
-    """A process's session. Final; use it as a context manager, or its threads outlive the program."""
+    """What a process has on the network. Final; use it as a context manager, or its threads outlive the program."""
 
     def __init__(
         self,
@@ -172,19 +171,26 @@ class Session:
         self._process = brief.process
         self.patience = float(brief.patience)
         """Seconds that are waited for the others."""
+        self.place = Place()
+        """Where this process is, to be kept up to date as it works."""
+        self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
+        """Bytes that one sender may have waiting to be read."""
+        self._room = _WINDOWS * (brief.flow.window + 8)
+        self._dropped = Dropped(brief.process, self._mistaken)
+        self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
+        self._waiting = Waiting(brief.process, brief.router)
         if config is None or listen is None:
-            self._session = connected(door_of(brief), self.patience, meanwhile)
+            door = door_of(brief)
+            once = _once(door)
+            first = connected(door, self.patience, meanwhile)
+            self._connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
         else:
-            self._session = _listening(listen, brief.identity, config)
-        self._publishers: list[zenoh.Publisher] = []
-        self._token: zenoh.LivelinessToken | None = None
+            self._connection = Connection(_listening(listen, brief.identity, config), None)
+        self._outlets: dict[str, Outlet] = {}
         self._kept: list[Kept] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
-        self._lifeline = _Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
-        if self._lifeline is not None:
-            self._session.info.declare_transport_events_listener(self._lifeline.changed)
         self._by_hand = not brief.ends_with_stdin
         # A router has nobody to connect to: it is its network.
         self._heartbeat = Heartbeat((lambda: True) if brief.role in ("router", "relay") else self.linked)
@@ -196,26 +202,54 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, MalformedMessage | Gap):
+            self._complain(error)
         if self._lifeline is not None:
             self._lifeline.release()
         self._heartbeat.stop()
-        self._session.close()  # type: ignore[no-untyped-call]
+        self._connection.close()
+
+    def _complain(self, error: MalformedMessage | Gap) -> None:
+        """Tell the observer, which ends the run, what cannot be read and why; wait a moment for it to do so."""
+        outlet = self._reporting
+        if outlet is not None and outlet.matched:
+            outlet(refusal(error.key, str(error)))
+            with suppress(Empty):
+                self._commands.get(timeout=_HEARD_SECONDS)
+
+    @property
+    def _reporting(self) -> Outlet | None:
+        """Where this process reports to the observer, if it does."""
+        key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
+        return self._outlets.get(key)
+
+    def _changed(self, connected: bool) -> None:
+        """The connection was lost or is back."""
+        self._waiting.begin(again=True)
+        if self._lifeline is not None:
+            self._lifeline.changed(connected)
+
+    def _mistaken(self) -> None:
+        """A message of another key arrived: the connection takes one for the other."""
+        self._connection.renew()
+
+    @property
+    def dropped(self) -> int:
+        """How many messages this process has dropped because they name another key than the one they came on."""
+        return self._dropped.count
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key, to be read in order with `recv`."""
-        return self._session.declare_subscriber(key, FifoChannel(_INBOX_MESSAGES))
+        return self._connection.add(Inbox(key, self._dropped, self.place, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
-        self._session.declare_subscriber(key, lambda sample: receive(sample.payload.to_bytes()))
+        self._connection.add(Funnel(key, self._dropped, receive))
 
     def outlet(self, key: str) -> Callable[[bytes], None]:
         """A publisher for one exact key."""
-        publisher = self._session.declare_publisher(
-            key, congestion_control=zenoh.CongestionControl.BLOCK, reliability=zenoh.Reliability.RELIABLE
-        )
-        self._publishers.append(publisher)
-        return publisher.put
+        self._outlets[key] = self._connection.add(Outlet(key))
+        return self._outlets[key]
 
     def kept(
         self,
@@ -231,22 +265,20 @@ class Session:
 
     def reaches(self, key: str) -> bool:
         """Whether somebody reads a key that this process has a publisher for: who does has opened its session."""
-        return any(str(publisher.key_expr) == key and _matched(publisher) for publisher in self._publishers)
+        return key in self._outlets and self._outlets[key].matched
 
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Be asked at one exact key; `receive` is called on a thread of Zenoh's and must only hand the question on."""
-        self._session.declare_queryable(key, lambda query: receive(Question(key, query)))
+        self._connection.add(Questions(key, self._dropped, receive))
 
     def watch(self, process: str, changed: Callable[[bool], None]) -> None:
-        """Call `changed` with true when a process is there, with false when it is gone; on a thread of Zenoh's."""
-        self._session.liveliness().declare_subscriber(
-            self.keys.alive(process), lambda sample: changed(sample.kind == zenoh.SampleKind.PUT), history=True
-        )
+        """Call `changed` with true when a process is there, with false when it is gone; it must only hand that on."""
+        self._connection.add(Watch(self.keys.alive(process), changed))
 
     @property
     def router_id(self) -> str | None:
         """Which router there is a connection with; one that was started again is another one."""
-        return next((str(found) for found in self._session.info.routers_zid()), None)
+        return next((str(found) for found in self._connection.session.info.routers_zid()), None)
 
     def attendance(self, processes: Iterable[str]) -> dict[str, bool]:
         """Process → whether it is there, kept up to date by a thread of Zenoh's."""
@@ -257,12 +289,14 @@ class Session:
 
     def linked(self) -> bool:
         """Whether there is a link with another router."""
-        return bool(self._session.info.routers_zid())
+        return self.router_id is not None
 
     def wait_for_link(self) -> None:
         """Wait until there is one. Raises RunError after the brief's patience."""
         deadline = time.monotonic() + self.patience
+        self._waiting.begin()
         while not self.linked():
+            self._waiting.look("no link yet")
             if time.monotonic() > deadline:
                 raise RunError(
                     f"{self._process}: no link with the router within {self.patience:.0f} s; look at its log"
@@ -290,14 +324,28 @@ class Session:
 
     def appear(self) -> None:
         """Show that this process is there."""
+        outlet = self._reporting
+        if outlet is not None:
+            self.place.answer(outlet)
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
-        self._token = self._session.liveliness().declare_token(self.keys.alive(self._process))
+        self._connection.appear(self.keys.alive(self._process))
         self._heartbeat.start()
+
+    def conclude(self) -> None:
+        """Confirm that this process ends because it was told to, and say how many messages it has dropped.
+
+        The relay, which reports nothing, withdraws its token instead.
+        """
+        outlet = self._reporting
+        if outlet is not None:
+            outlet(over(self.dropped))
+        else:
+            self._connection.disappear()
 
     def _unread(self) -> list[str]:
         """The keys that have no reader."""
-        return [str(publisher.key_expr) for publisher in self._publishers if not _matched(publisher)]
+        return [key for key, outlet in self._outlets.items() if not outlet.matched]
 
     def _send_again(self) -> None:
         """On a thread of its own, since whoever works may be waiting for just what is to come of it."""
@@ -318,6 +366,9 @@ class Session:
                 sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
                 sys.stderr.flush()
                 os._exit(RunError.exit_status)
+            if command.text("do") == "where":
+                self.place.ask()
+                return
             if self._kept and command.text("do") == "again":
                 command.integer("n"), command.integer("k")
                 self._rounds.put(command)
@@ -326,8 +377,11 @@ class Session:
 
     def wait_for(self, command: str) -> None:
         """Wait for one command of the conductor: `start` or `end`."""
-        while self.command().text("do") != command:
-            pass
+        with self.place.waiting(self._control):
+            while self.command().text("do") != command:
+                pass
+        if command == "end":
+            self.conclude()
 
     def command(self) -> Reader:
         """The next command of the conductor; its field `do` says what."""
@@ -336,40 +390,3 @@ class Session:
     def commanded(self) -> Reader | None:
         """The next command of the conductor if there is one."""
         return None if self._commands.empty() else self.command()
-
-
-class _Lifeline:
-    """Ends a process that has had no connection for too long: nobody can tell it that the run is over. Final."""
-
-    def __init__(self, brief: Brief) -> None:
-        self._brief = brief
-        self._lock = threading.Lock()
-        self._timer: threading.Timer | None = None
-        self._released = False
-
-    def changed(self, event: zenoh.TransportEvent) -> None:
-        """The connection was lost or is back."""
-        self._set(event.kind == zenoh.SampleKind.DELETE)
-
-    def release(self) -> None:
-        """The process closes its connection itself."""
-        self._released = True
-        self._set(lost=False)
-
-    def _set(self, lost: bool) -> None:
-        with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-            self._timer = None
-            if lost and not self._released:
-                self._timer = threading.Timer(self._brief.flow.longest_outage, self._give_up)
-                self._timer.daemon = True
-                self._timer.start()
-
-    def _give_up(self) -> None:
-        sys.stderr.write(
-            f"evedrop: {self._brief.process} has had no connection with the router at {self._brief.router} for "
-            f"{self._brief.flow.longest_outage:g} s; look whether the router runs and can be reached\n"
-        )
-        sys.stderr.flush()
-        os._exit(RunError.exit_status)

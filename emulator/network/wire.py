@@ -13,13 +13,14 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.errors import Gap, MalformedMessage
+from emulator.errors import Gap, MalformedMessage, Refusal
 from emulator.model.process import Floats
 from emulator.model.receiver import Flags
-from emulator.network.access import writer_of
+from emulator.network.access import reader_of, writer_of
 
 _LARGEST = 2**62  # of an integer that nothing else bounds: slots can be added to it without leaving 64 bits
 _SMALL_BYTES = 1 << 16  # whatever msgpack makes of so few bytes takes some megabytes at most
+_WHY_CHARACTERS = 1000
 _PARTS = 4096  # lists and maps in a message, of more than a handful of processes
 
 
@@ -207,3 +208,37 @@ def read_progress(key: str, payload: bytes, sent: int) -> int:
 def control(command: str, **fields: Any) -> bytes:
     """A command of the conductor: `start`, `end`, `hold`, `change`, `go` or `again`, and what goes with it."""
     return pack({"do": command, **fields})
+
+
+def over(dropped: int) -> bytes:
+    """A process's last message: it ends because it was told to. dropped: messages that it dropped, which named another key."""
+    return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
+
+
+def refusal(key: str, why: str) -> bytes:
+    """A process ends because it cannot read a message on a key, and why."""
+    return pack({"refuses": key, "why": why[:_WHY_CHARACTERS]})
+
+
+def is_refusal(message: Reader) -> bool:
+    """Whether a process says that it refuses a message."""
+    return message.has("refuses")
+
+
+def read_refusal(message: Reader, process: str) -> Refusal:
+    """The error of a process that refuses a message on a key, which must be one that it reads."""
+    key, why = message.text("refuses"), message.text("why")
+    if key.split("/")[:2] != message.key.split("/")[:2] or not writer_of(key) or reader_of(key) != process:
+        raise message.malformed(f"refuses = {shown(key)}", f"a key that {process} reads")
+    plain = "".join(character if character.isprintable() else "?" for character in why[:_WHY_CHARACTERS])
+    return Refusal(process, key, writer_of(key), plain)
+
+
+def is_over(message: Reader) -> bool:
+    """Whether a message is a process's last."""
+    return message.has("over")
+
+
+def read_over(message: Reader) -> int:
+    """How many messages the process dropped."""
+    return message.integer("misdelivered", 1) if message.has("misdelivered") else 0

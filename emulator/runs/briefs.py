@@ -12,11 +12,13 @@ from emulator.brief import Brief, Flow, Model
 from emulator.errors import UsageError
 from emulator.files import Unreadable, contents
 from emulator.model.account import COUNTED_BURSTS
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.answers import NoAnswer
+from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
 from emulator.model.link import Course, streams_of
 from emulator.model.schemes import scheme_of
 from emulator.modules import named_in
 from emulator.network.access import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
+from emulator.network.limits import Sizes
 from emulator.runs.acknowledging import chart_of, way_back_of
 from emulator.runs.folder import new_folder
 from emulator.runs.loop_briefs import LoopBriefs
@@ -101,7 +103,25 @@ def flow_of(scenario: Scenario) -> Flow:
     batch = max(1, window // 4)
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
-    return Flow(window, batch, scenario.longest_outage)
+    sizes = sizes_of(scenario, batch)
+    return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
+
+
+def sizes_of(scenario: Scenario, batch: int) -> Sizes:
+    """What the sizes of messages follow from, with reports of so many slots."""
+    plant, table = scenario.driven, scenario.controller
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return Sizes(
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        batch,
+        max(scenario.window(name) for name in scenario.receivers),
+        len(scenario.receivers),
+        len(scheme.header),
+        0 if plant is None or table is None else plant.inputs,
+        1 if table is None else table.period,
+    )
 
 
 def history_of(scenario: Scenario) -> int:
@@ -121,7 +141,6 @@ class Observation:
 
     results: Path
     recording: bool
-    live: str | None
     shard: bool = False
     """Whether the run is a shard of a larger one: it leaves its score to be merged, and is not steered by itself."""
 
@@ -154,7 +173,8 @@ def briefs_of(
     model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
     identities = identities_of(run, places, tuple(users))
-    loop = LoopBriefs(scenario)
+    loop, flow = LoopBriefs(scenario), flow_of(scenario)
+    limits = sizes_of(scenario, flow.batch).of_kinds
 
     def imports(process: str, part: Mapping[str, Any]) -> bool:
         """Whether a process may need a class that is not built in. Of links, somebody may set another while the run goes on."""
@@ -173,7 +193,7 @@ def briefs_of(
             trials=scenario.trials,
             first_trial=scenario.first_trial,
             recorded=scenario.record_trials,
-            flow=flow_of(scenario),
+            flow=flow,
             model=model,
             keys={name: key.hex() for name, key in owned.items()},
             part={**part, "modules": scenario.modules} if imports(process, part) else part,
@@ -200,6 +220,7 @@ def briefs_of(
                 "acknowledgements": None if back is None else back._asdict(),
                 "controller": loop.wiring,
                 "zid": routers.zid,
+                "limits": limits,
             },
         ),
         brief(
@@ -232,10 +253,10 @@ def briefs_of(
                 "scenario": scenario.model_dump(mode="json"),
                 "results": str(observation.results),
                 "recording": observation.recording,
-                "live": observation.live,
                 "operator": users[OPERATOR],
                 "shard": observation.shard,
                 "operator_identity": asdict(identities[OPERATOR]) if identities else None,
+                "classes": _answers(scenario),
             },
         ),
     ]
@@ -243,11 +264,29 @@ def briefs_of(
         made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
     if places.relay is not None:
         part = routers.relay_part(scenario.receivers, places.relay)
-        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring}))
+        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring, "limits": limits}))
     for name, table in scenario.eavesdroppers.items():
         part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
         made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
     return {one.process: one for one in made}
+
+
+def _answers(scenario: Scenario) -> dict[str, Any]:
+    """What eavesdroppers' classes that are not built in say of themselves: all that the observer will ask."""
+    tables = scenario.eavesdroppers
+    names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
+    foreign = {name for name in names if STRATEGIES.foreign(name)}
+    if foreign:
+        from emulator.runs.expectation import expectations_of  # noqa: PLC0415 - it is long to import, and seldom needed
+
+        for name, expectation in expectations_of(scenario).items():
+            if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:
+                try:
+                    expectation.traces(scenario.slots)
+                    _ = expectation.limit, expectation.infinite_variance
+                except NoAnswer as error:
+                    raise UsageError(f"eavesdroppers.{name}: its class has no theory of itself ({error})") from error
+    return ANSWERS.of(foreign)
 
 
 def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
@@ -268,7 +307,7 @@ def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path
             f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
             "itself, with its own --first-trial and --trials"
         )
-    made = briefs_of(scenario, places, Observation(results, True, None), ends_with_stdin=False, patience=patience)
+    made = briefs_of(scenario, places, Observation(results, True), ends_with_stdin=False, patience=patience)
     try:
         new_folder(folder)
         return [brief.write(folder) for brief in made.values()]

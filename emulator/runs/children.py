@@ -17,11 +17,13 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from emulator.brief import Brief
+from emulator.entry import INTERRUPTED
 from emulator.errors import RunError
 from emulator.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from emulator.runs.environment import lock_step_environment, own_environment
 from emulator.runs.folder import private_opener
 from emulator.runs.held import HeldFolder
+from emulator.runs.signals import held_back
 
 News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for everybody to leave
@@ -31,6 +33,7 @@ _BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there
 _GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
+_HUBS = frozenset({ROUTER, RELAY, OBSERVER})
 _ROUTER_LOST = "has had no connection with the router"
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
@@ -69,6 +72,8 @@ class Exit:
         """As a sentence goes on after the process's name."""
         if self.status < 0:
             return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
@@ -134,9 +139,9 @@ class Children:
         try:
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
-            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "emulator", brief.role, str(path)],
+                    [sys.executable, "-P", "-m", "emulator", brief.role, str(path)],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE if conducts else log,
                     stderr=log,
@@ -163,7 +168,8 @@ class Children:
 
     def restart_router(self, ended: Exit) -> bool:
         """Start a router again if a signal ended it, a few times at most; whether it was started."""
-        if ended.process not in {ROUTER, RELAY} or ended.status >= 0 or self._restarts == ROUTER_RESTARTS:
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
         self._killed.add(self._processes[ended.process].pid)
@@ -258,9 +264,9 @@ class Children:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
         suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
-        lost = next((name for name in (RELAY, ROUTER) if name in suspects), None)
-        if lost is not None and first is not None and self._lost_router(first.process):
-            first, suspects = None, [lost]  # whoever is not reached any more is at fault, not whoever gave up first
+        lost = None if first is None else self._lost_by_all(first.process, suspects)
+        if lost is not None:
+            first, suspects = None, [lost]  # it is at fault, and not the process that gave up first
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
         if accused and why:
@@ -300,6 +306,21 @@ class Children:
     def _lost_router(self, name: str) -> bool:
         """Whether a process ended because it could not reach its router any more."""
         return any(_ROUTER_LOST in line for line in self._log(name))
+
+    def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
+        """The router that a process gave up, if the observer misses it too, or all others that are connected to it; else None."""
+        if not self._lost_router(name):
+            return None
+        if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
+            return missed
+        place = self._briefs[name].router
+        others = [one for one, brief in self._briefs.items() if brief.router == place and one not in _HUBS]
+        deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
+        while time.monotonic() < deadline:
+            if all(self._lost_router(one) for one in others):
+                return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+            time.sleep(0.05)
+        return None
 
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""

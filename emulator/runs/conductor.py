@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection
 from queue import Empty, SimpleQueue
@@ -9,13 +10,17 @@ from typing import Any, NoReturn
 
 from emulator.errors import Interrupted, RunError
 from emulator.network.access import OBSERVER, RELAY, ROUTER, SENSOR
-from emulator.network.session import Question, Session
-from emulator.network.wire import control, progress
+from emulator.network.declared import Question
+from emulator.network.mailbox import Mailbox
+from emulator.network.session import Session
+from emulator.network.wire import Reader, control, is_over, progress, read_over
 
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
 _ABANDON_SECONDS = 2.0  # for who is told to go
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
-_END_SECONDS = 0.5  # after which who is still there is told once more that the run is over
+_END_SECONDS = 0.5  # after which a process that is still there is told again that the run is over
+_RETURN_SECONDS = 3.0  # for a process to come back that vanished when it was told so, and did not confirm it
+_ROUTERS_SECONDS = 5.0  # for a router to confirm
 
 
 class Stop:
@@ -48,7 +53,6 @@ class Conductor:
         """reporters: who reports besides router and sensor: the receivers, and a controller."""
         self._session = session
         self._stop = stop
-        self._news: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
         """Whether we are connected to a relay, and not to the router itself."""
@@ -58,10 +62,13 @@ class Conductor:
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
+        self._news = Mailbox(self.keys, session.allowance)
         for source, key in self.keys.items():
-            session.funnel(key, lambda payload, source=source: self._news.put((source, payload)))  # type: ignore[misc]
+            session.funnel(key, lambda payload, source=source: self._news.put(source, payload))  # type: ignore[misc]
         for name in self._present:
-            session.watch(name, lambda there, name=name: self._news.put((name, there)))  # type: ignore[misc]
+            session.watch(name, lambda there, name=name: self._news.put(name, there))  # type: ignore[misc]
+        self.misdelivered: dict[str, int] = {}
+        """Process → how many messages it dropped because they name another key, of those that have confirmed their end."""
         self.absent: set[str] = set()
         """Who is away by intent, and not missed."""
         self.questions: SimpleQueue[Question] = SimpleQueue()
@@ -129,33 +136,67 @@ class Conductor:
         """Tell one process what to do."""
         self._commands[name](control(do, **fields))
 
+    def ask(self, what: str) -> None:
+        """Ask everybody who is there and reports for something."""
+        for name in self.keys:
+            if self._present[name]:
+                self.command(name, what)
+
     def report(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""
         self._progress(progress(done))
 
     def end(self, patience: float) -> None:
-        """Tell everybody that the run is over, and again who was cut off meanwhile; the router when all others have left.
+        """Tell everybody that the run is over, and again those who were cut off meanwhile; the routers when all others have left.
 
-        patience: how many seconds a router is waited for that is missing just now.
+        patience: how many seconds a process is waited for that is missing just now.
         """
+        others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
+        told: set[str] = set()
         deadline = time.monotonic() + patience
         said = 0.0
         while time.monotonic() < deadline:
-            left = [
-                name
-                for name in self._present
-                if name not in {ROUTER, RELAY} and name not in self.absent and self._present[name]
-            ]
+            left = [name for name in others if not self._has_ended(name, told)]
             if not left and self._present[ROUTER]:
                 break
             if time.monotonic() - said > _END_SECONDS:
                 said = time.monotonic()
                 for name in left:
-                    self.command(name, "end")
-            self._note(self._next())
-        self.command(ROUTER, "end")
-        if RELAY in self._present:
-            self.command(RELAY, "end")
+                    if self._present[name]:
+                        self.command(name, "end")
+                        told.add(name)
+            self._hear_out(self._next())
+        # The relay after the router: what the router has to say comes over it.
+        for name in (ROUTER, RELAY):
+            if name in self._present:
+                self._end_router(name)
+
+    def _has_ended(self, name: str, told: Collection[str]) -> bool:
+        """Whether a process has left for good: it said so, or it vanished when it was told to end and does not come back."""
+        if self._present[name]:
+            return False
+        gone = time.monotonic() - self.lost.get(name, -math.inf)
+        return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
+
+    def _end_router(self, name: str) -> None:
+        """Tell a router that the run is over until it confirms that: the router by a message, the relay by its token."""
+        deadline = time.monotonic() + _ROUTERS_SECONDS
+        said = 0.0
+        while time.monotonic() < deadline and name not in self.misdelivered:
+            if name == RELAY and not self._present[name] and self._session.linked():
+                return
+            if time.monotonic() - said > _END_SECONDS:
+                said = time.monotonic()
+                self.command(name, "end")
+            self._hear_out(self._next())
+
+    def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
+        """Note who is there, and who confirms that the run is over; everything else has come before."""
+        if news is not None and isinstance(news[1], bytes):
+            message = Reader(self.keys[news[0]], news[1])
+            if is_over(message):
+                self.misdelivered[news[0]] = read_over(message)
+        self._note(news)
 
     def abandon(self, why: str) -> None:
         """Tell everybody who is there that the run will not go on."""

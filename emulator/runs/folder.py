@@ -52,6 +52,7 @@ def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Pat
     finally:
         with contextlib.suppress(OSError):
             folder.rmdir()  # only an empty one can be removed
+            folder.parent.rmdir()
 
 
 def _unusable(folder: Path, why: str) -> UsageError:

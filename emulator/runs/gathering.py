@@ -55,7 +55,9 @@ def gather(
     wall = 0.0 if started is None else time.monotonic() - started
     totals = Totals.merged([left(shard.folder, shard.scenario) for shard in shards])
     replay = replay_of(folder, scenario)
-    ending = Ending(wall, how, replay, events=_events(shards), outages=_outages(shards))
+    ending = Ending(
+        wall, how, replay, events=_events(shards), outages=_outages(shards), misdelivered=_misdelivered(shards)
+    )
     summary = summary_of(scenario, totals, digests, ending)
     write_summary(folder, summary)
     _tidy(folder, shards)
@@ -113,6 +115,15 @@ def _outages(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
     """Who was cut off in any shard, and in which, in order of slots."""
     found = [{"shard": shard.number, **one} for shard, summary in _summaries(shards) for one in summary["outages"]]
     return sorted(found, key=lambda one: int(one["slot"]))
+
+
+def _misdelivered(shards: Sequence[Shard]) -> dict[str, int]:
+    """Process → messages that it dropped, in all shards together."""
+    found: dict[str, int] = {}
+    for _, summary in _summaries(shards):
+        for name, count in summary["misdelivered"].items():
+            found[name] = found.get(name, 0) + int(count)
+    return found
 
 
 def _summaries(shards: Sequence[Shard]) -> Iterator[tuple[Shard, Mapping[str, Any]]]:

@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import threading
 from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self, final
 
 _BEAT_SECONDS = 1.0
-_OUTPUT = 1  # standard output
 _LINE = threading.Lock()  # one line at a time
+
+
+def set_news_apart() -> None:
+    """Let the file descriptor 1 be standard error from now on: Zenoh logs there, in the middle of the news."""
+    sys.stdout.flush()
+    sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
 
 
 def tell(event: str, **news: Any) -> None:
     """Write a line to standard output for the launcher; nobody has to read it."""
     left = memoryview(json.dumps({"event": event, **news}, ensure_ascii=False).encode() + b"\n")
-    with _LINE, suppress(OSError):  # a launcher that is gone, or no standard output
+    with _LINE, suppress(OSError, ValueError, AttributeError):  # a launcher that is gone, or no standard output
         while left:
-            left = left[os.write(_OUTPUT, left) :]
+            left = left[os.write(sys.stdout.fileno(), left) :]
 
 
 @final

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -15,7 +15,7 @@ from emulator.model.digest import Blocks, Digests
 from emulator.model.links.link import REASONS
 from emulator.model.process import Floats
 from emulator.model.receiver import Codes, Flags
-from emulator.network.access import CONTROLLER
+from emulator.network.access import CONTROLLER, ROUTER, SENSOR
 from emulator.network.loop_wire import read_decisions
 from emulator.network.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
 from emulator.network.wire import Reader
@@ -170,6 +170,10 @@ class Joiner:
     def reported(self, name: str) -> int:
         """The first slot that a receiver, or the controller, has not reported."""
         return self._decided if name == CONTROLLER else self._reports[name].end
+
+    def places(self, reporters: Iterable[str]) -> dict[str, int]:
+        """Process → the first slot that it has not reported: sensor, router, and these."""
+        return {SENSOR: self.sent, ROUTER: self.journaled, **{name: self.reported(name) for name in reporters}}
 
     def complete(self, slots: int) -> bool:
         """Whether so many slots have been given back, and a controller has reported them."""

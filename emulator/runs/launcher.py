@@ -11,10 +11,11 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from emulator.control import remove_control
+from emulator.entry import INTERRUPTED
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.network.access import OBSERVER
 from emulator.runs.briefs import Observation, briefs_of
@@ -29,6 +30,9 @@ from emulator.scenario import Scenario
 
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
+_AFTERTHOUGHT_SECONDS = (
+    0.5  # a signal that ended a child may be about to reach us: a terminal that closes hangs up on all
+)
 
 
 @dataclass(frozen=True)
@@ -91,18 +95,19 @@ def launch_one(
         make_private(folder / "logs")
         viewer = None
         try:
-            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", None, shard))
+            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", shard))
             observer = briefs.pop(OBSERVER)
             with Children(held, private, scenario.controller is not None) as children:
                 for brief in briefs.values():
                     children.start(brief)
-                # The others find their feet while the viewer does; only the observer must know it.
-                viewer = Viewer.start(view, folder / "logs")
+                # The others find their feet while the viewer does.
+                viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
-                    observer = replace(observer, part={**observer.part, "live": viewer.url})
-                    tell({"event": "view", "address": viewer.address})
+                    tell({"event": "view", "address": viewer.address, "warning": viewer.warning})
                 children.start(observer)
                 status = _supervise(children, stop, tell)
+                if viewer is not None:
+                    viewer.complete()
         except BaseException as error:
             if viewer is not None:
                 viewer.stop()
@@ -182,7 +187,9 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
         news = children.news(_LOOK_SECONDS)
         ending: News | None = None
         if isinstance(news, Exit):
-            if news.process != OBSERVER and (news.status == 0 or children.restart_router(news)):
+            if _meant_us_too(news, stop) or (
+                news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
+            ):
                 # Who leaves at the end may be faster than the word that it is the end.
                 early = early or ((news, time.monotonic()) if news.status == 0 else None)
                 continue
@@ -202,6 +209,11 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
         raise RunError(children.story(None, ending))
     children.wait_all()
     return int(ending["status"])
+
+
+def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
+    """Whether the signal that ended a child reaches us within a moment: a terminal that closes hangs up on everybody."""
+    return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)
 
 
 def _ended_well(ending: News) -> bool:

@@ -21,32 +21,39 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.brief import Brief, Identity
 from emulator.control import Control, remove_control
+from emulator.entry import heeded
 from emulator.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from emulator.launched import launcher_is_gone, when_launcher_is_gone
+from emulator.model.answers import NoAnswer
 from emulator.model.digest import Blocks
-from emulator.network.access import CONTROLLER, OPERATOR, ROUTER, SENSOR
+from emulator.model.eavesdroppers import ANSWERS
+from emulator.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
+from emulator.network.declared import Question
 from emulator.network.operator import Answer, read_request
 from emulator.network.resending import Due
-from emulator.network.session import Question, Session
+from emulator.network.session import Session
 from emulator.network.telemetry import is_held, is_leaving, read_leaving
-from emulator.network.wire import Reader
+from emulator.network.whereabouts import is_whereabouts, read_whereabouts
+from emulator.network.wire import Reader, is_refusal, read_refusal
 from emulator.runs.conductor import Conductor, Stop
 from emulator.runs.folder import new_folder
-from emulator.runs.heartbeat import tell
+from emulator.runs.heartbeat import set_news_apart, tell
 from emulator.runs.held import HeldFolder
 from emulator.runs.joined import Joiner
 from emulator.runs.judge import replay_of
 from emulator.runs.orders import Order
 from emulator.runs.recovery import Recovery
 from emulator.runs.results import ResultsWriter, write_summary
-from emulator.runs.rows import DigestRows, extent_of, write_rows
+from emulator.runs.rows import DigestRows, write_rows
 from emulator.runs.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
 from emulator.runs.shard_score import leave
 from emulator.runs.shown import open_recording, showing_of, shown
+from emulator.runs.stall import Stall, patience_of
 from emulator.runs.stand_in import StandIn
+from emulator.runs.status import status_of
 from emulator.runs.steering import Steering
 from emulator.runs.summary_file import unwritten
-from emulator.runs.verification import Verifier
+from emulator.runs.verification import Verifier, extent_of
 from emulator.runs.viewer import Stand, Viewer
 from emulator.scenario import Scenario
 
@@ -55,7 +62,7 @@ if TYPE_CHECKING:
     from emulator.view.recording import Recording
 
 _PROGRESS_SECONDS = 0.25
-_ORPHAN_SECONDS = 10.0  # to write the results when the launcher is gone
+_ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone
 
 
 def observe(brief: Brief, serve: str | None = None) -> int:
@@ -66,12 +73,14 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     """
     stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    set_news_apart()
     by_hand = not brief.ends_with_stdin
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
+    ANSWERS.learn(brief.part["classes"])  # so that the classes themselves need not run here
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = Observation(brief, scenario, confirmations, by_hand)
     if by_hand:
@@ -93,7 +102,9 @@ def observe(brief: Brief, serve: str | None = None) -> int:
                 tell("finishing")
             observation.settle(how)
     except OSError as error:
-        status, how = RunError.exit_status, unwritten(error)
+        status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)
+    except NoAnswer as error:  # of a class that the operator's change of a link has a question for
+        status, how = RunError.exit_status, f"an eavesdropper's class could not say what theory expects of it: {error}"
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
@@ -137,7 +148,6 @@ class Observation:
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: Recording | None = None
-        self._live: str | None = brief.part["live"]
         self._showing: Showing | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = time.monotonic()
@@ -145,7 +155,9 @@ class Observation:
         self._accused: tuple[str, ...] = ()
         """Processes that the run ends with because of what they did."""
         self._recovery: Recovery
+        self._stall: Stall
         self._outages: list[Mapping[str, Any]] = []
+        self._misdelivered: dict[str, int] = {}
         self._due: dict[str, Due] = {}
         self._recent: tuple[float, int] = (self._started, 0)
 
@@ -160,9 +172,8 @@ class Observation:
 
     def show(self, stand: Stand) -> Viewer:
         """A viewer for browsers, which the run will be streamed to."""
-        viewer = Viewer.serve(stand, self.folder / "logs")
+        viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
         tell("view", address=viewer.address)
-        self._live = viewer.url
         return viewer
 
     def writer(self) -> ResultsWriter:
@@ -176,13 +187,15 @@ class Observation:
             conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part["recording"]:
                 self._showing = showing_of(self._scenario)
-                self._recording = open_recording(
-                    self._scenario, self._brief.run, self.folder / "recording.rrd", self._live
-                )
+                path = self.folder / "recording.rrd"
+                self._recording = open_recording(self._scenario, self._brief.run, path)
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             patience = self._brief.flow.longest_outage
             self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
+            batch = self._brief.flow.batch
+            limit = patience_of(patience, self._scenario.pace, batch)
+            self._stall = Stall(limit, batch, lambda: conductor.ask("where"))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -196,7 +209,8 @@ class Observation:
                         self._take(conductor, *news)
                     self._steer(conductor)
                     self._recovery.look(self._joiner.done)
-                    self._writer.checkpoint(self._at, self._so_far)
+                    self._save()
+                    self._look(conductor)
             except EvedropError as error:
                 self._suspects = conductor.missing
                 self._accused = error.at_fault if isinstance(error, RunError) else ()
@@ -209,7 +223,21 @@ class Observation:
                 self._outages = self._recovery.account()
                 self._ended = time.monotonic()
             tell("over")
-            conductor.end(patience)
+            try:
+                conductor.end(patience)
+            finally:
+                self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
+                if session.dropped:
+                    self._misdelivered[OBSERVER] = session.dropped
+
+    def _look(self, conductor: Conductor) -> None:
+        """See whether a process that is there keeps the run waiting."""
+        done, at = self._joiner.done, self._steering.at
+        held = at is not None and done >= at
+        present = set(self._scenario.digested) - conductor.absent
+        beside = (CONTROLLER,) if done < self._scenario.slots else ()
+        missing = bool(conductor.missing)
+        self._stall.look(done, lambda: self._joiner.places(present), beside, held=held, missing=missing)
 
     @property
     def _control(self) -> Control:
@@ -257,26 +285,18 @@ class Observation:
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
 
     def _status(self, conductor: Conductor) -> dict[str, Any]:
-        """How the run is doing, as docs/protocol.md has it."""
-        steering, now = self._steering, time.monotonic()
+        """How the run is doing."""
         before, done = self._recent
-        links = {}
-        for name, tally in self._keeper.totals.tallies.items():
-            account = tally.link
-            fraction = account["delivered"] / account["offered"] if account["offered"] else None
-            links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
-        return {
-            "slot": self._joiner.done,
-            "slots": self._scenario.slots,
-            "slots_per_second": 0.0 if steering.paused else (self._joiner.done - done) / max(now - before, 1e-3),
-            "state": "paused" if steering.paused else "running" if steering.at is None else "held",
-            "processes": conductor.processes,
-            "links": links,
-            "events": steering.events,
-        }
+        rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)
+        return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.totals)
 
     def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
         message = Reader(conductor.keys[source], payload)
+        if is_refusal(message):
+            raise read_refusal(message, source)
+        if is_whereabouts(message):
+            self._stall.take(source, read_whereabouts(message, self._scenario.slots))
+            return
         if not self._news(source, message):
             return
         if source == ROUTER:
@@ -355,6 +375,14 @@ class Observation:
         """How far the run came."""
         return f"slot {self._joiner.done}"
 
+    def _save(self) -> None:
+        """Have on disk what was measured, from time to time. Raises RunError if it cannot be written."""
+        try:
+            with suppress(NoAnswer):  # which is told at the end; rows are written before figures are asked for
+                self._writer.checkpoint(self._at, self._so_far)
+        except OSError as error:
+            raise RunError(unwritten(error)) from error
+
     def _so_far(self) -> dict[str, Any]:
         """The summary of a run that goes on."""
         self._ended = time.monotonic()
@@ -367,7 +395,15 @@ class Observation:
             leave(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(folder, self._scenario), self._ended - self._started
-        ending = Ending(wall, how, replay, events=self._events, outages=self._outages, accused=self._accused)
+        ending = Ending(
+            wall,
+            how,
+            replay,
+            events=self._events,
+            outages=self._outages,
+            accused=self._accused,
+            misdelivered=self._misdelivered,
+        )
         return summary_of(self._scenario, self._keeper.totals, digests, ending)
 
     def settle(self, how: str) -> None:

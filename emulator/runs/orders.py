@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from emulator.network.declared import Question
 from emulator.network.operator import Answer, Request
-from emulator.network.session import Question
 
 
 @dataclass(frozen=True)

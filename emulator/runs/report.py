@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from io import StringIO
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -34,11 +36,34 @@ News = Mapping[str, Any]
 _DIGEST_WIDTH = 100  # columns of a terminal that has room for digests
 
 
+class _Unfailing:
+    """A stream that forgets what cannot be written to it: the terminal may be closed while the run is ended in order."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _unfailing(stream: TextIO | None) -> TextIO:
+    return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
+
+
 class ProgressLine:
     """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
 
     def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
-        self.console = Console(stderr=True, highlight=False, markup=False)
+        self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
         self.moved: Path | None = None
@@ -69,8 +94,11 @@ class ProgressLine:
     def tell(self, news: News) -> None:
         """Take one piece of news."""
         kind = news["event"]
-        if kind == "view" and news["address"] and not self._quiet:
-            self.console.print(f"live view: {news['address']}", soft_wrap=True)
+        if kind == "view" and not self._quiet:
+            if news["address"]:
+                self.console.print(f"live view, for whoever has this address: {news['address']}", soft_wrap=True)
+            if news.get("warning"):
+                self.console.print(f"warning: {news['warning']}", soft_wrap=True)
         elif kind == "started":
             self._progress.update(self._task, description="running")
         elif kind == "held":

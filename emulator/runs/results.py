@@ -5,6 +5,7 @@ Source: docs/results.md.
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -141,13 +142,14 @@ class ResultsWriter:
         if began >= self._figures_due:
             before()
         self._round()
+        self._round_due = time.monotonic() + _ROUND_SECONDS
         if began >= self._figures_due:
+            self._figures_due = self._round_due
             self.write_figures(figures())
             # The first time theory is imported, which says nothing about the next.
             took = time.monotonic() - began if self._figures_before else 0.0
             self._figures_before = True
             self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
-        self._round_due = time.monotonic() + _ROUND_SECONDS
 
     def settle(self, at: str, figures: Mapping[str, Any]) -> None:
         """Have everything on disk, with the last figures: nothing more will come. Raises OSError as above."""
@@ -166,6 +168,8 @@ class ResultsWriter:
         self._streams["slots"] = self._stream("slots", self._restarts)
 
     def _round(self) -> None:
+        if self._broken:  # what would come after a part of a batch could not be read
+            raise OSError(errno.EIO, "an earlier part could not be written")
         self._broken = True  # unless all goes well
         self._unfinished.round(self._at, self._slots, self._streams)
         self._broken = False

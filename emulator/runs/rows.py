@@ -7,11 +7,9 @@ from itertools import islice
 from typing import final
 
 from emulator.model.digest import Digests
-from emulator.network.telemetry import Extent
 from emulator.runs.joined import Slots
 from emulator.runs.results import ResultsWriter
 from emulator.runs.scorekeeper import Scored
-from emulator.scenario import Scenario
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
@@ -40,17 +38,3 @@ class DigestRows:
                 new = dict(islice(blocks.items(), self._written[name], None))
                 writer.digest_rows(self._first_trial, {name: new})
                 self._written[name] = len(blocks)
-
-
-def extent_of(scenario: Scenario, batch: int) -> Extent:
-    """What messages of a run are held to."""
-    plant = scenario.driven
-    return Extent(
-        scenario.slots,
-        batch,
-        len(scenario.process.A),
-        scenario.trials,
-        scenario.record_trials,
-        0 if plant is None or scenario.controller is None else plant.inputs,
-        plant is not None and plant.output_matrix is not None,
-    )

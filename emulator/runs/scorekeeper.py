@@ -7,7 +7,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,6 +107,8 @@ class Ending:
     """The same."""
     accused: tuple[str, ...] = ()
     """The processes that the run has ended with because of what they did."""
+    misdelivered: Mapping[str, int] = field(default_factory=dict)
+    """Process → messages of other keys that it dropped."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -152,6 +154,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         "events": list(ending.events),
         "outages": list(ending.outages),
         "verification": verification_of(scenario, ending.accused) if ending.mode == "live" else None,
+        "misdelivered": dict(ending.misdelivered),
         "secrecy": {name: one.as_dict() for name, one in secret.items()},
         "detection": None if detection is None else detection.summary(scenario),
         "controller": None

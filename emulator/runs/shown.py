@@ -25,8 +25,8 @@ def showing_of(scenario: Scenario) -> Showing | None:
     return Showing.of(scenario)
 
 
-def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -> Recording:
-    """The run's recording, on disk and, with the address of a viewer, live."""
+def open_recording(scenario: Scenario, run: str, path: Path) -> Recording:
+    """The run's recording, on disk."""
     from emulator.runs.showing import driven_scene  # noqa: PLC0415 - only with a view
     from emulator.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
     from emulator.view.scene import Scene, Shown  # noqa: PLC0415 - the same
@@ -53,7 +53,7 @@ def open_recording(scenario: Scenario, run: str, path: Path, live: str | None) -
         noise=float(np.trace(scenario.process.process.Q)),
         **driven_scene(scenario),
     )
-    return Recording(path, scene, live)
+    return Recording(path, scene)
 
 
 def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:

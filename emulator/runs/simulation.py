@@ -29,6 +29,7 @@ from emulator.model.receiver import Belief, Codes, Flags, Receiver, trace_of
 from emulator.model.schemes import scheme_of
 from emulator.model.schemes.scheme import Encoder, Packet
 from emulator.model.theory import misled_covariances
+from emulator.modules import look_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.runs.acknowledging import Acknowledging
 from emulator.runs.attendance import Attendance
@@ -95,6 +96,8 @@ class Simulation:
         self._batch = Batch(scenario.slots, len(trials), trials.start)
         self._process = scenario.process.process
         self._keys = StreamKeys.of(scenario)
+        if scenario.modules is not None:
+            look_in(scenario.modules)
         self._scheme = scheme_of(self._process, scenario.encoding.spec)
         self._guard = guard = Guard(scenario, self._scheme, self._batch)
         secret = self._keys.secret(self._scheme.secret_streams)
@@ -117,7 +120,7 @@ class Simulation:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
         knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
-        return STRATEGIES[table.strategy](knowledge, self._batch)
+        return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:
         """All slots, some tens or hundreds at a time."""

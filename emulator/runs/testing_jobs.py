@@ -24,8 +24,11 @@ _WORK = "from emulator.runs.testing_jobs import work; work()"
 def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Finding]:
     """What became of each scenario, in their order. Raises Interrupted on Ctrl-C; no process is left then."""
     if jobs == 1:
-        for scenario in scenarios:
-            yield carry_out(scenario, manner)
+        with stop_on_signals() as stop:
+            for scenario in scenarios:
+                if stop.is_set():
+                    raise Interrupted("interrupted; what was measured is in the results folders")
+                yield carry_out(scenario, manner)
         return
     crew = _Crew(replace(manner, workers=1))
     with stop_on_signals() as stop, ThreadPoolExecutor(jobs) as threads:
@@ -52,7 +55,7 @@ class _Crew:
         """One scenario, by a process that a Ctrl-C in the terminal does not reach: we pass it on."""
         task = json.dumps([scenario, asdict(self._manner)], default=str)
         process = subprocess.Popen(
-            [sys.executable, "-c", _WORK, task],
+            [sys.executable, "-P", "-c", _WORK, task],
             stdin=subprocess.PIPE,  # closed when we are gone
             stdout=subprocess.PIPE,
             text=True,

@@ -18,7 +18,7 @@ from emulator.errors import Contradiction
 from emulator.model.digest import Blocks, PartialDigests
 from emulator.model.receiver import Action, Belief, trace_of
 from emulator.network.access import ROUTER, SENSOR
-from emulator.network.telemetry import Report
+from emulator.network.telemetry import Extent, Report
 from emulator.runs.joined import ReceiverSlots, Slots
 from emulator.scenario import Scenario
 
@@ -156,6 +156,20 @@ class Verifier:
                 f"{int(np.broadcast_to(unsent, silent.shape)[row])}, or that one of them was delivered",
                 ROUTER,
             )
+
+
+def extent_of(scenario: Scenario, batch: int) -> Extent:
+    """What messages of a run are held to."""
+    plant = scenario.driven
+    return Extent(
+        scenario.slots,
+        batch,
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        0 if plant is None or scenario.controller is None else plant.inputs,
+        plant is not None and plant.output_matrix is not None,
+    )
 
 
 def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Any]:

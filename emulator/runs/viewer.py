@@ -1,42 +1,31 @@
-"""The viewer as a child process of ours, on loopback unless told otherwise. Neither Rerun nor Zenoh is imported here.
+"""The viewer of a run: a window, or a page for browsers; each is fed with the recording, as it is written to disk.
 
-Rerun's own ways to start a viewer listen on every interface; its command, told so, does not.
+A recording holds the truth, so none goes to a port where anybody could fetch it: a window gets it through a pipe, a browser
+at an address that cannot be guessed. Neither Rerun nor Zenoh is imported here.
+
+Source: docs/view.md, who sees it.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import ipaddress
 import os
 import socket
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 from urllib.parse import quote
 
 from emulator.errors import UsageError
-from emulator.runs.environment import viewer_environment
-from emulator.runs.folder import make_private, private_opener
+from emulator.runs.followed import Followed, Served, feed
 from emulator.runs.ports import free_port
+from emulator.runs.viewer_process import HOST, end, is_apart, spawn
 
-_HOST = "127.0.0.1"
-_START_SECONDS = 20.0
-_STOP_SECONDS = 3.0
 _ATTEMPTS = 3
-
-# Rerun's settings as we want them: it reports to nobody what is looked at, and writes nothing into the user's home.
-_CONFIG = Path(__file__).with_name("rerun_config")
-
-# Ends the viewer together with us, even if we are killed: PR_SET_PDEATHSIG is 1, and survives exec.
-_GUARD = (
-    "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); "
-    "os.getppid() == int(sys.argv[1]) or sys.exit(1); os.execv(sys.argv[2], sys.argv[2:])"
-)
+_WINDOW = ("--hide-welcome-screen",)
+_NOTHING = f"rerun+http://{HOST}:9/proxy"
+"""What the page would show by itself: with it Rerun serves the page alone, and opens no port for recordings."""
 
 
 def has_screen() -> bool:
@@ -83,7 +72,7 @@ class Stand:
     @property
     def seen(self) -> str:
         """The address to type into a browser of this machine."""
-        return _HOST if self.host == "0.0.0.0" else self.host  # noqa: S104 - what was asked for
+        return HOST if self.host == "0.0.0.0" else self.host  # noqa: S104 - what was asked for
 
     def check_free(self) -> None:
         """Raise UsageError if somebody else is there: he would be taken for the viewer."""
@@ -99,53 +88,85 @@ class Stand:
 
 
 class Viewer:
-    """A running viewer. Final; made by `start`.
+    """A running viewer. Final; made by `start` or `serve`.
 
     It listens on loopback only unless a stand says otherwise, in a session of its own so that Ctrl-C in the terminal does
     not reach it, and on Linux it dies with the thread that started it, however that ends.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], port: int, web_port: int | None, host: str = _HOST) -> None:
+    def __init__(
+        self, process: subprocess.Popen[bytes], followed: Followed, served: Served | None = None, page: str = ""
+    ) -> None:
         self._process = process
-        self.url = f"rerun+http://{host}:{port}/proxy"
-        """Where a recording is streamed to."""
-        self.address = None if web_port is None else f"http://{host}:{web_port}/?url={quote(self.url, safe='')}"
-        """What to open in a browser; None for a window."""
+        self._followed = followed
+        self._served = served
+        self.address: str | None = None
+        """What to open in a browser; None for a window. Whoever has it sees the truth."""
+        self.warning: str | None = None
+        """What the user should know of who else can get at it."""
+        if served is None and not is_apart(process):
+            self.warning = (
+                "other users of this machine can find the window's port, steer the window and take pictures of what it "
+                "shows, for this system allows it no network of its own; --view web, whose address is a secret, or --view "
+                "off keep it from them (docs/view.md, who sees it)"
+            )
+        if served is not None:
+            host = page.partition(":")[0]
+            data = quote(f"http://{host}:{served.port}{served.path}", safe="")
+            self.address = f"http://{page}/?url={data}"
 
     @classmethod
-    def start(cls, mode: str, logs: Path, files: Sequence[Path] = ()) -> Viewer | None:
-        """Start one and wait until it listens; None for "off". Its output goes to viewer.log in the folder `logs`.
+    def start(cls, mode: str, logs: Path, recording: Path, complete: bool = False) -> Viewer | None:
+        """Start one and wait until it is there; None for "off". Its output goes to viewer.log in the folder `logs`.
 
-        mode: "native", "web", "off", or "auto". files: recordings to open.
+        mode: "native", "web", "off", or "auto". recording: what to show, from its beginning on and as it grows, be there a
+        file already or not; complete: it does not grow.
 
         Raises UsageError if it cannot be started.
         """
         mode = choose(mode)
         if mode == "off":
             return None
+        followed = Followed(recording, complete)
         for attempt in range(_ATTEMPTS):
-            port, web_port = free_port(), free_port() if mode == "web" else None
-            arguments = ["--serve-web", "--web-viewer-port", str(web_port)] if web_port else ["--hide-welcome-screen"]
+            port = free_port()
             try:
-                process = spawn(port, [*arguments, *map(str, files)], logs, web_port=web_port)
+                if mode == "web":
+                    return cls._page(followed, HOST, HOST, port, free_port(), logs)
+                return cls._window(followed, port, logs)
             except UsageError:
                 # Somebody may have taken a port between our look and the viewer's.
                 if attempt == _ATTEMPTS - 1:
                     raise
-                continue
-            return cls(process, port, web_port)
         return None
 
     @classmethod
-    def serve(cls, stand: Stand, logs: Path, files: Sequence[Path] = ()) -> Viewer:
-        """Start one for browsers, at a place that is known beforehand.
+    def serve(cls, stand: Stand, logs: Path, recording: Path, complete: bool = False) -> Viewer:
+        """Start one for browsers, at a place that is known beforehand; the rest as for `start`.
 
         Raises UsageError if it cannot be started, for one because the place is taken.
         """
         stand.check_free()
-        arguments = ["--serve-web", "--web-viewer-port", str(stand.port), *map(str, files)]
-        process = spawn(stand.port + 1, arguments, logs, web_port=stand.port, host=stand.host)
-        return cls(process, stand.port + 1, stand.port, stand.seen)
+        followed = Followed(recording, complete)
+        return cls._page(followed, stand.host, stand.seen, stand.port, stand.port + 1, logs)
+
+    @classmethod
+    def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int, logs: Path) -> Viewer:
+        served = Served(followed, host, data_port)
+        try:
+            process = spawn(port, ["--serve-web", "--web-viewer-port", str(port), _NOTHING], logs, host=host)
+        except BaseException:
+            served.stop()
+            raise
+        return cls(process, followed, served, f"{seen}:{port}")
+
+    @classmethod
+    def _window(cls, followed: Followed, port: int, logs: Path) -> Viewer:
+        arguments = ["--port", str(port), *_WINDOW, "-"]
+        process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
+        assert process.stdin is not None  # noqa: S101 - it was asked for
+        feed(followed, process.stdin)
+        return cls(process, followed)
 
     def alive(self) -> bool:
         """Whether it still runs; a window may have been closed."""
@@ -155,9 +176,23 @@ class Viewer:
         """Return when it has ended by itself."""
         self._process.wait()
 
+    def complete(self) -> None:
+        """The recording is finished; it stays in view."""
+        self._followed.complete()
+
     def stop(self) -> None:
         """End it, for certain within seconds. Harmless if it has ended."""
+        self._followed.complete()
+        if self._served is not None:
+            self._served.stop()
+            self._served = None
         end(self._process)
+
+
+def _screen_is_remote() -> bool:
+    """Whether the screen is reached over the network, as that of `ssh -X` is, which a window apart could not."""
+    display = os.environ.get("DISPLAY", "")
+    return not os.environ.get("WAYLAND_DISPLAY") and not display.startswith((":", "/", "unix:"))
 
 
 def open_run(run: Path, mode: str, stand: Stand | None = None, recording: Path | None = None) -> Viewer:
@@ -169,87 +204,8 @@ def open_run(run: Path, mode: str, stand: Stand | None = None, recording: Path |
     if not recording.is_file():
         raise UsageError(f"{recording} does not exist; give the results folder of a run made without --view off")
     if stand is not None:
-        return Viewer.serve(stand, run / "logs", [recording])
-    viewer = Viewer.start(mode, run / "logs", [recording])
+        return Viewer.serve(stand, run / "logs", recording, complete=True)
+    viewer = Viewer.start(mode, run / "logs", recording, complete=True)
     if viewer is None:
         raise UsageError("a finished run cannot be opened with --view off; give auto, native or web")
     return viewer
-
-
-def spawn(
-    port: int,
-    arguments: Sequence[str],
-    logs: Path,
-    *,
-    web_port: int | None = None,
-    host: str = _HOST,
-    environment: Mapping[str, str] | None = None,
-) -> subprocess.Popen[bytes]:
-    """Rerun's command with these arguments, listening on a port of `host`; returns when it does, on web_port too.
-
-    Raises UsageError, with the last lines of its log, if it ends before or does not get there in time.
-    """
-    command = [str(executable()), "--bind", host, "--port", str(port), *arguments]
-    if sys.platform == "linux":
-        command = [sys.executable, "-I", "-S", "-c", _GUARD, str(os.getpid()), *command]
-    with _log(logs) as log:
-        start = log.tell()
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
-        )
-        try:
-            if all(_listens(process, host, awaited) for awaited in (port, web_port) if awaited):
-                return process
-        except BaseException:
-            end(process)
-            raise
-        found = f"ended with status {process.poll()}" if process.poll() is not None else "did not get ready"
-        end(process)
-        log.seek(start)
-        last = log.read().decode(errors="replace").strip().splitlines()[-5:]
-    raise UsageError("\n".join([f"the viewer {found}; give --view off to do without. Its last words:", *last]))
-
-
-def end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate a viewer, kill it if it does not listen, and wait for its end."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(_STOP_SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-    process.wait()
-
-
-def executable() -> Path:
-    """Rerun's command. Raises UsageError if rerun-sdk is not installed."""
-    found = importlib.util.find_spec("rerun_cli")
-    if found is None or found.origin is None:
-        raise UsageError("the viewer is not installed; install rerun-sdk, or give --view off")
-    folder = Path(found.origin).parent
-    return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
-
-
-def _listens(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
-    deadline = time.monotonic() + _START_SECONDS
-    while process.poll() is None and time.monotonic() < deadline:
-        with socket.socket() as probe:
-            probe.settimeout(1.0)
-            if probe.connect_ex((host, port)) == 0:
-                return True
-        time.sleep(0.02)
-    return False
-
-
-def _log(logs: Path) -> IO[bytes]:
-    """The log file, or a nameless one if a finished run's folder may not be written to."""
-    try:
-        make_private(logs)
-        return open(logs / "viewer.log", "a+b", opener=private_opener)
-    except OSError:
-        return tempfile.TemporaryFile()

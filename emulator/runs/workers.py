@@ -16,6 +16,7 @@ from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
+from emulator.entry import SIGNALS
 from emulator.errors import EvedropError, RunError, UsageError
 from emulator.model.registry import place_of
 from emulator.runs.environment import own_environment
@@ -71,10 +72,10 @@ class _Worker:
         # process, which would run the caller's script a second time.
         command = f"from emulator.runs.workers import work; work({theirs.fileno()})"
         # Until it can answer to it, our own stop waits: the mask is inherited.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", command],
+                [sys.executable, "-P", "-c", command],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
@@ -157,7 +158,9 @@ def work(descriptor: int) -> None:
     """A worker's life: tasks from its pipe until it is ended, or whoever started it is gone."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    for number in (signal.SIGINT, signal.SIGHUP):  # these reach whoever started us too, who says when to stop
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     with contextlib.suppress(EOFError, OSError), Connection(descriptor) as pipe:
         while True:
             pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))

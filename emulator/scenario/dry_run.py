@@ -6,6 +6,8 @@ Source: docs/your-own.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import astuple
+from functools import partial
 from typing import Any
 
 from emulator.conformance.eavesdroppers import EavesdropperChecks, Listening
@@ -13,14 +15,17 @@ from emulator.conformance.links import DelayChecks, LossChecks
 from emulator.conformance.problems import Problem
 from emulator.conformance.rules import how_broken
 from emulator.conformance.schemes import SchemeChecks
+from emulator.model.answers import NoAnswer
 from emulator.model.delays import DELAY_MODELS, delay_of
-from emulator.model.eavesdroppers import STRATEGIES
+from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
 from emulator.model.links import LOSS_MODELS, loss_of
+from emulator.model.process import Process
 from emulator.model.schemes import SCHEMES, scheme_of
+from emulator.model.schemes.scheme import Scheme
 from emulator.modules import names_in
 from emulator.network.access import LEGITIMATE
 from emulator.scenario.table import model_mistakes
-from emulator.scenario.tables import Scenario
+from emulator.scenario.tables import EavesdropperTable, Scenario
 from emulator.scenario.words import as_toml
 from emulator.streams import Batch
 
@@ -52,14 +57,43 @@ def dry_run(scenario: Scenario) -> list[str]:
         entry = "strategy" if table.reads_as is None else "reads_as"
         if not SCHEMES.foreign(scenario.encoding.scheme) and not STRATEGIES.foreign(getattr(table, entry)):
             continue
-        strategy = STRATEGIES[table.strategy]
-        listening = Listening(
-            table.strategy, strategy, table.parameters, lambda process: scheme_of(process, spec), kind
-        )
-        broken = how_broken(EavesdropperChecks(listening).shapes, problem)
+        broken = _eavesdropper_broken(scenario, table, entry, batch)
         if broken is not None:
             found.append(f"eavesdroppers.{name}.{entry}: is {as_toml(getattr(table, entry))}; in a dry run: {broken}")
     return found
+
+
+def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: str, batch: Batch) -> str | None:
+    """What breaks when an eavesdropper hears the scheme; a class that is not built in is put to work in a process of its own."""
+    spec, name = scenario.encoding.spec, getattr(table, entry)
+    if not STRATEGIES.foreign(name):
+        kind = SCHEMES[scenario.encoding.scheme]
+        strategy = STRATEGIES[table.strategy]
+        make = partial(_scheme, spec)
+        checks = EavesdropperChecks(Listening(table.strategy, strategy, table.parameters, make, kind))
+        return how_broken(checks.shapes, Problem(scenario.process.process, batch))
+    public = scenario.process
+    process = (public.A, public.Q, public.initial_covariance, public.singular_noise)
+    registry = "STRATEGIES" if entry == "strategy" else "READERS"
+    try:
+        found = ANSWERS.ask(name, "dry_run", registry, table.strategy, table.parameters, spec, process, astuple(batch))
+        if found is None:
+            _ask_for_theory(scenario, table)
+    except NoAnswer as error:
+        return str(error)
+    return None if found is None else str(found)
+
+
+def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
+    """Raise NoAnswer if what a class claims of its outcomes is no answer."""
+    outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, scenario.encoding.mu_d)
+    if outcomes_at is not None:
+        for quality in (0.0, 0.5, 1.0):
+            outcomes_at(quality)
+
+
+def _scheme(spec: Mapping[str, Any], process: Process) -> Scheme:
+    return scheme_of(process, spec)
 
 
 def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:

@@ -14,12 +14,12 @@ from pydantic import AfterValidator, ConfigDict, Field
 
 from emulator.model.acknowledgements import ATTACKS
 from emulator.model.controllers import Assignment
-from emulator.model.eavesdroppers import READERS, STRATEGIES
+from emulator.model.eavesdroppers import ANSWERS, READERS, STRATEGIES
 from emulator.model.link import Course
 from emulator.model.plant import Plant
 from emulator.model.registry import asked, is_own
 from emulator.model.schemes import SCHEMES
-from emulator.modules import elsewhere, look_in
+from emulator.modules import elsewhere, look_in, trusted_in
 from emulator.network.access import CONTROLLER, LEGITIMATE
 from emulator.scenario.events import EventTable
 from emulator.scenario.expect import ExpectTable
@@ -251,14 +251,21 @@ class Scenario(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether there is a folder of modules; they are looked for in it from now on, so that entries can name classes."""
+        """Whether there is a folder of modules; they are looked for in it from now on, so that entries can name classes.
+
+        Without a scheme or a link of somebody's own nothing in it is imported here: see `emulator.model.answers`.
+        """
         folder = table.get("modules")
         if not isinstance(folder, str):
             return []
         if not Path(folder).is_dir():
             return [("modules", f'is "{folder}", which is no folder; expected the one that the modules are in')]
-        look_in(str(Path(folder).absolute()))
-        return [("modules", what) for what in elsewhere(folder, table)]
+        absolute = str(Path(folder).absolute())
+        wrong = [("modules", what) for what in elsewhere(absolute, table)]
+        ANSWERS.folder = absolute
+        if any(trusted_in(table)):
+            look_in(absolute)
+        return wrong
 
     @property
     def relayed(self) -> bool:

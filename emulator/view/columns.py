@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
@@ -17,15 +16,6 @@ from emulator.view.events import Event, Watcher
 from emulator.view.lanes import Lane
 from emulator.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
 from emulator.view.scene import PeerSlots, Scene, Slots
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Columns made together, and what every lane held at their first slot, for who missed the batch before."""
-
-    columns: list[Column]
-    opening: list[tuple[str, int, str]]
-    """(path, slot, word)."""
 
 
 class Columns:
@@ -43,16 +33,15 @@ class Columns:
         self._trails = {name: plane.Trail(every) for name in (paths.TRUTH, *(r.name for r in scene.receivers))}
         self._watchers = {shown.name: Watcher(shown, scene) for shown in scene.receivers}
 
-    def of(self, slots: Slots) -> Batch:
+    def of(self, slots: Slots) -> list[Column]:
         """The columns of the next slots."""
         k = np.arange(slots.first, slots.first + slots.count)
         columns: list[Column] = []
-        opening: list[tuple[str, int, str]] = []
         if self._scene.n == 1:
             columns.append(scalars(f"{paths.PLANE}/{paths.TRUTH}", k, slots.x[:, 0]))
         else:
             columns.extend(self._truth(k, slots))
-        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu, slots.sent), columns, opening)
+        self._lane(paths.lane(self._scene, -1), lanes.SENT, k, lanes.sent(slots.nu, slots.sent), columns)
         for i, shown in enumerate(self._scene.receivers):
             peer = slots.peers[shown.name]
             columns.extend(self._curves(shown.name, k, peer))
@@ -62,13 +51,13 @@ class Columns:
             # The legitimate estimator knows every type, and is never misled.
             types = np.zeros_like(slots.nu) if legitimate else slots.nu
             codes = lanes.received(peer.action, types, slots.sent)
-            self._lane(paths.lane(self._scene, i), words, k, codes, columns, opening)
+            self._lane(paths.lane(self._scene, i), words, k, codes, columns)
             events = self._watchers[shown.name].watch(slots.first, codes)
             if events:
                 columns.append(lines(shown.name, events))
         if slots.moved is not None:
             columns.extend(driven.columns(self._scene, k, slots, slots.moved))
-        return Batch(columns, opening)
+        return columns
 
     def _curves(self, name: str, k: NDArray[np.int64], peer: PeerSlots) -> Iterator[Column]:
         curves = ((paths.ERROR, peer.squared_error), (paths.TRACE, peer.trace), (paths.THEORY, peer.expected_trace))
@@ -117,7 +106,6 @@ class Columns:
         k: NDArray[np.int64],
         codes: Codes,
         columns: list[Column],
-        opening: list[tuple[str, int, str]],
     ) -> None:
         before = self._last.get(path)
         changed = np.empty(len(codes), np.bool_)
@@ -125,15 +113,9 @@ class Columns:
         np.not_equal(codes[1:], codes[:-1], out=changed[1:])
         at = np.flatnonzero(changed)
         self._last[path] = int(codes[-1])
-        opening.append((path, int(k[0]), lane.words[codes[0]]))
         if len(at):
             words = [lane.words[code] for code in codes[at].tolist()]
             columns.append(Column(path, k[at], rr.StateChange.columns(state=words)))
-
-
-def opening(batch: Batch) -> list[Column]:
-    """What every lane held when the batch began: for a viewer that missed the batch before."""
-    return [Column(path, np.array([k]), rr.StateChange.columns(state=[word])) for path, k, word in batch.opening]
 
 
 def lines(name: str, events: list[Event]) -> Column:

@@ -5,10 +5,12 @@ Needs a Vulkan driver; software will do, such as Debian's mesa-vulkan-drivers.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,8 +18,9 @@ from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
 from emulator.errors import UsageError
+from emulator.runs.environment import viewer_environment
 from emulator.runs.ports import free_port
-from emulator.runs.viewer import end, spawn
+from emulator.runs.viewer_process import end, guarded, spawn
 from emulator.view.paths import TIMELINE
 
 _LOAD_SECONDS = 60.0
@@ -35,6 +38,40 @@ def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int
         except OSError as error:
             raise UsageError(f"{png} cannot be written ({error.strerror}); give another file") from error
         return reports(viewer)
+
+
+def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
+    """The same by a process of its own, in a network of its own where the system allows that.
+
+    A viewer without a screen draws for whoever finds its port.
+    """
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "emulator.view.picture",
+        str(rrd),
+        str(png),
+        *([] if slot is None else [str(slot)]),
+    ]
+    done = subprocess.run(
+        guarded(command, apart=True), capture_output=True, text=True, check=False, env=dict(viewer_environment())
+    )
+    if done.returncode:
+        raise UsageError(done.stderr.strip() or f"the process that draws ended with status {done.returncode}")
+    return done.stdout.splitlines()
+
+
+def main(words: Sequence[str]) -> int:
+    """Draw what `picture_apart` asks for; the exit status."""
+    rrd, png, *slot = words
+    try:
+        for complaint in picture(Path(rrd), Path(png), slot=int(slot[0]) if slot else None):
+            print(complaint)  # noqa: T201 - whoever has started us reads it
+    except UsageError as error:
+        print(error, file=sys.stderr)  # noqa: T201 - the same
+        return error.exit_status
+    return 0
 
 
 def reports(viewer: ViewerClient) -> list[str]:
@@ -68,7 +105,8 @@ def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterato
     """
     check(rrd)
     port = free_port()
-    arguments = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen", str(rrd.resolve())]
+    shown = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen", str(rrd.resolve())]
+    arguments = ["--headless", "--port", str(port), *shown]
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder)
         try:
@@ -116,3 +154,7 @@ def _without_driver(log: str) -> str | None:
     if "graphics adapter" not in log and "render context" not in log:
         return None
     return "no Vulkan driver to draw with; install one, on Debian: apt-get install mesa-vulkan-drivers"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,16 +1,12 @@
-"""The recording of a run: a file, and the same live to a viewer, neither of which can hold the run up.
+"""The recording of a run: a file, which cannot hold the run up.
 
-Rerun may block, for seconds or for ever, when a viewer is slow, hung or gone. So the run only ever appends to a list: one
-thread turns slots into columns and writes the file, another hands the same columns to the viewer from a bounded queue
-and leaves out what does not fit.
+Rerun may block when a disk is slow or full. So the run only ever appends to a list, and a thread turns slots into columns
+and writes the file. Viewers read it as it grows; the run knows nothing of them.
 """
 
 from __future__ import annotations
 
-import contextlib
-import queue
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +15,8 @@ import rerun as rr
 from emulator.model.receiver import Flags
 from emulator.runs.folder import private_file
 from emulator.view.blueprint import layout
-from emulator.view.columns import Batch, Columns, lines, log_styles, opening
+from emulator.view.column import Column
+from emulator.view.columns import Columns, lines, log_styles
 from emulator.view.events import Event, introduction
 from emulator.view.paths import NOTES
 from emulator.view.scene import Moved, PeerSlots, Scene, Shown, Slots
@@ -31,20 +28,12 @@ _PERIOD = 0.1  # seconds from one batch to the next, so that a batch is worth it
 _MOST_SLOTS = 1024  # in a batch
 _MOST_WAITING = 20_000  # slots the file may be behind, before the run waits for it
 _FILE_TIMEOUT = 5.0  # seconds the run waits for the file, before it goes on without one
-_LIVE_BATCHES = 20
-_LIVE_TIMEOUT = 1.0
 
 
 class Recording:
-    """Writes the recording of one run to `path`, and shows it in the viewer at `live`, if there is one.
+    """Writes the recording of one run to `path`. Final; nothing here raises because of the disk: see `failure`."""
 
-    Final. `live` is a viewer's gRPC address such as "rerun+http://127.0.0.1:9876/proxy". Nothing here raises because
-    of a viewer or of the disk: see `dropped` and `failure`.
-    """
-
-    def __init__(self, path: Path, scene: Scene, live: str | None) -> None:
-        self.dropped = 0
-        """Batches the viewer was too slow for. They are in the file."""
+    def __init__(self, path: Path, scene: Scene) -> None:
         self.failure: str | None = None
         """Why there is no recording on disk, or an incomplete one."""
         self._scene = scene
@@ -60,7 +49,6 @@ class Recording:
             log_styles(self._file, scene)
         except Exception as error:
             self._give_up(str(error))
-        self._live = _Live(scene, live) if live else None
         self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
         self._writer.start()
 
@@ -73,7 +61,7 @@ class Recording:
                 in_time = self._changed.wait_for(lambda: self._waiting_slots <= _MOST_WAITING, _FILE_TIMEOUT)
                 if not in_time:
                     self._give_up("the disk did not keep up with the run")
-            if self.failure is None or self._live is not None:
+            if self.failure is None:
                 self._waiting.append(slots)
                 self._waiting_slots += slots.count
                 self._changed.notify_all()
@@ -84,7 +72,7 @@ class Recording:
             self._notes.append(Event(k, level, text))
 
     def close(self) -> bool:
-        """Finish the file, then the viewer's stream, each within a time limit.
+        """Finish the file, within a time limit.
 
         True if the interpreter can now exit normally. If not, Rerun hangs, and only os._exit ends the process.
         """
@@ -94,8 +82,7 @@ class Recording:
         self._writer.join(_FILE_TIMEOUT)
         if self._writer.is_alive():
             self._give_up("the disk did not keep up with the run")
-        live_ended = self._live.close() if self._live else True
-        return live_ended and self.failure is None
+        return self.failure is None
 
     def _give_up(self, why: str) -> None:
         if self.failure is None:
@@ -120,84 +107,19 @@ class Recording:
 
     def _put(self, chunks: list[Slots], notes: list[Event]) -> None:
         columns = [lines(NOTES, notes)] if notes else []
-        batch = self._columns.of(_joined(chunks)) if chunks else Batch([], [])
-        batch = Batch([*batch.columns, *columns], batch.opening)
-        if not batch.columns:
-            return
-        if self.failure is None:
-            self._save(batch)
-        if self._live is not None and not self._live.offer(batch):
-            self.dropped += 1
+        if chunks:
+            columns = [*self._columns.of(_joined(chunks)), *columns]
+        if columns and self.failure is None:
+            self._save(columns)
 
-    def _save(self, batch: Batch) -> None:
-        for column in batch.columns:
+    def _save(self, columns: list[Column]) -> None:
+        for column in columns:
             column.send(self._file)
         try:
             # Rerun tells of a file it can no longer write only by never finishing.
             self._file.flush(timeout_sec=_FILE_TIMEOUT)
         except RuntimeError:
             self._give_up("the file could not be written")
-
-
-class _Live:
-    """The viewer's stream, in a thread of its own: everything in it may block for ever."""
-
-    def __init__(self, scene: Scene, url: str) -> None:
-        self._scene = scene
-        self._url = url
-        self._batches: queue.Queue[tuple[Batch, bool] | None] = queue.Queue(_LIVE_BATCHES)
-        self._missed = False
-        self._gone = False
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
-        self._thread.start()
-
-    def offer(self, batch: Batch) -> bool:
-        """Queue a batch; False if it was left out, because the viewer is slow. If it is gone, nothing is missed."""
-        if self._gone:
-            return True
-        try:
-            self._batches.put_nowait((batch, self._missed))
-        except queue.Full:
-            self._missed = True
-            return False
-        self._missed = False
-        return True
-
-    def close(self) -> bool:
-        """Whether the stream ended in time."""
-        deadline = time.monotonic() + _LIVE_TIMEOUT
-        with contextlib.suppress(queue.Full):
-            self._batches.put(None, timeout=_LIVE_TIMEOUT)
-        self._closing.set()
-        self._thread.join(max(0.1, deadline - time.monotonic()))
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        stream = _stream(self._scene)
-        stream.connect_grpc(self._url, default_blueprint=layout(self._scene))
-        log_styles(stream, self._scene)
-        while (item := self._batches.get()) is not None:
-            batch, missed = item
-            for column in [*(opening(batch) if missed else []), *batch.columns]:
-                column.send(stream)
-            if not self._arrived(stream):
-                self._gone = True
-                break
-        stream.disconnect()
-
-    def _arrived(self, stream: rr.RecordingStream) -> bool:
-        """Wait until the viewer has taken everything, so that Rerun never holds more than a batch; False if it is gone."""
-        while True:
-            begun = time.monotonic()
-            try:
-                stream.flush(timeout_sec=_LIVE_TIMEOUT)
-            except RuntimeError:
-                # A viewer that is merely slow uses up the time; one that is gone is known at once.
-                if self._closing.is_set() or time.monotonic() - begun < _LIVE_TIMEOUT / 2:
-                    return False
-            else:
-                return True
 
 
 def _stream(scene: Scene) -> rr.RecordingStream:

@@ -45,7 +45,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     if showing is not None and len(inputs) != len(x):
         raise UsageError(f"{folder}: inputs.parquet has not the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
-    recording = open_recording(scenario, folder.name, path, None)
+    recording = open_recording(scenario, folder.name, path)
     for first in range(0, len(x), _CHUNK):
         rows = slice(first, min(first + _CHUNK, len(x)))
         deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}

@@ -9,6 +9,7 @@ import signal
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 from tests.faults.disturbed import Disturbed
@@ -96,9 +97,20 @@ def _process(fault: Fault, run: Disturbed) -> list[int]:
     return _awaited(lambda: run.pids(fault.target, fault.shard), run)
 
 
+def _heeds(pid: int) -> bool:
+    """Whether a process has come to the first line of ours, which has it heed signals: what Python did before is not a run's."""
+    with suppress(OSError, StopIteration):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
+        return bool(caught >> (signal.SIGTERM - 1) & 1)
+    return False
+
+
 def _send(number: signal.Signals) -> Callable[[Fault, Disturbed], bool]:
     def strike(fault: Fault, run: Disturbed) -> bool:
         hit = False
+        if fault.target == "launcher" and fault.kind in SIGNALS:
+            _awaited(lambda: [True] if _heeds(run.launcher.pid) else [], run)
         for pid in _process(fault, run):
             with suppress(ProcessLookupError):
                 os.kill(pid, number)

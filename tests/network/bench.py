@@ -19,6 +19,7 @@ import zenoh
 
 from emulator.brief import Brief, Flow
 from emulator.network.access import Keys
+from emulator.network.envelope import enclosed, payload_of
 from emulator.network.session import client_config
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.runs.ports import free_port, loopback_places
@@ -61,14 +62,16 @@ def scenario_of(**changes: Any) -> Scenario:
 
 @dataclass
 class Ear:
-    """What arrived at one subscription, in order."""
+    """What arrived at one subscription, in order; without its envelope, if it has one."""
 
     messages: SimpleQueue[Message] = field(default_factory=SimpleQueue)
 
     def __call__(self, sample: zenoh.Sample) -> None:
         """Take what Zenoh hands over, on its thread."""
         kind = "" if sample.kind == zenoh.SampleKind.PUT else "deleted "
-        self.messages.put((kind + str(sample.key_expr), sample.payload.to_bytes()))
+        key, message = str(sample.key_expr), sample.payload.to_bytes()
+        payload = payload_of(key, message)
+        self.messages.put((kind + key, message if payload is None else payload))
 
     def hear(self) -> Message:
         """The next message."""
@@ -96,7 +99,7 @@ class Bench:
     """A router process, and sessions with everybody else's credentials in the test's hands."""
 
     def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
-        observation = Observation(folder / "results", False, None)
+        observation = Observation(folder / "results", False)
         listen = f"{protocol}/127.0.0.1:{free_port()}"
         places = loopback_places(listen, None, scenario.relayed)
         made = briefs_of(scenario, places, observation, ends_with_stdin=False)
@@ -155,7 +158,7 @@ class Bench:
             publisher = self.sessions[process].declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
             until(lambda: publisher.matching_status.matching, f"a reader of {key}")
             self._publishers[process, key] = publisher
-        self._publishers[process, key].put(payload)
+        self._publishers[process, key].put(enclosed(key, payload))
 
     def settle(self, process: str) -> None:
         """Return when the router has dealt with everything that a process put and asked for before."""

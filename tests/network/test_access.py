@@ -20,6 +20,7 @@ from bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, unt
 
 from emulator.network import packets, telemetry, wire
 from emulator.network.access import Grant, access_control, grants
+from emulator.network.envelope import enclosed
 
 EVE = "eve"
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -118,7 +119,7 @@ def attacking(stage: Bench, mode: str) -> Iterator[zenoh.Session]:
     key = stage.keys.telemetry(EVE)
 
     def knock(attacker: zenoh.Session) -> bool:
-        attacker.put(key, b"knock")
+        attacker.put(key, enclosed(key, b"knock"))
         return not stage.telemetry[EVE].messages.empty()
 
     with ExitStack() as stack:
@@ -135,8 +136,8 @@ def attacking(stage: Bench, mode: str) -> Iterator[zenoh.Session]:
 def assert_heard(stage: Bench, attacker: zenoh.Session) -> None:
     """What the attacker may put arrives, so the router has dealt with all that it put and asked for before."""
     block = zenoh.CongestionControl.BLOCK
-    attacker.put(stage.keys.progress(EVE), b"mine", congestion_control=block)
-    attacker.put(stage.keys.telemetry(EVE), b"mine", congestion_control=block)
+    attacker.put(stage.keys.progress(EVE), enclosed(stage.keys.progress(EVE), b"mine"), congestion_control=block)
+    attacker.put(stage.keys.telemetry(EVE), enclosed(stage.keys.telemetry(EVE), b"mine"), congestion_control=block)
     assert stage.progress[EVE].hear() == (stage.keys.progress(EVE), b"mine")
     while (found := stage.telemetry[EVE].hear()) != (stage.keys.telemetry(EVE), b"mine"):
         assert found == (stage.keys.telemetry(EVE), b"knock")
@@ -209,7 +210,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
     with attacking(stage, mode) as attacker:
         for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:
             for payload in payloads if key not in own else ():
-                attacker.put(key, payload, congestion_control=block)
+                attacker.put(key, enclosed(key, payload), congestion_control=block)
             attacker.delete(key, congestion_control=block)
         assert_heard(stage, attacker)
     talk(stage)
@@ -298,7 +299,7 @@ def test_eavesdropper_has_no_part_in_the_loop(acts_on: str, tmp_path: Path) -> N
         for name in ("sensor", "legitimate") if link["knows_input"] else ("sensor",):
             assert inputs[name].hear() == (keys.input, b"decided")
         for key in (*loop, f"evedrop/{keys.run}/*", "**"):
-            attacker.put(key, b"false", congestion_control=zenoh.CongestionControl.BLOCK)
+            attacker.put(key, enclosed(key, b"false"), congestion_control=zenoh.CongestionControl.BLOCK)
         assert_heard(bench, attacker)
         bench.put("controller", keys.input, b"again")
         assert inputs["sensor"].hear() == (keys.input, b"again")

@@ -6,9 +6,18 @@ A rogue is a real process of the run, with its own brief and credentials, in whi
 from __future__ import annotations
 
 import re
+import signal
+import subprocess
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
+from emulator.errors import MalformedMessage
+from emulator.network.wire import Reader, read_refusal, refusal
+from emulator.runs.ports import free_port
+from emulator.scenario import load
+from tests.by_hand import by_hand
 from tests.conftest import Evedrop, Live
 from tests.rogue import with_rogue
 
@@ -113,3 +122,151 @@ def test_what_is_verified_and_what_is_not(evedrop: Evedrop) -> None:
     assert done.summary["verification"]["smart"]["own_word"] == ["used_fraction"]
     in_memory = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "4", "--json")
     assert in_memory.summary["verification"] is None
+
+
+HANG = """
+import threading
+def hang(): threading.Event().wait()
+"""
+RECEIVER = """
+from emulator.network.reporting import BeliefReporter
+def add(self, k, *rest, honest=BeliefReporter.add): hang() if k == SLOT else honest(self, k, *rest)
+BeliefReporter.add = add
+"""
+SENSOR = """
+import peers.sensor as sensor
+def sent(k, z, honest=sensor.uplink, **rest): return hang() if k == SLOT else honest(k, z, **rest)
+sensor.uplink = sent
+"""
+ROUTER = """
+import emulator.network.router as router
+def read(message, k, shape, honest=router.read_uplink): return hang() if k == SLOT else honest(message, k, shape)
+router.read_uplink = read
+"""
+CONTROLLER = """
+import peers.controller as controller
+def told(k, u, failed, honest=controller.decided): return hang() if k >= SLOT else honest(k, u, failed)
+controller.decided = told
+"""
+SILENT = {
+    "a receiver in the middle": ("eavesdroppers", "smart", RECEIVER.replace("SLOT", "300")),
+    "a receiver from the first slot on": ("eavesdroppers", "smart", RECEIVER.replace("SLOT", "0")),
+    "the legitimate estimator, whose acknowledgements are waited for": (
+        "acknowledged", "legitimate", RECEIVER.replace("SLOT", "20")
+    ),
+    "the sensor": ("eavesdroppers", "sensor", SENSOR.replace("SLOT", "300")),
+    "the router": ("eavesdroppers", "router", ROUTER.replace("SLOT", "300")),
+    "the controller": ("microgrid", "controller", CONTROLLER.replace("SLOT", "120")),
+}  # fmt: skip
+"""Who is silent → in which scenario, its name, and how."""
+
+
+@pytest.mark.parametrize(
+    "what", [one if one == "a receiver in the middle" else pytest.param(one, marks=pytest.mark.long) for one in SILENT]
+)
+def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str) -> None:
+    """It keeps its connection and its token, and its loop stands still: the run ends, and says who it was that all waited for."""
+    scenario, name, does = SILENT[what]
+    rogue = with_rogue(evedrop, name, HANG + does)
+    live = evedrop.live(scenario, "--pace", "0", "--set", "longest_outage=2", env=rogue)
+    done = live.end()
+    assert done.status == 3, done.err
+    assert done.err.startswith(f"evedrop: {name}: alive, and silent for "), done.err
+    assert f"logs/{name}.log" in done.err
+    live.nothing_left()
+
+
+@pytest.mark.long
+def test_an_operator_may_pause_for_longer_than_an_outage(evedrop: Evedrop) -> None:
+    """Nobody is silent in a run that is held."""
+    live = evedrop.live("eavesdroppers", "--pace", "0.001", "--slots", "20000", "--set", "longest_outage=2")
+    live.running()
+    assert evedrop("pause", "run").status == 0
+    with pytest.raises(subprocess.TimeoutExpired):
+        live.process.wait(12.0)
+    assert evedrop("resume", "run").status == 0
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+
+
+PROGRESS = {
+    "no message": ("b''", "not msgpack"),
+    "beyond what was sent": ("pack({'k': 10**9})", r"k = 1000000000; expected an integer k from 0 to \d+"),
+}
+"""What a receiver says of its progress → how, and what is said of it."""
+
+
+@pytest.mark.parametrize("what", ["beyond what was sent", pytest.param("no message", marks=pytest.mark.long)])
+def test_malformed_progress_is_its_senders(evedrop: Evedrop, what: str) -> None:
+    """The sensor refuses it, and the run ends with the name of the receiver that sent it, not with the sensor's."""
+    does, said = PROGRESS[what]
+    rogue = with_rogue(evedrop, "naive", f"reporting.progress = lambda k: {does}")
+    done = evedrop.live("eavesdroppers", "--slots", "100000", env=rogue).end()
+    assert done.status == 3
+    first = done.err.splitlines()[0]
+    assert re.match(
+        rf"evedrop: naive broke the protocol: malformed message on evedrop/\w+/progress/naive: {said}", first
+    ), first
+    assert "logs/naive.log" in done.err
+
+
+def test_the_sender_is_named_where_everybody_is_started_by_hand(
+    evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sensor, on another host perhaps, tells the observer what it refuses before it ends, so the sender is named."""
+    rogue = with_rogue(evedrop, "naive", "reporting.progress = lambda k: pack({'k': 10**9})")
+    monkeypatch.setenv("PYTHONPATH", rogue["PYTHONPATH"])
+    scenario = load("eavesdroppers", {"slots": 100_000})
+    with by_hand(scenario, evedrop.folder, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        assert run.statuses()["observer"] == 3
+        said = run.summary["ended"]
+    assert re.match(
+        r"malformed message on evedrop/\w+/progress/naive: k = 1000000000; .*Check that naive speaks", said
+    ), said
+    assert said.endswith("(refused by sensor)")
+
+
+def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
+    """A refusal must be of a key that the process reads, in its own run; and what it says is shown without control characters."""
+    reader = Reader("evedrop/r1/telemetry/naive", refusal("evedrop/r1/uplink", "x"))
+    with pytest.raises(MalformedMessage, match="a key that naive reads"):
+        read_refusal(reader, "naive")
+    reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r2/progress/naive", "x"))
+    with pytest.raises(MalformedMessage, match="a key that sensor reads"):
+        read_refusal(reader, "sensor")
+    reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r1/progress/naive", "\x1b[2Jx\n"))
+    found = read_refusal(reader, "sensor")
+    assert found.at_fault == ("naive",)
+    assert str(found) == "malformed message on evedrop/r1/progress/naive: ?[2Jx? (refused by sensor)"
+
+
+BOMB = """
+from emulator.network.reporting import BeliefReporter
+def add(self, k, *rest, honest=BeliefReporter.add):
+    if k % 500 == 0:
+        for _ in range(5):
+            self._put(k, bytes([0xdd, 0, 0x98, 0x96, 0x80]) + bytes([0x90]) * 10**7)
+            self._put_progress(k, bytes([0x90]) * 10**7)
+    honest(self, k, *rest)
+BeliefReporter.add = add
+"""
+
+
+def test_messages_of_megabytes_harm_nobody(evedrop: Evedrop) -> None:
+    """What is larger than any message of the run the router drops; the run goes on to its end, and nobody grows by it."""
+    live = evedrop.live("eavesdroppers", "--slots", "1200", "--json", env=with_rogue(evedrop, "naive", BOMB))
+    largest = dict.fromkeys(("observer", "sensor", "router"), 0.0)
+    while live.process.poll() is None:
+        for name, pid in live.children().items():
+            with suppress(OSError, IndexError):
+                peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+                if name in largest and peak is not None:
+                    largest[name] = max(largest[name], int(peak[1]) / 1000)
+    done = live.end()
+    assert done.status in {0, 1}, done.err
+    assert done.summary["slots"] == 1200
+    assert 0.0 < largest["observer"] < 500.0
+    assert 0.0 < largest["sensor"] < 200.0
+    assert 0.0 < largest["router"] < 250.0

@@ -168,7 +168,7 @@ def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:
     """A brief of another run says whose router it found, within seconds."""
-    other = briefs_of(stage.scenario, stage.briefs[EVE].router, Observation(Path("nowhere"), False, None))[EVE]
+    other = briefs_of(stage.scenario, stage.briefs[EVE].router, Observation(Path("nowhere"), False))[EVE]
     with pytest.raises(BriefError) as caught:
         connected(door_of(other), 60.0)
     assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)
@@ -195,9 +195,7 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
 
 def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
     """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
-    made = briefs_of(
-        scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
-    )
+    made = briefs_of(scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), Observation(tmp_path, False))
     texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
     keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
     assert len(set(keys.values())) == len(made)
@@ -219,9 +217,7 @@ def certificate_of(brief: Brief) -> x509.Certificate:
 
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
-    made = briefs_of(
-        scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False, None)
-    )
+    made = briefs_of(scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False))
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]
     assert [str(one) for one in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]

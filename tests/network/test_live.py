@@ -22,6 +22,7 @@ from emulator import montecarlo
 from emulator.brief import Brief, read_brief
 from emulator.network import packets, wire
 from emulator.network.access import Keys
+from emulator.network.envelope import enclosed
 from emulator.runs.briefs import StreamKeys
 from emulator.runs.results import load_results
 from emulator.scenario import Scenario, load
@@ -132,7 +133,7 @@ def disturb(eve: Brief, keys: Keys) -> None:
                 continue
             attacker.declare_queryable(key, lambda query: query.reply(query.key_expr, b"\xc1"))
             for payload in (wire.control("end"), wire.progress(10**9), packets.uplink(0, np.zeros((2, 3))), b"\xc1"):
-                attacker.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+                attacker.put(key, enclosed(key, payload), congestion_control=zenoh.CongestionControl.BLOCK)
             attacker.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
             if key.rpartition("/")[2] in PROCESSES and "/alive/" in key:
                 attacker.liveliness().declare_token(key).undeclare()
@@ -143,8 +144,9 @@ def processes_of(pid: int) -> dict[str, int]:
     found = {}
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         arguments = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
-        if arguments[1:3] == [b"-m", b"emulator"] and arguments[4].endswith(b".json"):
-            found[Path(arguments[4].decode()).stem] = int(child)
+        *options, path, _ = arguments if len(arguments) > 1 else (b"", b"")
+        if b"emulator" in options and path.endswith(b".json"):
+            found[Path(path.decode()).stem] = int(child)
     return found
 
 

@@ -18,6 +18,7 @@ from emulator.brief import Brief
 from emulator.control import Control
 from emulator.errors import MalformedMessage
 from emulator.network.access import Keys
+from emulator.network.envelope import enclosed, payload_of
 from emulator.network.operator import Answer, Request, ask, read_request
 from emulator.network.wire import pack
 
@@ -52,8 +53,9 @@ def answering(stage: Bench) -> Iterator[list[bytes]]:
     key, asked = stage.keys.control("observer"), list[bytes]()
 
     def answer(query: zenoh.Query) -> None:
-        asked.append(query.payload.to_bytes() if query.payload is not None else b"")
-        query.reply(key, Answer(7, "yes").pack())
+        message = query.payload.to_bytes() if query.payload is not None else b""
+        asked.append(payload_of(key, message) or message)
+        query.reply(key, enclosed(key, Answer(7, "yes").pack()))
         query.drop()
 
     queryable = stage.sessions["observer"].declare_queryable(key, answer)
@@ -71,8 +73,10 @@ def attempts(stage: Bench) -> list[str]:
 
 def replies(session: zenoh.Session, key: str) -> list[bytes]:
     """What a question at a key brings, but for what a session says of itself."""
-    found = [reply.ok for reply in session.get(key, payload=Request("pause").pack(), timeout=PATIENCE) if reply.ok]
-    return [one.payload.to_bytes() for one in found if not str(one.key_expr).startswith("@/")]
+    question = enclosed(key, Request("pause").pack())
+    found = [reply.ok for reply in session.get(key, payload=question, timeout=PATIENCE) if reply.ok]
+    answers = [(str(one.key_expr), one.payload.to_bytes()) for one in found]
+    return [payload_of(key, message) or message for key, message in answers if not key.startswith("@/")]
 
 
 def test_the_operator_is_answered(stage: Bench) -> None:

@@ -17,6 +17,7 @@ from emulator.brief import Brief
 from emulator.errors import UsageError
 from emulator.network import packets, wire
 from emulator.network.access import RELAY, Grant, Keys, access_control, grants
+from emulator.network.envelope import enclosed
 from emulator.network.health import is_there
 from emulator.network.linked import at_relay, at_router
 from emulator.network.session import client_config
@@ -94,8 +95,9 @@ def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> N
             *(keys.control(name) for name in ("sensor", "router", "relay", "legitimate")),
             *(keys.telemetry(name) for name in ("sensor", "legitimate")),
         ):
-            attacker.put(key, wire.control("end"), congestion_control=zenoh.CongestionControl.BLOCK)
-        attacker.put(keys.telemetry(EVE), b"mine", congestion_control=zenoh.CongestionControl.BLOCK)
+            attacker.put(key, enclosed(key, wire.control("end")), congestion_control=zenoh.CongestionControl.BLOCK)
+        mine = enclosed(keys.telemetry(EVE), b"mine")
+        attacker.put(keys.telemetry(EVE), mine, congestion_control=zenoh.CongestionControl.BLOCK)
         assert stage.telemetry[EVE].hear() == (keys.telemetry(EVE), b"mine")
     flow(stage)
     for ears in (stage.controls, stage.progress, stage.telemetry):

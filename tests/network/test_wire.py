@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,8 +22,10 @@ from emulator.model.links.link import REASONS
 from emulator.model.receiver import Belief, Heard
 from emulator.model.transit import Late
 from emulator.network import packets, telemetry, wire
+from emulator.network.access import writer_of
 from emulator.network.wire import Reader
 from emulator.runs.joined import Joiner
+from tests.network.readers import EXAMPLES, READERS, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)
@@ -67,7 +71,7 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
                 data.draw(arrays(float, (n, trials), elements=FINITE)),
             ),
         )
-        for _ in range(count)
+        for _ in range(min(count, 2 * (k + 1)))
     )
     raw = packets.delivery(k, bytes((trials + 7) // 8), b"", late)
     heard, found = packets.read_delivery(Reader("d", raw), k, (n, trials))
@@ -191,51 +195,84 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
         assert link.late is None or np.array_equal(found.links[name].late, link.late)
 
 
-READERS = {
-    "packet": lambda raw: packets.read_uplink(Reader("key", raw), 0, (2, 3)),
-    "mark": lambda raw: packets.is_hold(Reader("key", raw)) and Reader("key", raw).slot(0),
-    "delivery": lambda raw: packets.read_delivery(Reader("key", raw), 0, (2, 3)),
-    "progress": lambda raw: wire.read_progress("key", raw, 9),
-    "control": lambda raw: Reader("key", raw).text("do"),
-    "go": lambda raw: (Reader("key", raw).names("absent"), Reader("key", raw).integer("until")),
-    "change": lambda raw: (
-        Reader("key", raw).text("link"),
-        Reader("key", raw).map("settings"),
-        Reader("key", raw).flag("cut"),
-    ),
-    "truth": lambda raw: telemetry.read_truth(Reader("key", raw), 0, extent(2, 3)),
-    "report": lambda raw: telemetry.read_report(Reader("key", raw), 0, extent(2, 3), Blocks(9, [2]), 1),
-    "leaving": lambda raw: telemetry.read_leaving(Reader("key", raw), extent(2, 3)),
-    "journal": lambda raw: telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3)),
+def refused(read: Callable[[bytes], Any], raw: bytes) -> MalformedMessage | Gap | None:
+    """How a reader refuses a message; None if it takes it."""
+    try:
+        read(raw)
+    except (MalformedMessage, Gap) as error:
+        return error
+    return None
+
+
+def parts() -> st.SearchStrategy[Any]:
+    """Anything that msgpack can carry, with the lengths of arrays that readers expect among the bytes."""
+    names = sorted({field for name in EXAMPLES for field in fields_of(name)})
+    leaves = st.one_of(
+        st.integers(-(2**63), 2**64 - 1),
+        st.sampled_from([None, True, 0.5, float("nan"), "", "start", "eve", "evedrop/r1/uplink"]),
+        st.sampled_from([0, 1, 2, 3, 4, 6, 8, 16, 24, 48, 96, 192, 256]).map(bytes),
+        st.sampled_from([1, 6, 12, 24, 48, 96]).map(lambda size: b"\xff" * size),
+        st.binary(max_size=9),
+    )
+    keys = st.one_of(st.sampled_from([*names, *REASONS, "eve", "legitimate", "lost", "bursts"]), st.integers(-1, 2**63))
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(keys, inner, max_size=4)),
+        max_leaves=8,
+    )
+
+
+@settings(deadline=None, max_examples=400)
+@given(st.data(), st.sampled_from(sorted(READERS)))
+def test_anything_else_is_an_error_of_ours(data: st.DataObject, name: str) -> None:
+    """Whatever arrives, a reader gives values or raises one of the two errors of messages, which names the key and its writer."""
+    key, read = READERS[name]
+    fields = fields_of(name)
+    for field in data.draw(st.sets(st.sampled_from(sorted(fields)), max_size=2)):
+        fields[field] = data.draw(parts())
+    for field in data.draw(st.sets(st.sampled_from(sorted(fields)), max_size=1)):
+        del fields[field]
+    raw = data.draw(st.one_of(st.just(msgpack.packb(fields)), st.binary(max_size=60), parts().map(msgpack.packb)))
+    error = refused(read, raw)
+    assert error is None or key in str(error)
+    assert error is None or error.at_fault == (writer_of(key),)
+    assert error is None or len(str(error)) < 1500
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_examples_are_read(name: str) -> None:
+    """The message that a reader's fuzzing begins with is one that it takes, and without any one byte it is not another error."""
+    assert READERS[name][1](EXAMPLES[name]) is not None
+    for place in range(len(EXAMPLES[name])):
+        with contextlib.suppress(MalformedMessage, Gap):
+            READERS[name][1](EXAMPLES[name][:place] + EXAMPLES[name][place + 1 :])
+
+
+BOMBS = {
+    "a list of lists": b"\xdd\x00\x98\x96\x80" + b"\x90" * 10**7,
+    "a list of maps in a map": b"\x81\xa1k\xdd\x00\x98\x96\x80" + b"\x80" * 10**7,
+    "lists one after the other": b"\x90" * 10**7,
+    "lists of lists of lists": b"\x81\xa1k"
+    + b"\xdc\x01\x00"
+    + (b"\xdc\x01\x00" + (b"\x9f" + b"\x90" * 15) * 256) * 256,
+    "a long list that is cut": b"\xdd\xff\xff\xff\xff",
+    "a long text that is cut": b"\x81\xa1k\xdb\xff\xff\xff\xff",
+    "lists without an end": b"\x91" * 10**6,
 }
-FIELDS = ("k", "c", "z", "x", "nu", "gamma", "late", "x_hat", "action", "P", "trace", "digests", "links", "do", "absent",
-          "until", "link", "settings", "cut", "hold")  # fmt: skip
-LINK = st.dictionaries(
-    st.sampled_from(["delivered", "lost", "late", "bursts", "delays"]),
-    st.one_of(st.just(1), st.binary(max_size=9), st.dictionaries(st.sampled_from(REASONS), st.just(bytes(4)))),
-)
-VALUES = st.one_of(
-    st.integers(-3, 2**63 - 1),
-    st.sampled_from([None, True, 0.5, "", "start", [], {}, float("nan")]),
-    st.sampled_from([0, 1, 4, 6, 8, 16, 24, 48, 80]).map(bytes),
-    st.binary(max_size=9),
-    st.dictionaries(st.sampled_from(["a", "b", 0]), st.one_of(LINK, st.just(bytes(96))), max_size=3),
-    st.lists(
-        st.dictionaries(st.sampled_from(["k", "gamma", "z"]), st.sampled_from([0, 1, b"\1", bytes(16)])), max_size=2
-    ),
-)
+"""Messages of some megabytes that are much larger once they are read."""
 
 
-@settings(deadline=None)
-@given(
-    st.sampled_from(sorted(READERS)),
-    st.one_of(st.binary(max_size=60), st.dictionaries(st.sampled_from(FIELDS), VALUES)),
-)
-def test_anything_else_is_an_error_of_ours(name: str, raw: bytes | dict[str, object]) -> None:
-    """Whatever arrives, a reader gives values or raises one of the two errors of messages: no other gets through."""
-    payload = raw if isinstance(raw, bytes) else msgpack.packb(raw)
-    with contextlib.suppress(MalformedMessage, Gap):
-        READERS[name](payload)
+@pytest.mark.parametrize("what", BOMBS)
+def test_a_large_message_is_refused_before_it_is_larger(what: str) -> None:
+    """However it is made, reading it takes some megabytes more than it has at most, and the error shows a part of it alone."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(MalformedMessage, match="not msgpack") as found:
+            Reader("evedrop/r1/telemetry/eve", BOMBS[what])
+        assert tracemalloc.get_traced_memory()[1] < 4e6 + (len(BOMBS[what]) if "after" in what else 0)
+    finally:
+        tracemalloc.stop()
+    assert len(str(found.value)) < 1000
 
 
 def test_errors_say_what_was_found_where_and_what_to_do() -> None:
@@ -267,7 +304,7 @@ def test_a_journal_without_a_receiver_is_refused() -> None:
     """Every receiver must be in every journal message."""
     raw = telemetry.Journal(0, 1, {"a": account_of(np.ones((1, 3), bool))}).pack()
     with pytest.raises(MalformedMessage, match="b = None; expected a map b"):
-        READERS["journal"](raw)
+        telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3))
 
 
 @pytest.mark.parametrize("reasons", [[], ["eaten"], ["lost", "eaten"]])
@@ -278,7 +315,7 @@ def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
     with pytest.raises(
         MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['corrupted', 'cut', 'down', "
     ):
-        READERS["journal"](raw)
+        telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3))
 
 
 TELEMETRY = {

@@ -155,8 +155,11 @@ class Estimator:
         self.rows = []
 
     def receive(self, payload):
+        """A recorded delivery: step all trials."""
+        self.take(msgpack.unpackb(payload))
+
+    def take(self, message):
         """A delivery: step all trials."""
-        message = msgpack.unpackb(payload)
         k = message["k"]
         if k != self.due:
             raise ValueError(f"slot {k} arrived, slot {self.due} was due")
@@ -253,18 +256,31 @@ def take_part(brief):
         block = {"congestion_control": zenoh.CongestionControl.BLOCK}
         telemetry = session.declare_publisher(under + f"telemetry/{name}", **block)
         progress = session.declare_publisher(under + f"progress/{name}", **block)
+
+        def put(publisher, message):
+            publisher.put(msgpack.packb(str(publisher.key_expr)) + message)
+
+        def received(subscriber):
+            """The next message on a subscriber's key; what names another key is dropped."""
+            while True:
+                unpacker = msgpack.Unpacker()
+                unpacker.feed(subscriber.recv().payload.to_bytes())
+                if unpacker.unpack() == str(subscriber.key_expr):
+                    return unpacker.unpack()
+
         while not (telemetry.matching_status.matching and progress.matching_status.matching):
             time.sleep(0.005)
         token = session.liveliness().declare_token(under + f"alive/{name}")
         for k in range(brief["slots"]):
-            estimator.receive(deliveries.recv().payload.to_bytes())
+            estimator.take(received(deliveries))
             ends = (k + 1) % batch == 0 or k + 1 == brief["slots"]
             if ends or (k + 1) % 256 == 0:
-                telemetry.put(estimator.report())
+                put(telemetry, estimator.report())
             if ends:
-                progress.put(msgpack.packb({"k": k + 1}))
-        while msgpack.unpackb(commands.recv().payload.to_bytes())["do"] != "end":
+                put(progress, msgpack.packb({"k": k + 1}))
+        while received(commands)["do"] != "end":
             pass
+        put(telemetry, msgpack.packb({"over": True}))
         del token
     return estimator.digest()
 

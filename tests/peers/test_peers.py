@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any, Self
 
 import msgpack
 import numpy as np
 import pytest
 
+import emulator.network.mailbox
 import peers.following
 import peers.sensor
 from emulator.brief import Brief, Flow
@@ -23,6 +23,7 @@ from emulator.network import packets, telemetry, wire
 from emulator.network.access import Keys
 from emulator.network.reporting import is_due
 from emulator.network.resending import Kept
+from emulator.network.whereabouts import Place
 from emulator.runs.briefs import Observation, briefs_of
 from emulator.scenario import Scenario
 from peers.eavesdropper import eavesdrop
@@ -58,7 +59,7 @@ def scenario_of(**changes: Any) -> Scenario:
 
 def briefs(**changes: Any) -> dict[str, Brief]:
     """Briefs with a small window."""
-    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None))
+    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 
 
@@ -99,12 +100,11 @@ class FakeInbox:
     def __init__(self, queue: SimpleQueue[bytes]) -> None:
         self._queue = queue
 
-    def recv(self) -> Any:
+    def recv(self) -> bytes:
         """The next message."""
-        payload = self._queue.get(timeout=LIMIT)
-        return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: payload))
+        return self._queue.get(timeout=LIMIT)
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[bytes]:
         while not self._queue.empty():
             yield self.recv()
 
@@ -115,6 +115,7 @@ class FakeSession:
     def __init__(self, stage: Stage, keys: Keys) -> None:
         self._stage = stage
         self.keys = keys
+        self.place = Place()
 
     def __enter__(self) -> Self:
         return self
@@ -409,7 +410,7 @@ class WouldWaitError(Exception):
 class News(SimpleQueue[tuple[str, bytes]]):
     """A queue that says so instead of waiting."""
 
-    def get(self, *_: Any) -> tuple[str, bytes]:
+    def get(self, *_: Any, **__: Any) -> tuple[str, bytes]:
         """The next news that is there."""
         if self.empty():
             raise WouldWaitError
@@ -421,7 +422,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
     slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
-    monkeypatch.setattr(peers.sensor, "SimpleQueue", News)
+    monkeypatch.setattr(emulator.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
     window = Window(session, followers, 10, Kept(print))  # type: ignore[arg-type]

@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
+from emulator.brief import Flow
 from emulator.runs.ports import free_port
+from emulator.runs.recovery import Recovery
 from emulator.scenario import Scenario, load
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, wait_until
@@ -107,12 +109,11 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
     """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
     path, scenario = scenario_in(tmp_path, **RUNS[what])
     live = evedrop.live(str(path), "--json")
-    found: list[int] = []
-    for _ in range(2):
+    for times in (1, 2):
         live.running(more_than=max(live.done(), 100))
-        found.append(live.child("router"))
         live.kill("router")
-        wait_until(lambda: live.children().get("router") not in {None, *found}, "another router")
+        # Losses that overlap are one outage: this one must be over before the next.
+        wait_until(lambda times=times: live.told("reconnected") == times, "a run that goes on")
     done = live.end(120)
     assert done.status == 0, done.err
     live.nothing_left()
@@ -282,3 +283,76 @@ def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
         for process in ("smart", "observer"):
             wait_until(lambda process=process: run.processes[process].poll() == 3, f"the end of {process}")
         assert "smart cut off from the network for 2 s" in run.log("observer").read_text()
+
+
+class Conducted:
+    """The part of a conductor and of a steering that a recovery uses, with the connections in the test's hands."""
+
+    relayed, at = False, None
+
+    def __init__(self) -> None:
+        self.lost: dict[str, float] = {}
+        self.rounds: list[int] = []
+        self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
+        self.changes: dict[str, Any] = {}
+        self.another_router = False
+
+    @property
+    def missing(self) -> list[str]:
+        """Those that are lost."""
+        return list(self.lost)
+
+    def lose(self, *names: str) -> None:
+        """These vanish."""
+        self.lost |= dict.fromkeys(names, time.monotonic())
+
+    def router_changed(self) -> bool:
+        """As the test says."""
+        return self.another_router
+
+    def command(self, name: str, do: str, **fields: Any) -> None:
+        """Note the rounds."""
+        if name == "sensor" and do == "again":
+            self.rounds.append(fields["k"])
+
+    def start(self) -> None:
+        """Nothing to start."""
+
+    def report(self, done: int) -> None:
+        """Nobody to tell."""
+
+    def remind(self) -> None:
+        """Nothing to say again."""
+
+
+def test_losses_that_overlap_are_one_outage() -> None:
+    """One entry for each process that was cut off, from its first loss to when slots are joined again; then another."""
+    conducted, said = Conducted(), list[str]()
+    recovery = Recovery(
+        conducted,  # type: ignore[arg-type]
+        conducted,  # type: ignore[arg-type]
+        Flow(32, 8, 30.0),
+        0.0,
+        lambda event, **outage: said.append(f"{event} {outage['process']}"),
+    )
+    recovery.look(10)
+    for lost in (
+        ("smart",),
+        ("smart", "sensor"),
+        ("smart",),
+    ):  # lost and back three times, and no slot joined meanwhile
+        conducted.lose(*lost)
+        recovery.look(10)
+        conducted.lost = {}
+        recovery.look(10)
+    assert conducted.rounds == [10, 10, 10]
+    assert said == []
+    recovery.look(11)
+    conducted.lose("router", "sensor", "smart")
+    recovery.look(12)
+    conducted.lost, conducted.another_router = {}, True
+    recovery.look(12)
+    recovery.look(13)
+    found = [(one.process, one.slot, one.until) for one in recovery.outages]
+    assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
+    assert said == [f"reconnected {name}" for name in ("smart", "sensor", "router")]

@@ -1,4 +1,8 @@
 import io
+import os
+import subprocess
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,17 +12,59 @@ import pytest
 from simulated_run import Simulated
 
 from emulator.errors import UsageError
-from emulator.view.picture import opened, picture
+from emulator.runs.viewer_process import guarded
+from emulator.view.picture import opened, picture, picture_apart
 from emulator.view.recording import Recording
+from tests.conftest import wait_until
 
 
 def recorded(run: Simulated, rrd: Path) -> Path:
     """The run on file."""
-    recording = Recording(rrd, run.scene, None)
+    recording = Recording(rrd, run.scene)
     for slots in run.chunks(100):
         recording.add(slots)
     assert recording.close()
     return rrd
+
+
+def drawing(rrd: Path) -> int | None:
+    """The process id of the viewer that draws a recording, as soon as it is Rerun's own command."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_text().split("\0")
+        except OSError:
+            continue
+        if "--headless" in words and str(rrd) in words and Path(words[0]).name == "rerun":
+            return int(folder.name)
+    return None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """A picture is drawn by a process with a network of its own, where the system allows that: its port is for anybody."""
+    rrd = recorded(simulated(60), tmp_path / "r.rrd")
+    look = [sys.executable, "-c", "import os; print(os.readlink('/proc/self/ns/net'))"]
+    allowed = subprocess.run(guarded(look, apart=True), capture_output=True, text=True, check=True)
+    apart = allowed.stdout.strip() != os.readlink("/proc/self/ns/net")
+    found: list[UsageError | list[str]] = []
+
+    def draw() -> None:
+        try:
+            found.append(picture_apart(rrd, tmp_path / "r.png", 7))
+        except UsageError as error:
+            found.append(error)
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    pid = wait_until(lambda: drawing(rrd) or bool(found), "a viewer that draws")
+    network = None if found else os.readlink(f"/proc/{pid}/ns/net")
+    thread.join()
+    if isinstance(found[0], UsageError):
+        if "no Vulkan driver" not in str(found[0]):
+            raise found[0]
+        pytest.skip(str(found[0]))
+    assert (network != os.readlink("/proc/self/ns/net")) == apart
+    assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (950, 1600)
 
 
 def filled(png: bytes) -> float:

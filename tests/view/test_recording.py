@@ -20,13 +20,12 @@ SLOTS = 400
 
 def record(run: Simulated, rrd: Path, chunk: int = 60) -> None:
     """Put a run on file, some slots at a time."""
-    recording = Recording(rrd, run.scene, None)
+    recording = Recording(rrd, run.scene)
     for slots in run.chunks(chunk):
         recording.add(slots)
     recording.note(5, "WARN", "a note")
     assert recording.close()
     assert recording.failure is None
-    assert recording.dropped == 0
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +138,7 @@ def test_long_runs_have_bounded_frames() -> None:
 
 def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) -> None:
     """Without a file the run goes on, and the reason is kept."""
-    recording = Recording(tmp_path / "missing" / "r.rrd", run.scene, None)
+    recording = Recording(tmp_path / "missing" / "r.rrd", run.scene)
     for slots in run.chunks(100):
         recording.add(slots)
     recording.close()
@@ -151,7 +150,7 @@ def test_slots_that_cannot_be_drawn_end_the_recording_and_not_the_run(
     run: Simulated, simulated: Callable[..., Simulated], tmp_path: Path
 ) -> None:
     """Slots of another process than the scene's: adding and closing end, and the reason is kept."""
-    recording = Recording(tmp_path / "r.rrd", simulated(50, n=1).scene, None)
+    recording = Recording(tmp_path / "r.rrd", simulated(50, n=1).scene)
     smart = run.slots.peers["smart"]
     recording.add(replace(run.slots, peers={name: replace(smart, x_hat=smart.x_hat[:3]) for name in run.slots.peers}))
     recording.close()
@@ -167,7 +166,7 @@ from emulator.view.recording import Recording
 run = simulate(orbit(), 3000)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
-recording = Recording(Path(sys.argv[2]), run.scene, None)
+recording = Recording(Path(sys.argv[2]), run.scene)
 for slots in run.chunks(300):
     recording.add(slots)
 safe = recording.close()
@@ -188,4 +187,4 @@ def test_close_leaves_no_thread(run: Simulated, tmp_path: Path) -> None:
     before = set(threading.enumerate())
     record(run, tmp_path / "r.rrd")
     left = set(threading.enumerate()) - before
-    assert not [thread for thread in left if thread.name in {"recording", "live view"}]
+    assert not [thread for thread in left if thread.name == "recording"]

@@ -1,18 +1,24 @@
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
 from emulator.errors import UsageError
+from emulator.runs.followed import Followed, feed
 from emulator.runs.ports import free_port
 from emulator.runs.viewer import Stand, Viewer, choose, open_run
 from emulator.view.recording import Recording
@@ -51,7 +57,7 @@ def listening(pid: int) -> list[str]:
 @pytest.fixture
 def viewer(tmp_path: Path) -> Iterator[Viewer]:
     """A viewer in the browser, without a browser."""
-    started = Viewer.start("web", tmp_path / "logs")
+    started = Viewer.start("web", tmp_path / "logs", tmp_path / "r.rrd")
     assert started is not None
     yield started
     started.stop()
@@ -73,16 +79,140 @@ def test_auto_takes_a_window_only_with_a_screen(monkeypatch: pytest.MonkeyPatch)
 
 def test_off_starts_nothing(tmp_path: Path) -> None:
     """Without a view there is no viewer."""
-    assert Viewer.start("off", tmp_path) is None
+    assert Viewer.start("off", tmp_path, tmp_path / "r.rrd") is None
 
 
 @LINUX
 def test_only_loopback_listens(viewer: Viewer) -> None:
-    """The viewer's two sockets are on 127.0.0.1, and its page is there."""
-    assert listening(viewer._process.pid) == ["0100007F", "0100007F"]
+    """Rerun serves its page on 127.0.0.1, and opens no other port: none that recordings could be fetched from."""
+    assert listening(viewer._process.pid) == ["0100007F"]
     assert viewer.address is not None
     with urllib.request.urlopen(viewer.address, timeout=LIMIT) as page:  # noqa: S310 - our own address
         assert b"<html" in page.read()
+
+
+def data_of(viewer: Viewer) -> str:
+    """Where the page of a viewer finds the recording."""
+    assert viewer.address is not None
+    return parse_qs(urlsplit(viewer.address).query)["url"][0]
+
+
+def test_the_recording_is_at_a_secret_address_alone(viewer: Viewer, tmp_path: Path) -> None:
+    """Who has the address gets the file as it grows, to its end; who knows no more than the port gets nothing of it."""
+    data = data_of(viewer)
+    with urllib.request.urlopen(data, timeout=LIMIT) as reply:  # noqa: S310 - the same; and there is no file yet
+        assert reply.headers["Access-Control-Allow-Origin"] == "*"
+        with (tmp_path / "r.rrd").open("wb", buffering=0) as file:
+            for piece in (b"first", b"second"):
+                file.write(piece)
+                assert reply.read(len(piece)) == piece
+            (tmp_path / "r.rrd").rename(tmp_path / "moved.rrd")
+            file.write(b"third")
+        viewer.complete()
+        assert reply.read() == b"third"
+    token = urlsplit(data).path.split("/")[1]
+    assert len(token) >= 32
+    for guess in ("", "/", "/recording.rrd", f"/{token[:-1]}/recording.rrd", f"/{token}", f"/{token}/recording.rrd/"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"http://{urlsplit(data).netloc}{guess}", timeout=LIMIT)
+
+
+def test_nothing_that_another_user_can_read_names_the_address(viewer: Viewer, tmp_path: Path) -> None:
+    """The address is neither among the viewer's arguments nor in its log."""
+    token = urlsplit(data_of(viewer)).path.split("/")[1].encode()
+    assert token not in Path(f"/proc/{viewer._process.pid}/cmdline").read_bytes()
+    assert token not in (tmp_path / "logs" / "viewer.log").read_bytes()
+
+
+def test_those_who_only_connect_keep_nobody_out_for_long(viewer: Viewer, tmp_path: Path) -> None:
+    """Connections that ask for nothing are bounded in number; once they are gone, the recording is served again."""
+    data = urlsplit(data_of(viewer))
+    (tmp_path / "r.rrd").write_bytes(b"all")
+    viewer.complete()
+    assert data.hostname is not None
+    idle = [socket.create_connection((data.hostname, data.port or 0), LIMIT) for _ in range(40)]
+    assert any(one.recv(1) == b"" for one in idle[-1:]), "one too many is turned away"
+    for one in idle:
+        one.close()
+
+    def served() -> bytes:
+        try:
+            with urllib.request.urlopen(data.geturl(), timeout=LIMIT) as reply:  # noqa: S310 - our own address
+                return bytes(reply.read())
+        except OSError:
+            return b""
+
+    assert wait_until(served, "the recording") == b"all"
+
+
+@pytest.fixture
+def headless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A window that needs no screen."""
+    monkeypatch.setattr("emulator.runs.viewer._WINDOW", ("--headless",))
+    monkeypatch.setenv("DISPLAY", ":0")
+
+
+def window(logs: Path, recording: Path) -> Viewer:
+    """A window that shows a recording. Skips the test where nothing can draw one."""
+    try:
+        started = Viewer.start("native", logs, recording)
+    except UsageError as error:
+        if "graphics adapter" not in str(error) and "render context" not in str(error):
+            raise
+        pytest.skip(f"no Vulkan driver: {error}")
+    assert started is not None
+    return started
+
+
+@LINUX
+@pytest.mark.usefixtures("headless")
+def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
+    """Its port is in a network of its own where the system allows that, and else a warning says so."""
+    started = window(tmp_path / "logs", tmp_path / "r.rrd")
+    try:
+        assert started.address is None
+        assert listening(started._process.pid) == ["0100007F"]
+        with socket.socket() as probe:
+            found = probe.connect_ex(("127.0.0.1", port_of(started._process.pid)))
+        assert (found == errno.ECONNREFUSED) == (started.warning is None)
+    finally:
+        started.stop()
+    assert not started.alive()
+
+
+@LINUX
+@pytest.mark.usefixtures("headless")
+def test_a_window_without_a_network_of_its_own_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system allows none it is started all the same, and the user is told what others can do."""
+    monkeypatch.setattr("emulator.runs.viewer_process._APART", "")
+    started = window(tmp_path / "logs", tmp_path / "r.rrd")
+    try:
+        assert started.warning is not None
+        assert "other users of this machine can find the window's port" in started.warning
+    finally:
+        started.stop()
+
+
+def port_of(pid: int) -> int:
+    """The port among a viewer's arguments."""
+    words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+    return int(words[words.index("--port") + 1])
+
+
+def test_a_pipe_gets_the_recording_as_it_grows(tmp_path: Path) -> None:
+    """From its beginning to its end, whenever the file is made; who stops reading holds up nobody."""
+    followed = Followed(tmp_path / "r.rrd")
+    reading, writing = os.pipe()
+    feed(followed, os.fdopen(writing, "wb", buffering=0))
+    (tmp_path / "r.rrd").write_bytes(b"x" * 3_000_000)
+    with open(reading, "rb") as pipe:
+        assert pipe.read(1000) == b"x" * 1000
+        followed.complete()
+        assert len(pipe.read()) == 3_000_000 - 1000
+    reading, writing = os.pipe()
+    feed(followed, os.fdopen(writing, "wb", buffering=0))
+    os.close(reading)
+    wait_until(lambda: not [one for one in threading.enumerate() if one.name == "view"], "no thread left")
 
 
 def test_stop_ends_it_and_may_be_repeated(viewer: Viewer) -> None:
@@ -98,7 +228,7 @@ def test_a_viewer_is_given_the_screen_and_no_tokens(tmp_path: Path, monkeypatch:
     """Of our environment it gets what it needs to run and to draw, and nothing else."""
     for name in ("ACCESS_TOKEN", "VK_EXAMPLE", "LC_EXAMPLE"):
         monkeypatch.setenv(name, f"of {name}")
-    started = Viewer.start("web", tmp_path)
+    started = Viewer.start("web", tmp_path, tmp_path / "r.rrd")
     assert started is not None
     try:
         given = Path(f"/proc/{started._process.pid}/environ").read_bytes()
@@ -122,7 +252,7 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from emulator.runs.viewer import Viewer
-viewer = Viewer.start("web", Path(sys.argv[1]))
+viewer = Viewer.start("web", Path(sys.argv[1]), Path(sys.argv[1]) / "r.rrd")
 print(viewer._process.pid, flush=True)
 time.sleep(600)
 """
@@ -146,51 +276,54 @@ def test_viewer_that_cannot_start_says_why(tmp_path: Path) -> None:
         open_run(tmp_path, "web")
 
 
-@pytest.mark.parametrize("fault", ["absent", "frozen", "killed"])
+@pytest.mark.parametrize("fault", ["frozen", "killed", "unread"])
 def test_faulty_viewer_changes_nothing(
     fault: str, simulated: Callable[..., Simulated], viewer: Viewer, tmp_path: Path
 ) -> None:
-    """A viewer that is not there, hangs or dies holds up no slot, and the file is complete."""
+    """A viewer that hangs, dies or reads nothing of what it asked for holds up no slot, and the file is complete."""
     run = simulated(SLOTS)
     run = replace(run, scene=replace(run.scene, run=fault))
-    url = "rerun+http://127.0.0.1:9/proxy" if fault == "absent" else viewer.url
-    recording = Recording(tmp_path / "r.rrd", run.scene, url)
+    recording = Recording(tmp_path / "r.rrd", run.scene)
     longest = 0.0
-    for slots in run.chunks(100):
-        if slots.first == 1000 and fault != "absent":
-            os.kill(viewer._process.pid, signal.SIGSTOP if fault == "frozen" else signal.SIGKILL)
-        begun = time.monotonic()
-        recording.add(slots)
-        longest = max(longest, time.monotonic() - begun)
-    recording.close()
+    with urllib.request.urlopen(data_of(viewer), timeout=LIMIT):  # noqa: S310 - our own address
+        for slots in run.chunks(100):
+            if slots.first == 1000 and fault != "unread":
+                os.kill(viewer._process.pid, signal.SIGSTOP if fault == "frozen" else signal.SIGKILL)
+            begun = time.monotonic()
+            recording.add(slots)
+            longest = max(longest, time.monotonic() - begun)
+        assert recording.close()
+        viewer.stop()
     assert longest < BLOCKED
-    assert recording.failure is None
-    viewer._process.kill()
+    assert not viewer.alive()
     chunks = RrdReader(tmp_path / "r.rrd").stream().filter(content="/error/smart", is_static=False)
     assert sum(chunk.num_rows for chunk in chunks) == SLOTS
 
 
-def test_live_viewer_gets_the_run(simulated: Callable[..., Simulated], viewer: Viewer, tmp_path: Path) -> None:
-    """With a healthy viewer nothing is left out, and a normal exit is safe."""
+def test_a_browser_gets_the_run(simulated: Callable[..., Simulated], viewer: Viewer, tmp_path: Path) -> None:
+    """What is served while a run is recorded is the recording, whole."""
     run = simulated(SLOTS)
-    recording = Recording(tmp_path / "r.rrd", run.scene, viewer.url)
-    for slots in run.chunks(500):
-        recording.add(slots)
-    recording.close()
-    assert recording.dropped == 0
+    recording = Recording(tmp_path / "r.rrd", run.scene)
+    with urllib.request.urlopen(data_of(viewer), timeout=LIMIT) as reply:  # noqa: S310 - our own address
+        for slots in run.chunks(500):
+            recording.add(slots)
+        assert recording.close()
+        viewer.complete()
+        assert reply.read() == (tmp_path / "r.rrd").read_bytes()
 
 
 def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
     """The page at the port that was asked for, the data at the next; whoever asks for the same place is refused."""
     stand = Stand("127.0.0.1", free_port())
-    viewer = Viewer.serve(stand, tmp_path / "logs")
+    viewer = Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
     try:
-        data = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{stand.port + 1}%2Fproxy"
-        assert viewer.address == f"http://127.0.0.1:{stand.port}/?url={data}"
+        assert viewer.address is not None
+        assert viewer.address.startswith(f"http://127.0.0.1:{stand.port}/?url=")
+        assert data_of(viewer).startswith(f"http://127.0.0.1:{stand.port + 1}/")
         with urllib.request.urlopen(f"http://127.0.0.1:{stand.port}/") as page:
             assert page.status == 200
         with pytest.raises(UsageError, match=f":{stand.port} cannot be had"):
-            Viewer.serve(stand, tmp_path / "logs")
+            Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
     finally:
         viewer.stop()
 

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 from emulator.model.eavesdroppers.colluding import Colluding
 from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
-from emulator.model.eavesdroppers.readers import GROUP, READERS, RESERVED
+from emulator.model.eavesdroppers.readers import ANSWERS, GROUP, READERS, RESERVED
 from emulator.model.eavesdroppers.replay_informed import ReplayInformed
+from emulator.model.eavesdroppers.stand_in import StandIns
 from emulator.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
@@ -15,6 +16,13 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "colluding": Colluding,
     "replay-informed": ReplayInformed,
 }
-STRATEGIES: Registry[Eavesdropper] = Registry("eavesdropper", Eavesdropper, GROUP, _BUILT_IN, RESERVED)  # type: ignore[type-abstract]
+STRATEGIES: Registry[Eavesdropper] = Registry(
+    "eavesdropper",
+    Eavesdropper,  # type: ignore[type-abstract]
+    GROUP,
+    _BUILT_IN,
+    RESERVED,
+    StandIns(ANSWERS, "STRATEGIES"),
+)
 
-__all__ = ["READERS", "STRATEGIES"]
+__all__ = ["ANSWERS", "READERS", "STRATEGIES"]

@@ -20,7 +20,7 @@ class Delegate(Eavesdropper):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self.reader = READERS[knowledge.parameters["reads_as"]](knowledge, batch)
+        self.reader = READERS.imported(knowledge.parameters["reads_as"])(knowledge, batch)
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from emulator.model.answers import Answers
 from emulator.model.eavesdroppers.bayesian import Bayesian
 from emulator.model.eavesdroppers.constant import Constant
 from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
@@ -13,6 +14,7 @@ from emulator.model.eavesdroppers.naive import Naive
 from emulator.model.eavesdroppers.reference import Reference
 from emulator.model.eavesdroppers.selective import Selective
 from emulator.model.eavesdroppers.smart import Smart
+from emulator.model.eavesdroppers.stand_in import StandIns
 from emulator.model.eavesdroppers.suspicious import Suspicious
 from emulator.model.eavesdroppers.tracker import Tracker
 from emulator.model.registry import Registry
@@ -33,4 +35,13 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "selective": Selective,
     "tracker": Tracker,
 }
-READERS: Registry[Eavesdropper] = Registry("eavesdropper", Eavesdropper, GROUP, _BUILT_IN, (*RESERVED, "reads_as"))  # type: ignore[type-abstract]
+ANSWERS = Answers()
+"""What the classes of eavesdroppers that are not built in have said of themselves, in this process."""
+READERS: Registry[Eavesdropper] = Registry(
+    "eavesdropper",
+    Eavesdropper,  # type: ignore[type-abstract]
+    GROUP,
+    _BUILT_IN,
+    (*RESERVED, "reads_as"),
+    StandIns(ANSWERS, "READERS"),
+)

@@ -1,0 +1,184 @@
+"""What classes that must not run in this process say of themselves: asked of them in a process of their own.
+
+An eavesdropper's class may be anybody's, and the launcher and the observer hold the seed and the truth. So neither imports
+it. A child process does, which has an empty environment and is told the class's name, the parameters that the scenario
+gives it and where modules are. Its answers are JSON, and whoever asks checks them.
+
+Every answer is kept: the same question is asked once, and a process that is given the answers need not ask at all.
+
+Source: docs/your-own.md, where a class runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+_SECONDS = 60.0  # for an answer; a class may import much
+_MOST_BYTES = 2**20  # of an answer
+_MODULE = "emulator.answering"
+# Libraries that are not where the system looks for them; nothing else of our environment.
+_NEEDED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH", "PYTHONHOME")
+
+
+class NoAnswer(Exception):
+    """A class raised an error when it was asked, answered what is no answer, or not at all; the text says which."""
+
+
+class Answers:
+    """What classes have said of themselves, and the child processes that are asked. Final; usable from any thread.
+
+    Children are asked one after the other, one for each class, and end by themselves when they are asked no more.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, dict[str, Any]] = {}
+        self._children: dict[str, _Child] = {}
+        self._folders: dict[str, str | None] = {}
+        self._lock = threading.Lock()
+        self.folder: str | None = None
+        """Where modules are looked for before all other places."""
+
+    def ask(self, name: str, do: str, *given: Any) -> Any:
+        """The answer of the class `name` to one question, as JSON has it.
+
+        Raises NotRegistered if the name stands for no class, NoAnswer if it has no answer.
+        """
+        from emulator.model.registry import NotRegistered  # noqa: PLC0415 - the registries ask us
+
+        question = json.dumps([name, do, *given], default=str)
+        with self._lock:
+            answer = self._known.get(question) or self._asked(name, question)
+            if "is" in answer:
+                self._known[question] = answer
+            elif name in self._children:  # its author may correct it, and ask again
+                self._children.pop(name).end()
+        if "not_registered" in answer:
+            raise NotRegistered(name, str(answer["not_registered"]))
+        if "is" not in answer:
+            raise NoAnswer(str(answer.get("raised", "its answer was no answer")))
+        return answer["is"]
+
+    def of(self, names: Iterable[str]) -> dict[str, Any]:
+        """Every question that these classes have answered so far, with the answer: for `learn`."""
+        wanted = set(names)
+        return {question: answer for question, answer in self._known.items() if json.loads(question)[0] in wanted}
+
+    def learn(self, known: Mapping[str, Any]) -> None:
+        """Take answers from somebody who has asked."""
+        with self._lock:
+            self._known.update({str(question): dict(answer) for question, answer in known.items()})
+
+    def folder_of(self, name: str) -> str | None:
+        """The folder in which a class was looked for first, if it was asked anything."""
+        return self._folders.get(name)
+
+    def forget(self) -> None:
+        """Ask anew from now on."""
+        with self._lock:
+            for child in self._children.values():
+                child.end()
+            self._known, self._children, self._folders = {}, {}, {}
+
+    def _asked(self, name: str, question: str) -> dict[str, Any]:
+        child = self._children.get(name)
+        if child is not None:
+            with contextlib.suppress(NoAnswer):  # it may have ended by itself
+                return child.answer(question)
+        child = self._children[name] = _Child(self._folders.setdefault(name, self.folder))
+        try:
+            return child.answer(question)
+        except NoAnswer as error:
+            return {"raised": str(error)}
+
+
+class _Child:
+    """A process that answers for one class. Final."""
+
+    def __init__(self, folder: str | None) -> None:
+        places = json.dumps([str(Path(place).absolute()) for place in sys.path])
+        command = (
+            "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.raw.readline()); "
+            f"from {_MODULE} import answer; answer(json.loads(sys.stdin.buffer.raw.readline()))"
+        )
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-c", command],
+                bufsize=0,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={name: os.environ[name] for name in _NEEDED if name in os.environ},
+                cwd="/",
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise NoAnswer(f"it cannot be asked: no process can be started ({error})") from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        self._first = f"{places}\n{json.dumps(folder)}\n"
+
+    def answer(self, question: str) -> dict[str, Any]:
+        """Its answer to a question. Raises NoAnswer, and ends it, if it gives none."""
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - they were asked for
+        try:
+            deadline = time.monotonic() + _SECONDS
+            _write(process.stdin.fileno(), f"{self._first}{question}\n".encode(), deadline)
+            self._first = ""
+            found = json.loads(_line(process.stdout.fileno(), deadline))
+            if not isinstance(found, dict):
+                raise NoAnswer("its answer was no answer")
+        except BaseException as error:
+            self.end()
+            status = process.returncode
+            if isinstance(error, NoAnswer):
+                raise
+            if isinstance(error, (OSError, ValueError, RecursionError)):
+                raise NoAnswer(f"the process that was to answer for it ended (status {status})") from error
+            raise
+        return found
+
+    def end(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+
+
+def _write(handle: int, text: bytes, deadline: float) -> None:
+    os.set_blocking(handle, False)
+    while text:
+        _wait([], [handle], deadline)
+        text = text[os.write(handle, text) :]
+
+
+def _line(handle: int, deadline: float) -> bytes:
+    line = b""
+    while not line.endswith(b"\n"):
+        _wait([handle], [], deadline)
+        read = os.read(handle, 65536)
+        if not read:
+            raise OSError("it ended")
+        line += read
+        if len(line) > _MOST_BYTES:
+            raise NoAnswer(f"its answer was longer than {_MOST_BYTES} bytes")
+    return line
+
+
+def _wait(reading: list[int], writing: list[int], deadline: float) -> None:
+    if not any(select.select(reading, writing, [], max(0.0, deadline - time.monotonic()))):
+        raise NoAnswer(f"it did not answer within {_SECONDS:g} s")

@@ -1,0 +1,117 @@
+"""Every reader of messages, in one table: what it is given, and what it makes of a message. Used by tests and by fuzzing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from emulator.model.account import COUNTED_BURSTS, Account
+from emulator.model.digest import Blocks
+from emulator.model.links.link import REASONS
+from emulator.model.receiver import Belief, Heard
+from emulator.model.transit import Late
+from emulator.network import loop_wire, operator, packets, router, telemetry, whereabouts, wire
+from emulator.network.wire import Reader
+
+SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
+SHAPE = (N, TRIALS)
+EXTENT = telemetry.Extent(SLOTS, 8, N, TRIALS, RECORDED, INPUTS, measures=True)
+BLOCKS = Blocks(SLOTS, [6])
+K = 4
+"""The slot that is due everywhere."""
+
+
+def _on(path: str, read: Callable[[Reader], Any]) -> tuple[str, Callable[[bytes], Any]]:
+    key = f"evedrop/r1/{path}"
+    return key, lambda payload: read(Reader(key, payload))
+
+
+def _go(command: Reader) -> tuple[Any, ...]:
+    until = command.integer("until") if command.has("until") else None
+    return command.text("do"), command.integer("k"), command.names("absent"), until
+
+
+def _changed(command: Reader) -> Any:
+    return command.choice("link", ("eve", "legitimate")), router.read_changes(command, "changes", SLOTS)
+
+
+READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
+    "packet": _on("uplink", lambda m: (packets.read_uplink(m, K, SHAPE), packets.read_beside(m, SHAPE, 1))),
+    "once more": _on("uplink", lambda m: packets.is_once_more(m) and packets.read_once_more(m, SLOTS)),
+    "mark": _on("uplink", lambda m: packets.is_hold(m) and m.slot(K)),
+    "delivery": _on("downlink/eve", lambda m: packets.read_delivery(m, K, SHAPE, 1, WINDOW)),
+    "acknowledgement": _on("ack/sent", lambda m: packets.read_acknowledgement(m, K, TRIALS)),
+    "estimate": _on("estimate", lambda m: loop_wire.read_known(m, "x_hat", K, SHAPE)),
+    "state": _on("state", lambda m: loop_wire.read_known(m, "x", K, SHAPE)),
+    "input": _on("input", lambda m: loop_wire.read_decided(m, K, (INPUTS, TRIALS))),
+    "progress": ("evedrop/r1/progress/eve", lambda raw: wire.read_progress("evedrop/r1/progress/eve", raw, K)),
+    "control": _on("control/eve", lambda m: (m.text("do"), m.has("k") and m.integer("k"))),
+    "go": _on("control/sensor", _go),
+    "change": _on("control/router", _changed),
+    "again": _on("control/router", lambda m: router.read_links(m, ("eve", "legitimate"), SLOTS)),
+    "request": ("evedrop/r1/control/observer", lambda raw: operator.read_request("evedrop/r1/control/observer", raw)),
+    "answer": ("evedrop/r1/control/observer", lambda raw: operator.read_answer("evedrop/r1/control/observer", raw)),
+    "truth": _on("telemetry/sensor", lambda m: telemetry.read_truth(m, K, EXTENT)),
+    "held": _on("telemetry/sensor", lambda m: telemetry.is_held(m) and m.slot(K)),
+    "leaving": _on("telemetry/eve", lambda m: telemetry.read_leaving(m, EXTENT)),
+    "report": _on("telemetry/eve", lambda m: telemetry.read_report(m, K, EXTENT, BLOCKS, WINDOW)),
+    "decisions": _on("telemetry/controller", lambda m: loop_wire.read_decisions(m, K, EXTENT, BLOCKS, PERIOD)),
+    "journal": _on("journal", lambda m: telemetry.read_journal(m, K, {"legitimate": 0, "eve": WINDOW}, EXTENT)),
+    "whereabouts": _on("telemetry/eve", lambda m: whereabouts.read_whereabouts(m, SLOTS)),
+    "refusal": _on("telemetry/eve", lambda m: wire.read_refusal(m, "eve")),
+}
+"""What is read → the key it comes on, and its reader, of the bytes within the envelope. A reader gives values or raises
+MalformedMessage or Gap; either names the key."""
+
+
+def _accounts() -> dict[str, Account]:
+    lost = {reason: np.zeros(2, np.uint32) for reason in REASONS}
+    delivered, bursts = np.ones((2, TRIALS), bool), np.zeros(COUNTED_BURSTS, np.uint32)
+
+    def one(window: int) -> Account:
+        late = np.zeros((2, TRIALS), np.uint16) if window else None
+        return Account(delivered, lost, late, bursts, np.array([6, *[0] * (window + 1)], np.uint32))
+
+    return {"legitimate": one(0), "eve": one(WINDOW)}
+
+
+_z, _header, _flags = np.arange(6.0).reshape(SHAPE), np.ones((1, TRIALS), np.int64), np.array([True, False, True])
+_late = (Late(3, Heard(_flags, _z, _header)),)
+_digests = {0: np.zeros((TRIALS, 32), np.uint8)}
+EXAMPLES: Mapping[str, bytes] = {
+    "packet": packets.uplink(K, _z, _header, _flags, _z),
+    "once more": packets.once_more(2, 6, 4),
+    "mark": packets.hold(K),
+    "delivery": packets.delivery(K, b"\5", _z[:, _flags].tobytes(), _late, packets.packed_header(_header, _flags), _z.tobytes()),
+    "acknowledgement": packets.acknowledgement(K, _flags),
+    "estimate": loop_wire.known("x_hat", K, _z),
+    "state": loop_wire.known("x", K, _z),
+    "input": loop_wire.decided(K, _z[:1], _flags),
+    "progress": wire.progress(K),
+    "control": wire.control("end"),
+    "go": wire.control("go", k=K, absent=["eve"], until=9),
+    "change": wire.control("change", link="eve", changes=[{"at": 4, "cut": True}, {"at": 9, "settings": {"loss": {}}}]),
+    "again": wire.control("again", n=1, k=K, links={"eve": [{"at": 4, "cut": True}]}),
+    "request": operator.Request("step", slots=3).pack(),
+    "answer": operator.Answer(3, "done").pack(),
+    "truth": telemetry.Truth(K, np.ones((2, *SHAPE)), np.ones((2, 3), bool), None, None, np.ones((2, 1, 3)),
+                             np.ones((2, 3), bool), np.ones((2, *SHAPE))).pack(),
+    "held": telemetry.held(K),
+    "leaving": telemetry.leaving(K, Belief(_z, np.ones((N, N, TRIALS)), np.zeros(TRIALS, np.uint8))),
+    "report": telemetry.Report(K, np.ones((2, *SHAPE)), np.ones((2, TRIALS), np.uint8), np.ones((2, N, N, 1)), np.ones((2, 2)),
+                               np.ones((2, TRIALS), np.uint16), _digests, np.ones((2, TRIALS), np.uint16)).pack(),
+    "decisions": loop_wire.Decisions(K, 4, np.ones(1), _digests).pack(),
+    "journal": telemetry.Journal(K, 2, _accounts()).pack(),
+    "whereabouts": whereabouts.Whereabouts(K, ("evedrop/r1/uplink",)).pack(),
+    "refusal": wire.refusal("evedrop/r1/downlink/eve", "no k"),
+}  # fmt: skip
+"""A message that each reader takes, to begin with."""
+
+
+def fields_of(name: str) -> dict[str, Any]:
+    """The fields of an example."""
+    found: dict[str, Any] = msgpack.unpackb(EXAMPLES[name], strict_map_key=False)
+    return found

@@ -1,0 +1,226 @@
+"""Attacks on a run from inside: an eavesdropper's class that takes what it can wherever it is loaded."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.model.answers import Answers, NoAnswer
+from emulator.model.eavesdroppers import ANSWERS
+from emulator.model.eavesdroppers.eavesdropper import Knowledge
+from emulator.model.eavesdroppers.stand_in import StandIns
+from emulator.model.process import Process
+from emulator.runs.results import load_results
+from emulator.streams import Batch
+from tests.conftest import Evedrop, Live, wait_until
+
+SEED = 7318529640182736451
+"""That no process knows but the launcher and the observer, and that nothing holds by chance."""
+
+SPY = f'''
+import gc, json, os, sys
+from pathlib import Path
+
+from emulator.model.eavesdroppers.naive import Naive
+
+SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its constants are no find
+OURS = ("emulator.scenario", "emulator.runs", "emulator.network.router", "peers.sensor", "peers.legitimate")
+
+
+def held(value):
+    return value == SEED if type(value) is int else str(SEED) in value if type(value) is str else False
+
+
+def seen():
+    """Where the seed is, of all that this process can get at."""
+    found = []
+    texts = {{"environ": str(dict(os.environ)), "argv": str(sys.argv), "cmdline": Path("/proc/self/cmdline").read_text()}}
+    found += [place for place, text in texts.items() if str(SEED) in text]
+    frame = sys._getframe(1)
+    while frame is not None:
+        if frame.f_globals is not globals() and any(map(held, frame.f_locals.values())):
+            found.append("frame " + frame.f_code.co_name)
+        frame = frame.f_back
+    for one in gc.get_objects():
+        if one is not globals() and isinstance(one, (dict, list, tuple)):
+            values = one.values() if isinstance(one, dict) else one
+            if any(map(held, list(values))):
+                found.append(str(one)[:200])
+    return found
+
+
+def report(when):
+    words = Path("/proc/self/cmdline").read_text().split("\\0")
+    line = {{
+        "when": when,
+        "pid": os.getpid(),
+        "words": words,
+        "environ": sorted(os.environ),
+        "ours": [name for name in sys.modules if name.startswith(OURS)],
+        "seen": seen(),
+    }}
+    with Path(__file__).with_name("spied").open("a") as file:
+        file.write(json.dumps(line) + "\\n")
+
+
+class Spy(Naive):
+    def __init__(self, knowledge, batch):
+        super().__init__(knowledge, batch)
+        report("made")
+
+    @classmethod
+    def use_probabilities(cls, parameters):
+        report("asked")
+        return 1.0, 1.0
+
+
+report("imported")
+'''
+
+SCENARIO = f"""
+title = "An eavesdropper that spies"
+slots = 600
+seed = {SEED}
+
+[process]
+A = [[1.0, 0.1], [0.0, 1.0]]
+Q = [[1e-3, 0.0], [0.0, 1e-3]]
+initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
+
+[encoding]
+scheme = "innovation"
+state_probability = 0.6
+
+[legitimate]
+link = {{ quality = 0.9 }}
+
+[eavesdroppers.eve]
+strategy = "spy:Spy"
+link = {{ quality = 0.8 }}
+
+[[event]]
+at = 300
+link = "eve"
+set = {{ quality = 0.5 }}
+"""
+
+
+def spied(folder: Path) -> list[dict[str, Any]]:
+    """What the class has reported of the processes in which it ran."""
+    return [json.loads(line) for line in (folder / "spied").read_text().splitlines()]
+
+
+def written(folder: Path) -> None:
+    """A scenario with the class, and beside it modules that are called like some of ours and of a library."""
+    (folder / "spy.py").write_text(SPY)
+    (folder / "spy.toml").write_text(SCENARIO)
+    for name in ("zenoh", "rerun", "pyarrow", "emulator", "peers", "tomli_w"):
+        (folder / f"{name}.py").write_text('import spy\nspy.report("shadow")\nraise SystemExit("taken")\n')
+
+
+def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) -> None:
+    """Of a run's processes only the eavesdropper's imports it, and whoever asks it about itself knows neither seed nor brief."""
+    written(evedrop.folder)
+    command = ["-P", "-m", "emulator"]  # as the script `evedrop` does, not looking for modules where it was typed
+    typed = ("run", "spy.toml", "--view", "off", "--pace", "0.005", "--out", "run")
+    live = Live(evedrop._start(command, typed, {}), evedrop.temporary, evedrop.folder / "run")
+    children = wait_until(lambda: len(found := live.children()) == 5 and found, "five processes")
+    assert live.end().status == 0
+    reports = spied(evedrop.folder)
+    assert {one["when"] for one in reports} == {"imported", "made", "asked"}
+    by_pid = {pid: name for name, pid in children.items()} | {live.process.pid: "launcher"}
+    for one in reports:
+        assert by_pid.get(one["pid"], "asked alone") in {"eve", "asked alone"}, one
+        assert one["seen"] == [], one
+        assert one["ours"] == [], one
+        if one["pid"] not in by_pid:
+            assert set(one["environ"]) <= {"LC_CTYPE", "LD_LIBRARY_PATH"}, one
+            assert not any(str(evedrop.folder) in word for word in one["words"]), one
+    assert by_pid[next(one["pid"] for one in reports if one["when"] == "made" and one["pid"] in by_pid)] == "eve"
+    summary = load_results(live.folder).summary
+    assert summary["peers"]["eve"]["expected_trace_covariance"] > 0.0, "theory knows the class all the same"
+
+
+def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:
+    """Commands that ask a class about itself, and read results made with it, import it into none of their own processes."""
+    written(evedrop.folder)
+    ANSWERS.forget()
+    for shadow in evedrop.folder.glob("*.py"):
+        if shadow.stem != "spy":
+            shadow.unlink()
+    assert evedrop("check", "spy.toml").status == 0
+    assert evedrop("brief", "spy.toml", "--out", "briefs").status == 0
+    pids = {one["pid"] for one in spied(evedrop.folder)}
+    assert pids
+    assert os.getpid() not in pids
+    told = json.loads((evedrop.folder / "briefs" / "observer.json").read_text())["part"]["classes"]
+    assert any('"use_probabilities"' in question for question in told)
+
+
+def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
+    """Answers that are no answer are mistakes of the scenario, with the entry or what was asked; so is an end without one."""
+    (evedrop.folder / "spy.toml").write_text(SCENARIO)
+    wrong = {
+        "os._exit(7)": "the process that was to answer for it ended (status",
+        "return 0.5, float('nan')": "expected a probability",
+        "raise OSError('no way')": "OSError: no way, spy.py line",
+    }
+    for body, said in wrong.items():
+        ANSWERS.forget()
+        text = (
+            "import os\nfrom emulator.model.eavesdroppers.naive import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
+        )
+        (evedrop.folder / "spy.py").write_text(f"{text}    def use_probabilities(cls, parameters):\n        {body}\n")
+        done = evedrop("run", "spy.toml", "--view", "off", "--out", "run")
+        assert done.status == 2, (body, done.err)
+        assert said in done.err
+        assert not (evedrop.folder / "run").exists()
+    ANSWERS.forget()
+
+
+FACTS = {"parameters": {}, "pools_links": False, "takes": True, "own_outcomes": True}
+SHARES = {"predicted": 0.5, "state": 0.5, "misled": 0.0, "decoded": 0.0, "leaked": 0.0, "initial": 0.5}
+LIES: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+    "mistakes": ("none", lambda kind: kind.mistakes({})),
+    "streams": ([7], lambda kind: kind.streams({})),
+    "betrayed": (-1, lambda kind: kind.betrayed({})),
+    "follows_gamma": ("yes", lambda kind: kind.follows_gamma({})),
+    "use_probabilities": ([0.5, 1.5], lambda kind: kind.use_probabilities({})),
+    "outcomes_at": ({**SHARES, "state": 0.7}, lambda kind: kind.outcomes({}, 0.5)(0.5)),
+}
+
+
+def said_by(lies: dict[str, Any]) -> Any:
+    """What stands for a class that gives these answers, whatever it should say."""
+    answers = Answers()
+    truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
+    said = {**truth, "outcomes": True, "outcomes_at": SHARES, **lies}
+    given = {"class": ["STRATEGIES"], "outcomes": ["STRATEGIES", {}, 0.5], "outcomes_at": ["STRATEGIES", {}, 0.5, 0.5]}
+    known = {
+        json.dumps(["spy:Spy", do, *given.get(do, ["STRATEGIES", {}])]): {"is": answer}
+        for do, answer in {"class": FACTS, **said}.items()
+    }
+    answers.learn(known)
+    return StandIns(answers, "STRATEGIES")("spy:Spy")
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_an_answer_that_is_none_is_refused(lie: str) -> None:
+    """Each answer has a form and a range; one of another is an error that quotes it, not a figure."""
+    answer, asked = LIES[lie]
+    asked(said_by({}))
+    with pytest.raises(NoAnswer, match="; expected "):
+        asked(said_by({lie: answer}))
+
+
+def test_a_stand_in_runs_nowhere() -> None:
+    """What stands for a class cannot be put to work in its place."""
+    process = Process(np.eye(1), np.eye(1), np.eye(1))
+    with pytest.raises(TypeError, match="runs in the eavesdropper's process alone"):
+        said_by({})(Knowledge(process, 1.0, {}, {}), Batch(1, 1))

@@ -1,0 +1,122 @@
+"""How large messages may be, and how many may wait: what a run sends always fits."""
+
+from __future__ import annotations
+
+from queue import Empty
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.errors import MalformedMessage
+from emulator.model.account import COUNTED_BURSTS, Account
+from emulator.model.links.link import REASONS
+from emulator.model.receiver import Belief, Heard
+from emulator.model.transit import Late
+from emulator.network import loop_wire, packets, telemetry, wire
+from emulator.network.envelope import head_of
+from emulator.network.limits import Sizes
+from emulator.network.mailbox import Mailbox, allowance
+from emulator.network.whereabouts import Whereabouts
+
+SIZES = st.builds(
+    Sizes,
+    n=st.integers(1, 4),
+    trials=st.sampled_from([1, 7, 8, 200]),
+    recorded=st.just(1),
+    batch=st.integers(1, 40),
+    window=st.integers(0, 5),
+    receivers=st.integers(1, 5),
+    header=st.integers(0, 2),
+    inputs=st.integers(0, 3),
+    period=st.integers(1, 50),
+)
+
+
+def largest(sizes: Sizes) -> dict[str, bytes]:
+    """Kind of key → the largest message on it."""
+    n, R, c, recorded = sizes.n, sizes.trials, sizes.batch, sizes.recorded
+    z, all_of, k = np.ones((n, R)), np.ones(R, bool), 2**40
+    header = np.ones((sizes.header, R), np.int64) if sizes.header else None
+    heard = Heard(all_of, z, header)
+    late = tuple(Late(k, heard) for _ in range(2 * (sizes.window + 1)))
+    packed = b"" if header is None else packets.packed_header(header, all_of)
+    digests = {k: np.ones((R, 32), np.uint8), k + 1: np.ones((R, 32), np.uint8)}
+    u = np.ones((c, sizes.inputs, R)) if sizes.inputs else None
+    flags, counts = np.ones((c, R), bool), np.ones((c, R), np.uint16)
+    lost = {reason: np.ones(c, np.uint32) for reason in REASONS}
+    bursts, delays = np.ones(COUNTED_BURSTS, np.uint32), np.ones(sizes.window + 2, np.uint32)
+    account = Account(flags, lost, counts, bursts, delays, np.ones(c, np.uint32))
+    truth = telemetry.Truth(
+        k, np.ones((c, n, R)), flags, flags, flags, u, flags if sizes.inputs else None, np.ones((c, n, R))
+    )
+    report = telemetry.Report(
+        k,
+        np.ones((c, n, R)),
+        counts.astype(np.uint8),
+        np.ones((c, n, n, recorded)),
+        np.ones((c, 2)),
+        counts,
+        digests,
+        counts,
+    )
+    seconds = np.ones(c // sizes.period + 2)
+    reports = [
+        truth.pack(),
+        report.pack(),
+        telemetry.leaving(k, Belief(z, np.ones((n, n, R)), np.ones(R, np.uint8))),
+        loop_wire.Decisions(k, c, seconds, digests).pack(),
+        Whereabouts(k, tuple("evedrop/r0123abcd/progress/" + "n" * 32 for _ in range(sizes.receivers + 1))).pack(),
+        wire.refusal("evedrop/r0123abcd/progress/" + "n" * 32, "x" * 1000),
+    ]
+    names = [f"{i:032}" for i in range(sizes.receivers)]
+    return {
+        "uplink": packets.uplink(k, z, header, all_of, z),
+        "downlink": packets.delivery(k, b"\xff" * ((R + 7) // 8), z.tobytes(), late, packed, z.tobytes()),
+        "ack": packets.acknowledgement(k, all_of),
+        "estimate": loop_wire.known("x_hat", k, z),
+        "state": loop_wire.known("x", k, z),
+        "input": loop_wire.decided(k, np.ones((sizes.inputs, R)), all_of),
+        "telemetry": max(reports, key=len),
+        "journal": telemetry.Journal(k, c, dict.fromkeys(names, account)).pack(),
+        "progress": wire.progress(k),
+        "control": wire.control("again", n=k, k=k, links={name: [{"at": k, "cut": True}] * 100 for name in names}),
+    }
+
+
+@settings(max_examples=50)
+@given(SIZES)
+def test_whatever_a_run_sends_fits(sizes: Sizes) -> None:
+    """The largest message of every kind is within its limit, and the limit is not far above it where messages are large."""
+    for kind, message in largest(sizes).items():
+        limit = sizes.of_kinds[kind]
+        assert len(head_of("evedrop/r0123abcd/telemetry/" + "n" * 32)) + len(message) <= limit, kind
+        if kind != "control":
+            assert limit <= 3 * len(message) + 5000 * (sizes.receivers + 1), kind
+
+
+def test_what_waits_is_bounded_by_sender() -> None:
+    """Who sends more than is ever under way is named when the reader comes to it; what others sent is not lost before."""
+    mailbox = Mailbox({"eve": "evedrop/r/telemetry/eve", "sensor": "evedrop/r/telemetry/sensor"}, 10_000)
+    for _ in range(3):
+        mailbox.put("eve", bytes(2000))
+        assert mailbox.get() == ("eve", bytes(2000))
+    mailbox.put("sensor", b"truth")
+    mailbox.put("eve", True)
+    assert [mailbox.get(), mailbox.get()] == [("sensor", b"truth"), ("eve", True)]
+    with pytest.raises(Empty):
+        mailbox.get(timeout=0.0)
+    for _ in range(100):
+        mailbox.put("eve", bytes(2000))
+    with pytest.raises(
+        MalformedMessage, match="telemetry/eve: more than 10000 bytes that nobody has read yet"
+    ) as found:
+        mailbox.get()
+    assert found.value.at_fault == ("eve",)
+    assert mailbox._queue.qsize() < 10
+
+
+def test_a_window_in_some_rounds_is_allowed() -> None:
+    """All that is sent again in four rounds, before anything is read, is no flood."""
+    assert allowance(10**6, 100, 25) > 4 * (100 // 25 + 2) * 10**6

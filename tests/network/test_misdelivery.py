@@ -1,0 +1,237 @@
+"""Messages that arrive on a key they do not name: each kind of reader drops and counts them, and the connection is renewed."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import pytest
+import zenoh
+from bench import LIMIT_SECONDS, scenario_of, until
+
+from emulator.brief import Brief
+from emulator.control import Control
+from emulator.errors import MalformedMessage
+from emulator.network.access import Keys
+from emulator.network.declared import InboxClosedError, Question
+from emulator.network.doorkeeping import users_file
+from emulator.network.envelope import enclosed, head_of, named_in
+from emulator.network.operator import Answer, Request, ask
+from emulator.network.session import Session
+from emulator.network.wire import Reader, control, progress
+from emulator.runs.briefs import Observation, briefs_of
+from emulator.runs.ports import free_port
+from tests.proxy import Cable, cable
+
+GOOD = progress(7)
+
+
+def foreign(keys: Keys, key: str) -> list[bytes]:
+    """Messages that do not belong on a key: of another key, of another run, and with no envelope."""
+    other = key.replace(keys.run, "another-run")
+    return [enclosed(keys.control("smart"), GOOD), enclosed(other, GOOD), GOOD, b"", b"\xc1", head_of(key)[:-1]]
+
+
+class Stage:
+    """A Zenoh router without access control in this very process, and briefs that lead to it through a cable."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        port = free_port()
+        self.cable: Cable = stack.enter_context(cable(port))
+        observation = Observation(folder / "results", False)
+        self.briefs = briefs_of(scenario_of(), self.cable.endpoint, observation, ends_with_stdin=False)
+        with users_file({"operator": "password", **{one.user: one.password for one in self.briefs.values()}}) as users:
+            config = {
+                "mode": "router",
+                "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
+                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+                "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
+            }
+            self.router = stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(config))))
+        self.keys = Keys(self.briefs["eve"].run)
+
+    @property
+    def eve(self) -> Brief:
+        """Of an eavesdropper."""
+        return self.briefs["eve"]
+
+    def reads(self, key: str) -> None:
+        """Wait until somebody reads a key."""
+        publisher = self.router.declare_publisher(key)
+        until(lambda: publisher.matching_status.matching, f"a reader of {key}")
+        publisher.undeclare()
+
+    def put(self, key: str, messages: list[bytes]) -> None:
+        """Put messages on a key, whatever they name."""
+        self.reads(key)
+        for message in messages:
+            self.router.put(key, message, congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    """A router, for one test."""
+    with ExitStack() as stack:
+        yield Stage(tmp_path, stack)
+
+
+def test_a_message_names_its_key() -> None:
+    """The key is read from the front of a message; of anything else there is none."""
+    assert named_in(enclosed("evedrop/r/uplink", GOOD)) == "evedrop/r/uplink"
+    for message in (b"", b"\xc1", GOOD, b"\xd9\xff", b"\xa5uplin"[:3]):
+        assert named_in(message) is None
+
+
+def test_an_inbox_drops_what_names_another_key(stage: Stage, capfd: pytest.CaptureFixture[str]) -> None:
+    """Only what names its own key is read; the rest is counted, and standard error says which key was named."""
+    key = stage.keys.downlink("eve")
+    with Session(stage.eve) as session:
+        inbox = session.inbox(key)
+        stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
+        assert inbox.recv() == GOOD
+        assert session.dropped == len(foreign(stage.keys, key))
+    said = capfd.readouterr().err
+    assert f"eve: dropped a message that came on {key} and names {stage.keys.control('smart')} (number 1)" in said
+
+
+def test_a_funnel_drops_what_names_another_key(stage: Stage) -> None:
+    """As an inbox, whatever the key is."""
+    key, heard = stage.keys.telemetry("eve"), SimpleQueue[bytes]()
+    with Session(stage.briefs["observer"]) as session:
+        session.funnel(key, heard.put)
+        stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
+        assert heard.get(timeout=LIMIT_SECONDS) == GOOD
+        assert heard.empty()
+        assert session.dropped == len(foreign(stage.keys, key))
+
+
+def test_commands_that_name_another_process_are_dropped(stage: Stage) -> None:
+    """A command on a process's own control key is obeyed only if it is meant for it."""
+    key, other = stage.keys.control("eve"), stage.keys.control("mallory")
+    with Session(stage.eve) as session:
+        stage.put(key, [enclosed(other, control("end")), enclosed(key, control("start"))])
+        assert session.command().text("do") == "start"
+        assert session.dropped == 1
+
+
+def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None:
+    """Nor handed on; one that names its key is."""
+    key, asked = stage.keys.control("observer"), SimpleQueue[Question]()
+    with Session(stage.briefs["observer"]) as session:
+        session.asked(key, asked.put)
+        querier = stage.router.declare_querier(key)
+        until(lambda: querier.matching_status.matching, "somebody to be asked")
+        for message in foreign(stage.keys, key):
+            assert list(stage.router.get(key, payload=message, timeout=2.0)) == []
+        assert asked.empty()
+        assert session.dropped == len(foreign(stage.keys, key))
+        threading.Thread(target=lambda: list(stage.router.get(key, payload=enclosed(key, GOOD)))).start()
+        question = asked.get(timeout=LIMIT_SECONDS)
+        assert question.payload == GOOD
+        question.answer(GOOD)
+
+
+def test_an_answer_that_names_another_key_is_none(stage: Stage) -> None:
+    """The operator takes an answer for its own only if it names the key at which it asked."""
+    key, answers = stage.keys.control("observer"), SimpleQueue[bytes]()
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(key, answers.get())
+        query.drop()
+
+    stage.router.declare_queryable(key, answer)
+    entry = Control(stage.eve.run, stage.eve.router, "operator", "password")
+    for message in (*foreign(stage.keys, key), enclosed(stage.keys.control("eve"), Answer(3, "no").pack())):
+        answers.put(message)
+        assert ask(entry, Request("status"), 2.0) is None
+    answers.put(enclosed(key, Answer(7, "yes").pack()))
+    assert ask(entry, Request("status"), LIMIT_SECONDS) == Answer(7, "yes")
+
+
+def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
+    """What names its key and is no message is not dropped: the error names the key, and with it the sender."""
+    key = stage.keys.downlink("eve")
+    with Session(stage.eve) as session:
+        inbox = session.inbox(key)
+        stage.put(key, [enclosed(key, b"\xc1")])
+        with pytest.raises(MalformedMessage, match=f"malformed message on {key}"):
+            Reader(key, inbox.recv())
+        assert session.dropped == 0
+
+
+def test_a_lost_connection_is_replaced(stage: Stage) -> None:
+    """By another session with another id, on which everything is declared again: inbox, funnel, outlet, watch and token."""
+    keys, watched, tokens = stage.keys, SimpleQueue[bool](), SimpleQueue[bool]()
+    heard, funnelled = SimpleQueue[bytes](), SimpleQueue[bytes]()
+    stage.router.declare_subscriber(keys.progress("eve"), lambda sample: heard.put(sample.payload.to_bytes()))
+    token = stage.router.liveliness().declare_token(keys.alive("router"))
+    stage.router.liveliness().declare_subscriber(
+        keys.alive("eve"), lambda sample: tokens.put(sample.kind == zenoh.SampleKind.PUT)
+    )
+    with Session(stage.eve) as session:
+        inbox = session.inbox(keys.downlink("eve"))
+        session.funnel(keys.telemetry("eve"), funnelled.put)
+        put = session.outlet(keys.progress("eve"))
+        session.watch("router", watched.put)
+        session.ready()
+        assert watched.get(timeout=LIMIT_SECONDS)
+        assert tokens.get(timeout=LIMIT_SECONDS)
+        stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(1))])
+        stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(0))])
+        assert funnelled.get(timeout=LIMIT_SECONDS) == progress(0)  # so the one before it has arrived too
+        ids = {str(session._connection.session.zid())}
+        for number in range(3):
+            stage.cable.flap()
+            assert [tokens.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
+            assert [watched.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
+            ids.add(str(session._connection.session.zid()))
+            assert len(ids) == number + 2
+        stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
+        stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
+        assert [inbox.recv(), inbox.recv()] == [progress(1), progress(2)]
+        assert funnelled.get(timeout=LIMIT_SECONDS) == progress(3)
+        until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
+        put(GOOD)
+        assert heard.get(timeout=LIMIT_SECONDS) == enclosed(keys.progress("eve"), GOOD)
+    assert tokens.get(timeout=LIMIT_SECONDS) is False
+    token.undeclare()
+
+
+def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -> None:
+    """A message of another key makes a process open another session: nothing of the old one is trusted any more."""
+    key, other = stage.keys.downlink("eve"), stage.keys.downlink("mallory")
+    with Session(stage.eve) as session:
+        inbox = session.inbox(key)
+
+        def renewed() -> bool:
+            stage.router.put(key, enclosed(other, GOOD))
+            return session._connection.openings > 1
+
+        reads = threading.Thread(target=lambda: list(inbox))
+        reads.start()
+        until(renewed, "another session")
+    reads.join(LIMIT_SECONDS)
+    assert not reads.is_alive()
+
+
+def test_an_inbox_that_is_closed_says_so(stage: Stage) -> None:
+    """Nobody waits for ever for what cannot arrive any more."""
+    with Session(stage.eve) as session:
+        inbox = session.inbox(stage.keys.downlink("eve"))
+        caught: list[Any] = []
+
+        def read() -> None:
+            try:
+                inbox.recv()
+            except InboxClosedError as error:
+                caught.append(error)
+
+        reads = threading.Thread(target=read)
+        reads.start()
+    reads.join(LIMIT_SECONDS)
+    assert [str(error) for error in caught] == [stage.keys.downlink("eve")]

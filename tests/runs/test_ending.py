@@ -1,0 +1,144 @@
+"""The end of a run is told until everybody has heard it, connections that are lost just then included."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from emulator.network.access import Keys
+from emulator.network.wire import Reader, over
+from emulator.runs import conductor
+from emulator.runs.conductor import Conductor, Stop
+
+RUN = "r"
+NAMES = ("router", "relay", "sensor", "legitimate", "smart")
+
+
+class Network:
+    """The part of a session that a conductor uses, with processes that do as the test says when they are told something."""
+
+    keys, allowance, patience, router_id = Keys(RUN), 2**20, 1.0, "id"
+
+    def __init__(self) -> None:
+        self.reads: dict[str, Callable[[bytes], None]] = {}
+        self.watches: dict[str, Callable[[bool], None]] = {}
+        self.told: dict[str, int] = dict.fromkeys(NAMES, 0)
+        self.does: dict[str, Callable[[int], None]] = {}
+        """Process → what it does when it is told for the so-many-th time that the run is over."""
+
+    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+        """Remember who reads."""
+        self.reads[key] = receive
+
+    def watch(self, name: str, changed: Callable[[bool], None]) -> None:
+        """Everybody is there."""
+        self.watches[name] = changed
+        changed(True)
+
+    def asked(self, key: str, receive: Callable[[Any], None]) -> None:
+        """Nobody asks."""
+
+    def outlet(self, key: str) -> Callable[[bytes], None]:
+        """What is said to a process reaches it at once."""
+        name = key.rpartition("/")[2]
+
+        def put(payload: bytes) -> None:
+            assert Reader(key, payload).text("do") == "end"
+            self.told[name] += 1
+            self.does.get(name, lambda _: self.ends(name))(self.told[name])
+
+        return put
+
+    def linked(self) -> bool:
+        """Always."""
+        return True
+
+    def ready(self) -> None:
+        """Nobody to wait for."""
+
+    def ends(self, name: str, misdelivered: int = 0) -> None:
+        """A process confirms that the run is over, and leaves; routers stay for others to leave."""
+        if name == "relay":
+            self.watches[name](False)
+            return
+        self.reads[self.keys.journal if name == "router" else self.keys.telemetry(name)](over(misdelivered))
+        if name != "router":
+            self.watches[name](False)
+
+
+@pytest.fixture
+def network(monkeypatch: pytest.MonkeyPatch) -> Network:
+    """A network whose conductor has less patience."""
+    for name in ("_END_SECONDS", "_LOOK_SECONDS"):
+        monkeypatch.setattr(conductor, name, 0.02)
+    monkeypatch.setattr(conductor, "_RETURN_SECONDS", 0.3)
+    return Network()
+
+
+def ended(network: Network, patience: float = 30.0) -> tuple[Conductor, float]:
+    """The conductor of a run that has told its end, and the seconds that this took."""
+    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True)  # type: ignore[arg-type]
+    one.assemble()
+    began = time.monotonic()
+    one.end(patience)
+    return one, time.monotonic() - began
+
+
+def test_everybody_is_told_once(network: Network) -> None:
+    """Who confirms the end is not told again, and says how many messages it dropped."""
+    network.does["smart"] = lambda _: network.ends("smart", 3)
+    one, _ = ended(network)
+    assert network.told == dict.fromkeys(NAMES, 1)
+    assert one.misdelivered == {"router": 0, "sensor": 0, "legitimate": 0, "smart": 3}
+
+
+def test_a_process_that_loses_its_connection_just_then_is_told_again(network: Network) -> None:
+    """It vanishes without a word, comes back, and is told again."""
+
+    def lost(times: int) -> None:
+        network.watches["smart"](False)
+        if times == 1:
+            network.watches["smart"](True)
+        else:
+            network.reads[network.keys.telemetry("smart")](over(0))
+
+    network.does["smart"] = lost
+    ended(network)
+    assert network.told["smart"] == 2
+
+
+def test_a_process_that_vanishes_without_a_word_is_not_waited_for_long(network: Network) -> None:
+    """Its last message may have been lost: after a while it has left."""
+    network.does["smart"] = lambda _: network.watches["smart"](False)
+    one, seconds = ended(network)
+    assert network.told["smart"] == 1
+    assert "smart" not in one.misdelivered
+    assert 0.3 <= seconds < 10.0
+
+
+def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
+    """One that is cut off when the run is over is told as soon as it is back; for as long as the scenario allows."""
+
+    def gone(_: int) -> None:
+        network.ends("sensor")
+        network.watches["smart"](True)
+
+    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True)  # type: ignore[arg-type]
+    one.assemble()
+    network.watches["smart"](False)
+    network.does["sensor"] = gone
+    one._note(one._next())
+    one.end(30.0)
+    assert network.told["smart"] == 1
+    assert "smart" in one.misdelivered
+
+
+@pytest.mark.parametrize("name", ["router", "relay"])
+def test_a_router_is_told_until_it_confirms(name: str, network: Network) -> None:
+    """What a router is told may be lost with a connection too."""
+    network.does[name] = lambda times: network.ends(name) if times == 3 else None
+    ended(network)
+    assert network.told[name] == 3

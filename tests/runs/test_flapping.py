@@ -1,0 +1,155 @@
+"""Connections that flap: cut again and again and back at once. Nothing wrong gets into the results, and nothing is lost."""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from emulator.brief import read_brief
+from emulator.network.access import Keys
+from emulator.network.envelope import enclosed
+from emulator.network.session import client_config
+from emulator.network.wire import control
+from emulator.runs.ports import free_port
+from emulator.scenario import Scenario, load
+from tests.by_hand import as_if_undisturbed, by_hand
+from tests.conftest import wait_until
+from tests.proxy import cable
+from tests.resets import reset_connections
+from tests.runs.test_recovery import ACKNOWLEDGED, INNOVATION, LOOP
+
+SEEDS = 50
+GAPS = (0.0, 0.01, 0.03, 0.1)
+SCENARIO = """
+title = "Flapping"
+slots = 1500
+seed = 20
+trials = 3
+pace = 0.002
+[process]
+A = [[1.0, 0.1], [0.0, 0.98]]
+Q = [[0.01, 0.0], [0.0, 0.01]]
+initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
+[encoding]
+{encoding}
+[legitimate]
+link = {{ quality = 0.8 }}
+{more_of_legitimate}
+[eavesdroppers.naive]
+strategy = "naive"
+link = {{ quality = 0.9 }}
+[eavesdroppers.other]
+strategy = "{strategy}"
+link = {{ quality = 0.7 }}
+[eavesdroppers.third]
+strategy = "{strategy}"
+link = {{ quality = 0.6, duplicate = 0.1 }}
+{more}
+"""
+PLAIN = {"encoding": INNOVATION, "strategy": "smart", "more": "", "more_of_legitimate": ""}
+KINDS = (
+    PLAIN,
+    {
+        **PLAIN,
+        "encoding": 'scheme = "acknowledged"',
+        "strategy": "reference",
+        "more": ACKNOWLEDGED.replace("smart", "other"),
+    },
+    {**PLAIN, "more": LOOP.format("period = 5"), "more_of_legitimate": "knows_input = true"},
+)
+"""Of a run: with no way back, with one from slot to slot, and with a closed loop."""
+
+
+def scenario_of(folder: Path, kind: dict[str, str]) -> Scenario:
+    """A scenario with some eavesdroppers, whose deliveries can be mistaken for each other's."""
+    path = folder / "flapping.toml"
+    path.write_text(SCENARIO.format(**kind))
+    return load(path)
+
+
+def flaps(seed: int, bursts: int = 2) -> list[float]:
+    """Seconds to wait before each cut: some bursts of 5 to 20."""
+    rng = random.Random(seed)  # noqa: S311 - no secret
+    waits: list[float] = []
+    for _ in range(bursts):
+        count = rng.randint(5, 20)
+        waits += [rng.uniform(0.2, 0.6), *(rng.choice(GAPS) for _ in range(count - 1))]
+    return waits
+
+
+def disturbed(seed: int, folder: Path, how: str) -> None:
+    """A run in which all connections with the router are cut in bursts, and back at once, is as if nothing had been."""
+    scenario = scenario_of(folder, KINDS[seed % len(KINDS)])
+    port = free_port()
+    with ExitStack() as stack:
+        wire = stack.enter_context(cable(port))
+        run = stack.enter_context(by_hand(scenario, folder, f"tcp/127.0.0.1:{port}"))
+        everybody = ("sensor", *scenario.receivers, "observer")
+        run.write(**(dict.fromkeys(everybody, wire.endpoint) if how == "proxy" else {}))
+        run.start()
+        run.running(more_than=100)
+        for wait in flaps(seed):
+            time.sleep(wait)  # when it is cut is what is tested
+            if how == "proxy":
+                wire.flap()
+            else:
+                reset_connections(run.processes["router"].pid, port)
+        assert run.done() < scenario.slots, "the run must not end before it is disturbed"
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, folder / "memory")
+        assert run.summary["outages"]
+
+
+def may_reset() -> bool:
+    """Whether this process may reset the connections of one that it has started."""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        try:
+            reset_connections(child.pid, 1)
+        except PermissionError:
+            return False
+        finally:
+            child.kill()
+    return True
+
+
+def test_connections_that_flap_change_nothing(tmp_path: Path) -> None:
+    """Cut by a proxy between the router and everybody else: digests and links are those in memory."""
+    disturbed(0, tmp_path, "proxy")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_connections_that_are_reset_change_nothing(seed: int, tmp_path: Path) -> None:
+    """Reset at the router's own end, which makes Zenoh mistake keys most often; by the proxy where that is not permitted."""
+    disturbed(seed, tmp_path, "reset" if may_reset() else "proxy")
+
+
+def test_a_message_of_another_key_is_dropped_counted_and_sent_again(tmp_path: Path) -> None:
+    """A delivery that arrives on another receiver's key changes no figure: the summary says who dropped how many."""
+    scenario = scenario_of(tmp_path, PLAIN)
+    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        run.running(more_than=100)
+        # The observer may write there: its credentials stand in for a connection that takes one key for the other.
+        observer = read_brief(tmp_path / "briefs" / "observer.json")
+        keys = Keys(observer.run)
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(observer)))) as session:
+            for name in ("other", "sensor"):
+                publisher = session.declare_publisher(keys.control(name))
+                wait_until(lambda publisher=publisher: publisher.matching_status.matching, f"{name} to read")
+                publisher.put(enclosed(keys.downlink("legitimate"), control("end")))
+            publisher.put(enclosed(Keys("another").control("sensor"), control("end")))
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert run.summary["misdelivered"]["other"] == 1
+        assert 1 <= run.summary["misdelivered"]["sensor"] <= 2
+        assert "dropped a message that came on" in run.log("other").read_text()

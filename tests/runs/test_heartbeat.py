@@ -1,0 +1,100 @@
+"""An observer that lives is not given up, however long it takes to finish; one that stands still is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from emulator.runs.growing import UNFINISHED, last_round
+from tests.conftest import Evedrop, Live, wait_until
+
+SLOW = """
+import sys
+import time
+if sys.orig_argv[-1].endswith('/observer.json'):
+    import emulator.runs.heartbeat as heartbeat
+    import emulator.runs.results as results
+    honest = results.finish
+    def finish(folder):
+        time.sleep({finish})
+        honest(folder)
+    results.finish = finish
+    heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
+elif not sys.orig_argv[-1].endswith('.json'):
+    import emulator.runs.children as children
+    import emulator.runs.launcher as launcher
+    honest = children.Children.news
+    def news(self, seconds):
+        if self.started:
+            children.SILENCE_SECONDS = launcher.SILENCE_SECONDS = {silence}
+        return honest(self, seconds)
+    children.Children.news = news
+"""
+"""How long an observer takes to make Parquet files, and after how long a silence in a run its launcher gives it up."""
+
+
+def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str) -> Live:
+    """A run that finishes slowly."""
+    (evedrop.folder / "sitecustomize.py").write_text(SLOW.format(finish=finish, silence=silence))
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    return evedrop.live("eavesdroppers", "--slots", "300", *arguments, env=environment)
+
+
+def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> None:
+    """Much longer than a silence may last: the observer says that it lives, and the run is complete."""
+    live = slow(evedrop, 9.0, 3.0)
+    done = live.end()
+    assert done.status == 0, done.err
+    live.nothing_left()
+    assert live.results.summary["ended"] == "complete"
+    assert live.results.trials.num_rows == 4 * 300
+
+
+def test_a_run_that_is_interrupted_while_it_finishes_is_finished(evedrop: Evedrop) -> None:
+    """The launcher waits as long as the observer says that it lives."""
+    live = slow(evedrop, 6.0, 3.0)
+    wait_until(lambda: last_round(live.folder).slots == 300, "all slots on disk")
+    live.process.send_signal(signal.SIGINT)
+    done = live.end()
+    assert done.status == 130, done.err
+    live.nothing_left()
+    assert not (live.folder / UNFINISHED).exists()
+    assert live.results.trials.num_rows == 4 * 300
+
+
+def test_an_observer_that_stands_still_is_named_and_its_rows_are_kept(evedrop: Evedrop) -> None:
+    """Stopped, it says nothing; the launcher ends the run and makes tables of what it had written."""
+    live = slow(evedrop, 0.0, 3.0, "--slots", "1000000")
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    os.kill(live.child("observer"), signal.SIGSTOP)
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith("evedrop: observer gave no sign of life any more")
+    live.nothing_left()
+    assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
+
+
+BUSY = "import time\nwhile True:\n    pass\n"
+
+
+@pytest.mark.long
+def test_a_run_on_a_starved_machine_comes_to_its_end(evedrop: Evedrop) -> None:
+    """One processor for all its processes, at the lowest priority, beside six that never rest."""
+    loops = [subprocess.Popen(["taskset", "-c", "0", sys.executable, "-c", BUSY]) for _ in range(6)]
+    try:
+        command = ["taskset", "-c", "0", "nice", "-n", "10", sys.executable, "-m", "emulator"]
+        words = ["run", "eavesdroppers", "--slots", "3000", "--view", "off", "--out", "run"]
+        done = subprocess.run(
+            [*command, *words], cwd=evedrop.folder, env=evedrop.environment, capture_output=True, text=True, check=False
+        )
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+    assert done.returncode == 0, done.stderr
+    assert Live(loops[0], evedrop.temporary, Path(evedrop.folder / "run")).results.summary["ended"] == "complete"  # type: ignore[arg-type]

@@ -1,0 +1,249 @@
+"""Ctrl-C, SIGTERM and SIGHUP at any moment, of every command: status 130, results that can be read, no traceback, no process."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emulator.runs.growing import UNFINISHED, last_round
+from emulator.runs.ports import free_port
+from emulator.runs.results import load_results
+from emulator.scenario import load
+from tests.by_hand import by_hand
+from tests.conftest import Done, Evedrop, Live, wait_until
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDLESS = ("--slots", "1000000")
+LINES = ("evedrop: interrupted", "evedrop: warning", "^C")
+
+Moment = Callable[[Live], object]
+
+
+def heeds(pid: int) -> bool:
+    """Whether a process has its handlers for SIGHUP and SIGTERM in place."""
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
+        return all(caught >> (number - 1) & 1 for number in (signal.SIGHUP, signal.SIGTERM))
+    return False
+
+
+def has_loaded(pid: int, library: str) -> bool:
+    """Whether a process has come to import a library."""
+    with contextlib.suppress(OSError):
+        return library in Path(f"/proc/{pid}/maps").read_text()
+    return False
+
+
+MOMENTS: dict[str, Moment] = {
+    "first": lambda live: heeds(live.process.pid),
+    "import": lambda live: has_loaded(live.process.pid, "_multiarray_umath"),
+    "folder": lambda live: live.folder.exists(),
+    "child": lambda live: live.children(),
+    "done": lambda live: live.done() > 0,
+    "disk": lambda live: last_round(live.folder).slots > 0,
+    "finish": lambda live: (live.folder / UNFINISHED / "slots.parquet").exists() or (live.folder / "slots.parquet").exists(),
+}  # fmt: skip
+
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "run": ("run", "eavesdroppers", *ENDLESS, "--view", "off"),
+    "short run": ("run", "eavesdroppers", "--slots", "500", "--view", "off"),
+    "shards": ("run", "eavesdroppers", *ENDLESS, "--trials", "4", "--set", "shards=2", "--view", "off"),
+    "montecarlo": ("montecarlo", "eavesdroppers", "--trials", "100000", "--slots", "1000", "--workers", "1"),
+    "workers": ("montecarlo", "eavesdroppers", "--trials", "100000", "--slots", "1000", "--workers", "2"),
+    "sweep": ("sweep", "eavesdroppers", "--over", "slots=100:4000:1", "--trials", "100", "--workers", "1"),
+    "compare": ("compare", "eavesdroppers", "--trials", "5000", "--slots", "500", "--workers", "1"),
+    "test": ("test", "eavesdroppers", "vehicle", "--in-memory", "--trials", "20000"),
+}
+QUICK = (
+    ("run", "first", signal.SIGTERM),
+    ("run", "import", signal.SIGHUP),
+    ("short run", "finish", signal.SIGINT),
+    ("montecarlo", "import", signal.SIGTERM),
+    ("workers", "done", signal.SIGHUP),
+    ("test", "import", signal.SIGINT),
+)
+REST = [
+    (command, moment, number)
+    for command in COMMANDS
+    for moment in MOMENTS
+    for number in SIGNALS
+    if (command, moment, number) not in QUICK
+    and (moment != "finish" or command == "short run")
+    and (moment not in {"child", "disk"} or command in {"run", "short run"})
+    and (moment != "folder" or command not in {"test"})
+]
+
+
+def interrupted(live: Live, done: Done) -> None:
+    """Check how a command ended that was sent a signal."""
+    assert done.status == 130, (done.status, done.err)
+    assert "Traceback" not in done.err + done.out
+    assert all(line.startswith(LINES) for line in done.err.splitlines()), done.err
+    live.nothing_left()
+    if (live.folder / "summary.json").exists() or (live.folder / UNFINISHED).exists():
+        results = load_results(live.folder)
+        assert results.slots.num_rows >= 0
+        assert results.digests.num_rows >= 0
+
+
+@pytest.mark.parametrize(
+    ("command", "moment", "number"),
+    [*QUICK, *(pytest.param(*case, marks=pytest.mark.long) for case in REST)],
+    ids=lambda part: part.name if isinstance(part, signal.Signals) else part,
+)
+def test_a_signal_ends_a_command_in_order(evedrop: Evedrop, command: str, moment: str, number: signal.Signals) -> None:
+    """All three the same, from the first moment on that Python lets us decide, to the last file."""
+    if moment == "done":  # only then it must tell how far it is
+        live = evedrop.started(*COMMANDS[command])
+    else:
+        live = evedrop.begun(*COMMANDS[command], "--out", "run")
+        live.folder = evedrop.folder / "run"
+    wait_until(lambda: MOMENTS[moment](live) or live.process.poll() is not None, moment)
+    if live.process.poll() is None:
+        live.process.send_signal(number)
+    done = live.end()
+    if moment == "finish" and done.status in {0, 1}:  # it had ended before
+        assert live.results.summary["ended"] == "complete"
+        return
+    interrupted(live, done)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+@pytest.mark.parametrize("command", ["short run", "montecarlo", "sweep"])
+def test_a_signal_may_come_at_any_time(evedrop: Evedrop, command: str, number: signal.Signals) -> None:
+    """After 0, 1, 2, … fortieths of the time that a run takes."""
+    begun = time.monotonic()
+    live = evedrop.started(*COMMANDS["short run"], out="first")
+    assert live.end().status in {0, 1}
+    takes = time.monotonic() - begun
+    for part in range(40):
+        live = evedrop.started(*COMMANDS[command], out=f"{command.rsplit(maxsplit=1)[-1]}-{part}")
+        wait_until(lambda live=live: heeds(live.process.pid), "handlers")  # type: ignore[misc]
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            live.process.wait(takes * part / 40)
+        live.process.send_signal(number)
+        done = live.end()
+        if done.status in {0, 1}:
+            assert live.results.summary["ended"] == "complete"
+        else:
+            interrupted(live, done)
+
+
+def test_a_second_signal_changes_nothing(evedrop: Evedrop) -> None:
+    """An impatient user, or a system that shuts down, sends another while the first is heeded."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    live.process.send_signal(signal.SIGINT)
+    while live.process.poll() is None:
+        live.process.send_signal(signal.SIGINT)
+        live.process.send_signal(signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            live.process.wait(0.05)
+    done = live.end()
+    assert done.status == 130
+    assert "Traceback" not in done.err
+    live.nothing_left()
+    assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
+
+
+@pytest.mark.parametrize("first", ["command", pytest.param("children", marks=pytest.mark.long)])
+def test_a_hang_up_of_everybody_is_one_of_the_run(evedrop: Evedrop, first: str) -> None:
+    """Every process of a run gets it, in whatever order: 130, and the results are written."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    children = [*live.children().values()]
+    for pid in [live.process.pid, *children] if first == "command" else [*children, live.process.pid]:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGHUP)
+    interrupted(live, live.end())
+    assert live.results.summary["ended"] == "interrupted"
+    assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
+
+
+IN_TERMINAL = """
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.executable, [sys.executable, "-m", "emulator", *sys.argv[1:]])
+"""
+"""The command, as what a terminal was opened for."""
+
+
+def test_a_terminal_that_closes_ends_the_run(evedrop: Evedrop) -> None:
+    """The system hangs up on who runs in it, whose output goes nowhere any more: still 130, and whole results."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", IN_TERMINAL, "run", "eavesdroppers", *ENDLESS, "--view", "off", "--out", "run"],
+        cwd=evedrop.folder, stdin=theirs, stdout=theirs, stderr=theirs, env={**evedrop.environment, "TERM": "xterm"},
+        start_new_session=True, text=True,
+    )  # fmt: skip
+    os.close(theirs)
+    live = Live(process, evedrop.temporary, evedrop.folder / "run")
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    os.close(ours)
+    wait_until(lambda: process.poll() is not None, "an end")
+    assert process.returncode == 130
+    live.nothing_left()
+    assert live.results.summary["ended"] == "interrupted"
+    assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
+
+
+def test_nohup_keeps_a_run_from_hanging_up(evedrop: Evedrop) -> None:
+    """A signal that was ignored when the command was started stays ignored, in all its processes."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        live = evedrop.live("eavesdroppers", "--slots", "3000")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    for pid in (live.process.pid, *live.children().values()):
+        os.kill(pid, signal.SIGHUP)
+    done = live.end()
+    assert done.status == 0, done.err
+    assert live.results.summary["slots"] == 3000
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, *(pytest.param(one, marks=pytest.mark.long) for one in SIGNALS[:2])])
+def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Signals) -> None:
+    """A receiver, the sensor and the router at once, and the observer with its results, whatever they wait for."""
+    with by_hand(load("eavesdroppers", {"slots": 1_000_000}), tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start()
+        wait_until(lambda: last_round(run.folder / "run").slots > 0, "slots on disk")
+        run.processes["observer"].send_signal(number)
+        assert run.processes["observer"].wait(60) == 130
+        results = load_results(run.folder / "run")
+        assert results.summary["ended"] == "interrupted"
+        assert results.slots.num_rows == 4 * results.summary["slots"] > 0
+    (tmp_path / "second").mkdir()
+    with by_hand(load("eavesdroppers"), tmp_path / "second", f"tcp/127.0.0.1:{free_port()}") as run:
+        run.write()
+        run.start("router", "sensor", "smart")  # which wait for the others
+        for name in ("smart", "sensor", "router"):
+            wait_until(lambda name=name: heeds(run.processes[name].pid), f"{name} with handlers")  # type: ignore[misc]
+            run.processes[name].send_signal(number)
+            assert run.processes[name].wait(60) == 130
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
+def test_a_signal_waits_until_a_process_of_a_run_heeds_it(evedrop: Evedrop, number: signal.Signals) -> None:
+    """Sent while its interpreter starts, before any line of ours: it ends with 130, without a traceback, and is named."""
+    begin = "import os, sys\nif sys.orig_argv[-1].endswith('/naive.json'):\n    os.kill(os.getpid(), NUMBER)\n"
+    (evedrop.folder / "sitecustomize.py").write_text(begin.replace("NUMBER", str(int(number))))
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    live = evedrop.live("eavesdroppers", *ENDLESS, env=environment)
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith("evedrop: naive was interrupted by a signal")
+    assert "Traceback" not in done.err
+    live.nothing_left()

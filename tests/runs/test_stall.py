@@ -1,0 +1,224 @@
+"""Who a run that stands still waits for, and when that ends it; no clock but the test's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+
+from emulator.errors import Silence
+from emulator.network.access import Keys
+from emulator.network.whereabouts import Whereabouts
+from emulator.runs import stall
+from emulator.runs.stall import Stall, patience_of, silent_of
+
+KEYS = Keys("r")
+WINDOW = 100
+
+
+def at(slot: int, *waits: str) -> Whereabouts:
+    """Where a process says to be."""
+    return Whereabouts(slot, waits)
+
+
+SENSOR_WAITS = at(150, KEYS.progress("eve"))
+ROUTER_WAITS = at(150, KEYS.uplink)
+RUNS = {
+    "a receiver that sleeps": (
+        {"sensor": 150, "router": 150, "legitimate": 150, "eve": 50},
+        {
+            "sensor": SENSOR_WAITS,
+            "router": ROUTER_WAITS,
+            "legitimate": at(150, KEYS.downlink("legitimate")),
+            "eve": at(77),
+        },
+        ["eve"],
+    ),
+    "a receiver that answers nothing": (
+        {"sensor": 150, "router": 150, "legitimate": 150, "eve": 50},
+        {"sensor": SENSOR_WAITS, "router": ROUTER_WAITS, "legitimate": at(150, KEYS.downlink("legitimate"))},
+        ["eve"],
+    ),
+    "a receiver that says to wait and reports nothing": (
+        {"sensor": 150, "router": 150, "legitimate": 150, "eve": 50},
+        {"sensor": SENSOR_WAITS, "router": ROUTER_WAITS, "eve": at(150, KEYS.downlink("eve"))},
+        ["eve"],
+    ),
+    "a receiver that reports and makes no progress known": (
+        {"sensor": 100, "router": 100, "legitimate": 100, "eve": 100},
+        {
+            "sensor": at(100, KEYS.progress("eve")),
+            "router": at(100, KEYS.uplink),
+            "legitimate": at(100, KEYS.downlink("legitimate")),
+            "eve": at(100, KEYS.downlink("eve")),
+        },
+        ["eve"],
+    ),
+    "a sensor that sleeps": (
+        {"sensor": 100, "router": 100, "legitimate": 100, "eve": 100},
+        {
+            "sensor": at(110),
+            "router": at(110, KEYS.uplink),
+            "legitimate": at(110, KEYS.downlink("legitimate")),
+            "eve": at(110, KEYS.downlink("eve")),
+        },
+        ["sensor"],
+    ),
+    "a router that sleeps": (
+        {"sensor": 150, "router": 100, "legitimate": 100, "eve": 100},
+        {
+            "sensor": at(150, KEYS.progress("eve"), KEYS.progress("legitimate")),
+            "router": at(110),
+            "legitimate": at(110, KEYS.downlink("legitimate")),
+            "eve": at(110, KEYS.downlink("eve")),
+        },
+        ["router"],
+    ),
+    "a router that keeps no journal": (
+        {"sensor": 150, "router": 50, "legitimate": 150, "eve": 150},
+        {"sensor": at(150, KEYS.progress("observer")), "router": at(150, KEYS.uplink)},
+        ["router"],
+    ),
+    "a controller that sleeps": (
+        {"sensor": 64, "router": 64, "legitimate": 64, "eve": 64},
+        {
+            "sensor": at(70, KEYS.input),
+            "router": at(71, KEYS.uplink),
+            "legitimate": at(71, KEYS.downlink("legitimate")),
+            "eve": at(71, KEYS.downlink("eve")),
+            "controller": at(70),
+        },
+        ["controller"],
+    ),
+    "a legitimate estimator that acknowledges nothing": (
+        {"sensor": 64, "router": 64, "legitimate": 64, "eve": 64},
+        {
+            "sensor": at(70, KEYS.acknowledgements),
+            "router": at(70, KEYS.acknowledged),
+            "legitimate": at(70),
+            "eve": at(71, KEYS.downlink("eve")),
+        },
+        ["legitimate"],
+    ),
+    "a peer that does not know the question is no suspect before one that idles": (
+        {"sensor": 100, "router": 100, "legitimate": 100, "eve": 100},
+        {"sensor": at(110), "router": at(110, KEYS.uplink), "eve": at(110, KEYS.downlink("eve"))},
+        ["sensor"],
+    ),
+}
+"""What happens → places by report, what is answered, and who is silent."""
+
+
+@pytest.mark.parametrize("what", RUNS)
+def test_who_is_silent(what: str) -> None:
+    """The process at the end of the chain of those who wait for each other, whoever else is idle."""
+    places, answers, silent = RUNS[what]
+    if "controller" in answers:
+        places = {**places, "controller": 64}
+    assert silent_of(places, answers, ["controller"]) == silent
+
+
+class Clock:
+    """In the place of the module `time`."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        """What the test has set."""
+        return self.now
+
+
+class Run:
+    """A run that stands still, watched."""
+
+    def __init__(self, patience: float, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock = Clock()
+        monkeypatch.setattr(stall, "time", self.clock)
+        self.asked = 0
+        self.answers: dict[str, Whereabouts] = {}
+        self.places = {"sensor": 60, "router": 60, "eve": 50}
+        self.stall = Stall(patience, 10, self.ask)
+
+    def ask(self) -> None:
+        """Everybody is asked, and answers."""
+        self.asked += 1
+        for name, where in self.answers.items():
+            self.stall.take(name, where)
+
+    def wait(self, seconds: float, done: int = 50, step: float = 0.25, **how: bool) -> None:
+        """Let time go by."""
+        end = self.clock.now + seconds
+        while self.clock.now < end:
+            self.clock.now += step
+            self.stall.look(done, self.reported, **{"held": False, "missing": False, **how})
+
+    def reported(self) -> Mapping[str, int]:
+        """How far everybody is."""
+        return self.places
+
+
+def test_a_silent_process_is_named_after_the_patience_and_not_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds of a run in which nothing happens are counted, from its last slot on; then the process is named."""
+    run = Run(20.0, monkeypatch)
+    run.answers = {"eve": at(55)}
+    run.wait(3.0)
+    run.wait(0.25, done=50)
+    run.wait(19.0)
+    assert run.asked > 3
+    said = r"eve: alive, and silent for 2\d s while the run waits for slot 50 \(eve is at slot 55"
+    with pytest.raises(Silence, match=said) as found:
+        run.wait(10.0)
+    assert found.value.at_fault == ("eve",)
+
+
+@pytest.mark.parametrize("how", ["held", "missing", "asleep", "joined"])
+def test_time_in_which_nobody_is_expected_to_do_anything_does_not_count(
+    how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the run is held or paused, somebody is cut off, this machine sleeps, or slots are joined, nobody is silent."""
+    run = Run(20.0, monkeypatch)
+    run.answers = {"eve": at(55)}
+    run.wait(15.0)
+    if how == "asleep":
+        run.clock.now += 5000.0
+    elif how == "joined":
+        run.places["eve"] = 51
+        run.wait(0.25, done=51)
+    else:
+        run.wait(500.0, **{how: True})
+    run.wait(5.0, done=run.places["eve"])
+    with pytest.raises(Silence):
+        run.wait(25.0, done=run.places["eve"])
+
+
+def test_a_slow_process_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that takes longer for a batch than the patience, but goes on from slot to slot, is waited for."""
+    run = Run(20.0, monkeypatch)
+    for slot in range(50, 60):
+        run.answers = {"eve": at(slot)}
+        run.wait(15.0)
+
+
+def test_slots_beyond_the_next_report_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who says to go on and on but never reports is silent all the same."""
+    run = Run(20.0, monkeypatch)
+    slot = 50
+
+    def go_on() -> None:
+        nonlocal slot
+        while True:
+            slot += 1
+            run.answers = {"eve": at(slot)}
+            run.wait(15.0)
+
+    with pytest.raises(Silence):
+        go_on()
+    assert slot <= 50 + 10 + 3
+
+
+def test_patience_allows_for_real_time() -> None:
+    """The scenario's longest outage, at least some seconds, and two batches in real time."""
+    assert patience_of(30.0, 0.0, 256) == 30.0
+    assert patience_of(0.0, 0.0, 256) == 5.0
+    assert patience_of(30.0, 60.0, 1) == 150.0
