@@ -5,6 +5,7 @@ A reader gives anything or raises an EvedropError; it is broken by any other err
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import io
 import json
@@ -12,12 +13,14 @@ import re
 import tomllib
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgpack
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
@@ -33,13 +36,18 @@ from emulator.runs.diff import difference
 from emulator.runs.estimates import warnings_of
 from emulator.runs.montecarlo import simulate
 from emulator.runs.reading import load_results
+from emulator.runs.results import ResultsWriter
+from emulator.runs.score import SlotSums
+from emulator.runs.scorekeeper import write_resolved
 from emulator.scenario import load, parse, shipped, value_of
 from emulator.traces import Recording
+from emulator.view.replay import replay
 from tests.fuzz.mutation import Mutator, words_of
 from tests.network import test_protocol
 
 Change = Callable[[Mutator, bytes], bytes]
 _EXAMPLES = Path(__file__).with_name("examples")
+_SLOTS_STREAM = "unfinished/slots-0.arrows"
 _DOCUMENTS = Path(__file__).parents[2] / "docs"
 
 
@@ -91,6 +99,25 @@ def _cells(mutator: Mutator, data: bytes) -> bytes:
     lines = changed if isinstance(changed, list) else [changed]
     texts = [",".join(map(str, row)) if isinstance(row, list) else str(row) for row in lines]
     return "\n".join(texts).encode("utf-8", "replace")
+
+
+def _as_parquet(mutator: Mutator, data: bytes) -> bytes:
+    """A table with some columns of another type, or rows that are not there."""
+    table = pq.read_table(io.BytesIO(data))
+    rows = mutator.tree(table.to_pylist())
+    try:
+        return _parquet_of(pa.Table.from_pylist(rows, table.schema if mutator.random.random() < 0.7 else None))
+    except (pa.ArrowException, TypeError, AttributeError, OverflowError, ValueError):
+        return mutator.raw(data)
+
+
+def _lines(mutator: Mutator, data: bytes) -> bytes:
+    """Lines of JSON, of which some say something else."""
+    lines = [
+        mutator.tree(json.loads(line)) if mutator.random.random() < 0.5 else json.loads(line)
+        for line in data.splitlines()
+    ]
+    return "".join(f"{json.dumps(line)}\n" for line in lines).encode("utf-8", "replace")
 
 
 # Scenarios
@@ -192,33 +219,65 @@ def _recordings() -> list[bytes]:
 @cache
 def _results() -> dict[str, bytes]:
     """Path → bytes of a results folder, of a short study."""
-    from tempfile import TemporaryDirectory
-
     with TemporaryDirectory() as name:
         folder = Path(name) / "run"
         scenario = load("eavesdroppers", {"slots": 12, "trials": 3, "record_trials": 2, "expect": []})
         simulate(scenario, folder, lambda _: None)
-        return {
-            str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
-        }
+        return _files_in(folder)
+
+
+@cache
+def _cut_short() -> dict[str, bytes]:
+    """The same of a run whose observer was killed after three rounds."""
+    with TemporaryDirectory() as name:
+        folder = Path(name) / "run"
+        folder.mkdir(mode=0o700)
+        scenario = load("eavesdroppers", {"slots": 12, "trials": 3, "record_trials": 2, "expect": []})
+        write_resolved(folder, scenario)
+        with contextlib.suppress(_Killed), ResultsWriter.of(folder, scenario) as writer:
+            for first in range(3):
+                for receiver in scenario.receivers:
+                    ones = SlotSums(*(np.ones(1) for _ in fields(SlotSums)))
+                    writer.slot_rows(first, receiver, ones, np.zeros(1))
+                writer._round()
+            found = _files_in(folder)
+            raise _Killed
+        return found
+
+
+class _Killed(Exception):
+    """The writer of results ends where it is."""
+
+
+def _files_in(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def _results_of(name: str) -> Callable[[], list[bytes]]:
     return lambda: [data for path, data in _results().items() if path.endswith(name)]
 
 
-def _in_results(file: str | None) -> Callable[[bytes, Path], None]:
-    """Read a results folder of which one file is as given; None is whichever has as many bytes."""
+def _in_results(
+    file: str,
+    whole_folder: Callable[[], dict[str, bytes]] = lambda: _results(),
+    look: Callable[[Path], None] | None = None,
+) -> Callable[[bytes, Path], None]:
+    """Read a results folder of which one file is as given."""
 
     def read(data: bytes, folder: Path) -> None:
         place = folder / "run"
         place.mkdir(exist_ok=True)
-        for path, whole in _results().items():
+        for path, whole in whole_folder().items():
             (place / path).parent.mkdir(parents=True, exist_ok=True)
             (place / path).write_bytes(data if path == file else whole)
-        _look_at(place)
+        (look or _look_at)(place)
 
     return read
+
+
+def _replayed(place: Path) -> None:
+    """As `evedrop view` does of results that have no recording."""
+    replay(place, place / "again.rrd")
 
 
 def _look_at(place: Path) -> None:
@@ -314,6 +373,14 @@ FILES: dict[str, Reader] = {
         f"results-{name}": Reader(_results_of(f"{name}.parquet"), _in_results(f"{name}.parquet"), (raw,))
         for name in ("slots", "trials", "digests")
     },
+    "view-trials": Reader(
+        _results_of("trials.parquet"), _in_results("trials.parquet", look=_replayed), (raw, _as_parquet)
+    ),
+    "view-summary": Reader(_results_of("summary.json"), _in_results("summary.json", look=_replayed), (_as_json,)),
+    "unfinished-rounds": Reader(
+        lambda: [_cut_short()["unfinished/rounds"]], _in_results("unfinished/rounds", _cut_short), (raw, _lines)
+    ),
+    "unfinished-slots": Reader(lambda: [_cut_short()[_SLOTS_STREAM]], _in_results(_SLOTS_STREAM, _cut_short), (raw,)),
 }
 """Files that are read by what a user types."""
 
