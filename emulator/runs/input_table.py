@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from emulator.files import opened
 from emulator.model.plant import Plant
 from emulator.model.process import Floats
 from emulator.runs.joined import Slots
@@ -35,9 +36,10 @@ def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
 def inputs_schema_in(path: Path) -> pa.Schema:
     """What a file's schema should be; where it is no such file, one that says so when the file is read by it."""
     try:
-        schema = pq.read_schema(path)
+        with opened(path) as file:
+            schema = pq.read_schema(file)
         u, d = (int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d"))
-    except (OSError, pa.ArrowException, AttributeError):
+    except Exception:  # a damaged file makes pyarrow raise errors of many kinds, and the table's reader says what it is
         u = d = 0
     return inputs_schema(max(1, u), d)
 

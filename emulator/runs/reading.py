@@ -15,10 +15,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.errors import UsageError
+from emulator.files import Unreadable, opened, text_of
 from emulator.runs.growing import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
 from emulator.runs.input_table import inputs_schema_in
 from emulator.runs.summary_file import plain
 from emulator.runs.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, trials_schema
+
+_MOST_BYTES = 2**28
+_LAST_SLOT = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -38,10 +42,12 @@ class Results:
         path = self.folder / f"{name}.parquet"
         schema = None if path.exists() else schema_of(self.folder, name)
         try:
-            table = (
-                pq.read_table(path) if schema is None else pa.Table.from_batches(batches_of(self.folder, name), schema)
-            )
-        except (OSError, pa.ArrowException) as error:
+            if schema is None:
+                with opened(path) as file:  # a pipe would be waited for
+                    table = pq.read_table(file)
+            else:
+                table = pa.Table.from_batches(batches_of(self.folder, name), schema)
+        except Exception as error:  # a damaged file makes pyarrow raise errors of many kinds
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
         if not table.schema.equals(wanted):
@@ -113,17 +119,29 @@ def load_results(folder: str | Path) -> Results:
 
 def _read_summary(path: Path) -> dict[str, Any]:
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
+        summary = json.loads(text_of(path, _MOST_BYTES))
+    except Unreadable as error:
         raise UsageError(
-            f"{path.parent} is no results folder ({path.name}: {error.strerror}); give the --out of a run"
+            f"{path.parent} is no results folder ({path.name}: {error}); give the --out of a run"
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
     parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
     if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
         raise UsageError(f"{path} is no summary of a run; run the scenario again")
+    events = summary.get("events", [])
+    if not isinstance(events, list) or not all(map(_is_event, events)):
+        raise UsageError(f"{path} has events that are none; run the scenario again")
     return summary
+
+
+def _is_event(found: Any) -> bool:
+    return (
+        isinstance(found, dict)
+        and type(found.get("slot")) is int
+        and 0 <= found["slot"] <= _LAST_SLOT
+        and all(isinstance(found.get(name), str) for name in ("event", "by"))
+    )
 
 
 def _cut_short(folder: Path) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def test_tests_of_one_name_keep_their_results_apart(tmp_path: Path) -> None:
     assert folders == [tmp_path / "out" / name for name in ("one", "one-2", "one-3")]
     blocked = testing.carry_out(str(tmp_path / "one.toml"), Manner(in_memory=True, out=tmp_path / "one.toml"))
     assert (blocked.outcome, blocked.folder) == (Outcome.MISTAKES, None)
-    assert "cannot be made (Not a directory)" in blocked.reasons[0]
+    assert "cannot be written (Not a directory)" in blocked.reasons[0]
 
 
 def test_a_report_holds_what_xml_cannot() -> None:
