@@ -175,9 +175,10 @@ CHECKED = """
 import resource, sys
 from emulator.cli import main
 resource.setrlimit(resource.RLIMIT_AS, (1_500_000_000, 1_500_000_000))
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 status = main(sys.argv[1:])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, resource.getrusage(resource.RUSAGE_SELF).ru_utime)
+# Not ru_maxrss: that begins with what the process had that started this one.
+peak = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(peak, resource.getrusage(resource.RUSAGE_SELF).ru_utime)
 raise SystemExit(status)
 """
 
@@ -412,7 +413,7 @@ def test_a_command_that_fails_leaves_no_empty_folder(evedrop: Evedrop) -> None:
     """The folder that is made for its results is removed again, where nothing came to be in it."""
     done = evedrop("montecarlo", "eavesdroppers", "--slots=20", "--trials=2", "--workers=0")
     assert done.status == 2
-    assert list((evedrop.folder / "runs").iterdir()) == []
+    assert not (evedrop.folder / "runs").exists()
     (evedrop.folder / "here").write_text("")
     with pytest.raises(UsageError, match="cannot be written"):
         claimed(evedrop.folder / "here" / "run")

@@ -52,7 +52,8 @@ def place_of(error: BaseException, file: str | None = None) -> str:
         where = f", {Path(error.filename).name} line {error.lineno}"
         return f"{type(error).__name__}: {error.msg}{where}"
     where = f", {Path(own[-1].filename).name} line {own[-1].lineno}" if own else ""
-    return f"{type(error).__name__}: {error}{where}" if str(error) else f"{type(error).__name__}{where}"
+    said = " ".join(str(error).split())
+    return f"{type(error).__name__}: {said}{where}" if said else f"{type(error).__name__}{where}"
 
 
 def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -259,7 +259,7 @@ def _results_of(name: str) -> Callable[[], list[bytes]]:
 
 def _in_results(
     file: str,
-    whole_folder: Callable[[], dict[str, bytes]] = lambda: _results(),
+    whole_folder: Callable[[], dict[str, bytes]] = _results,
     look: Callable[[Path], None] | None = None,
 ) -> Callable[[bytes, Path], None]:
     """Read a results folder of which one file is as given."""

@@ -181,7 +181,7 @@ def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
         "evedrop: link legitimate: 2 mistakes, nothing was changed",
         "  set.sluts: is nothing that can be changed of a link; expected quality, loss, delay, reorder, duplicate, "
         "corrupt, rate or queue",
-        "  set.quality: is 1.2; expected a number from 0 to 1",
+        "  set.quality: is 1.2; expected a number from 0 to 1, such as 0.9",
     ]
     assert (
         run.try_to("link", "nobody", "cut").err.splitlines()[1] == '  cut: names "nobody"; expected legitimate or smart'

@@ -38,6 +38,15 @@ def kill_all(live: Live) -> None:
         os.kill(pid, signal.SIGKILL)
     live.process.communicate()
     wait_until(lambda: not live.left(), "no process left of the run")
+    wait_until(lambda: all(map(ended, found)), "processes that have let go of their files")
+
+
+def ended(pid: int) -> bool:
+    """Whether a process holds nothing any more: on its way out its memory goes first, then its files, then it is a zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in {"Z", "X"}
+    except OSError:
+        return True
 
 
 def cut_short(live: Live) -> int:

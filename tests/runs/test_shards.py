@@ -100,13 +100,15 @@ def test_the_statistics_of_every_slot_agree(ran: Ran, shards: int) -> None:
 def test_the_summary_is_that_of_all_trials(ran: Ran, shards: int) -> None:
     """Figures, accounts, quantiles, events, verdicts and expectations are those of the whole run."""
     close(dict(ran(shards).summary), dict(ran(1).summary), "summary")
+    recorded = {2: 4, 3: 5}[shards]  # each shard records its first trial at least
+    assert {one["recomputed_trials"] for one in ran(shards).summary["verification"].values()} == {recorded}
 
 
 def close(found: Any, wanted: Any, where: str) -> None:
-    """Check that two parts of summaries are the same, numbers within rounding; but for times and folders."""
+    """Check that two parts of summaries are the same, numbers within rounding; but for times, folders, what was verified."""
     if isinstance(wanted, Mapping):
         assert found.keys() == wanted.keys(), where
-        for name in wanted.keys() - {"wall_seconds", "slots_per_second", "replay"}:
+        for name in wanted.keys() - {"wall_seconds", "slots_per_second", "replay", "verification"}:
             close(found[name], wanted[name], f"{where}.{name}")
     elif isinstance(wanted, list):
         assert len(found) == len(wanted), where

@@ -156,7 +156,7 @@ def test_a_failing_worker_says_what_failed(monkeypatch: pytest.MonkeyPatch) -> N
     tasks = tasks_of(scenario, Mode.EXACT, 2)
     broken = [type(task)({**task.scenario, "slots": "many"}, task.mode, task.start, task.stop) for task in tasks]
     results = in_processes(broken, 2, lambda _: None, lambda: False)
-    with pytest.raises(RunError, match="a worker failed: ValidationError"):
+    with pytest.raises(RunError, match=r"^a worker failed: trials \d+ to \d+: ValidationError: [^\n]*slots[^\n]*$"):
         next(results)
 
 
