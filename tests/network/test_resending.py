@@ -1,0 +1,71 @@
+"""What is kept for a lost connection, and what is sent again."""
+
+from __future__ import annotations
+
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.network.resending import Kept
+
+
+def slot_message(k: int) -> bytes:
+    """A message that belongs to slot k."""
+    return bytes(msgpack.packb({"k": k}))
+
+
+def head(number: int, k: int, first: int) -> bytes:
+    """A message that says what follows it."""
+    return bytes(msgpack.packb({"round": number, "from": k, "first": first}))
+
+
+@given(
+    slots=st.integers(0, 30),
+    done=st.integers(0, 30),
+    asked=st.integers(0, 35),
+    back=st.integers(0, 5),
+    span=st.none() | st.integers(0, 10),
+)
+def test_a_round_announces_the_slot_that_follows(
+    slots: int, done: int, asked: int, back: int, span: int | None
+) -> None:
+    """Whatever was forgotten, however late a round is asked for: the head names the message behind it, and none is missing."""
+    sent: list[bytes] = []
+    kept = Kept(sent.append, span=span, head=head, back=back)
+    for k in range(slots):
+        kept(k, slot_message(k))
+    kept.forget(min(done, slots))
+    del sent[:]
+    kept.again(7, asked)
+    announced, *messages = [msgpack.unpackb(payload) for payload in sent]
+    found = [message["k"] for message in messages]
+    assert announced["round"] == 7
+    assert announced["from"] >= min(done, slots)
+    wanted = list(range(announced["first"], slots))
+    assert found == wanted or (not wanted and found in ([], [slots - 1]))
+    assert announced["first"] <= max(asked, announced["from"])
+
+
+def test_a_late_round_does_not_announce_what_is_forgotten() -> None:
+    """A round from slot 0 on, asked for when 1184 slots were done, once made the reader wait for slot 0 in vain."""
+    sent: list[bytes] = []
+    kept = Kept(sent.append, head=head, back=2)
+    for k in range(1190):
+        kept(k, slot_message(k))
+    kept.forget(1184)
+    del sent[:]
+    kept.again(1, 0)
+    assert msgpack.unpackb(sent[0]) == {"round": 1, "from": 1184, "first": 1182}
+    assert [msgpack.unpackb(payload)["k"] for payload in sent[1:]] == [*range(1182, 1190)]
+
+
+@pytest.mark.parametrize("k", [0, 5])
+def test_the_last_message_is_sent_in_any_case(k: int) -> None:
+    """Who has all of them hears that the sender is there."""
+    sent: list[bytes] = []
+    kept = Kept(sent.append)
+    kept(k, slot_message(k))
+    del sent[:]
+    kept.again(1, k + 1)
+    assert sent == [slot_message(k)]
