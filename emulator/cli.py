@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from emulator import commands, operate, roles
-from emulator.entry import program
 from emulator.errors import EvedropError, Interrupted, RunError, UsageError
 from emulator.files import shown
 from emulator.output import OUTPUT, finish, named_output, say, silence
 
-__all__ = ["is_role", "main", "program"]  # the last for an installation of an earlier version
+__all__ = ["is_role", "main"]
 
 Command = Callable[[argparse.Namespace], int]
 _ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")

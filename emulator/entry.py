@@ -1,4 +1,4 @@
-"""The first module of every command: what a signal does is settled before anything that takes time is imported.
+"""What a signal does to a command, settled before anything that takes time is imported.
 
 Ctrl-C, SIGTERM and SIGHUP end a command with status 130 at any moment. Until a command has begun something that must be ended
 in order, it ends at once; then `emulator.runs.signals` takes over.
@@ -9,7 +9,6 @@ from __future__ import annotations
 # What `signal` wraps, for that imports enum and more, which takes about as long as the interpreter needs to start.
 import _signal as signal  # type: ignore[import-not-found]
 import os
-import sys
 
 # Not from typing, whose import would take longer than everything before it; type checkers know the name.
 TYPE_CHECKING = False
@@ -38,23 +37,3 @@ def heed_signals() -> None:
     for number in heeded():
         signal.signal(number, leave)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)  # whoever launched us may have blocked them
-
-
-def program() -> NoReturn:
-    """Run the command line, and end."""
-    heed_signals()
-
-    from emulator.cli import is_role, main  # noqa: PLC0415 - the handlers come first
-
-    status = main()
-    if is_role(sys.argv[1:]):
-        # Threads of a process may still be in Zenoh, and an interpreter that ends meanwhile aborts (Python 3.11).
-        for stream in (sys.stdout, sys.stderr):
-            try:
-                stream.flush()
-            except (OSError, ValueError, AttributeError):
-                continue
-        os._exit(status)
-    for number in heeded():  # the command is over, whatever comes while the interpreter ends
-        signal.signal(number, signal.SIG_IGN)
-    sys.exit(status)

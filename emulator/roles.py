@@ -15,6 +15,8 @@ from emulator.commands import loaded
 from emulator.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from emulator.brief import Brief
 
 
@@ -100,10 +102,17 @@ def _observe(brief: Brief, serve: str | None) -> int:
     from emulator.scenario.mistakes import sentences
 
     try:
-        return observe(brief, serve)
+        return observe(brief, _report, serve)
     except ValidationError as error:
         lines = "; ".join(sentences(error)[:_MOST_TOLD])
         raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
+
+
+def _report(folder: Path, status: int, how: str) -> None:
+    """Print how a run ended that was started by hand."""
+    from emulator.runs.closing import print_ending
+
+    print_ending(folder, status, how)
 
 
 def health(options: argparse.Namespace) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from emulator.runs.showing import Showing
     from emulator.view.recording import Recording
 
+Report = Callable[[Path, int, str], None]
+"""Prints how a run ended: its results folder, its exit status, and why it failed."""
 _PROGRESS_SECONDS = 0.25
 
 
@@ -342,8 +344,11 @@ class Observation:
         self._final = self._summary(how)
         self._writer.settle(self._at, self._final)
 
-    def finish(self, status: int, how: str) -> int:
-        """Close the view, write the summary, tell the launcher or whoever started us by hand; the exit status of the run."""
+    def finish(self, status: int, how: str, report: Report) -> int:
+        """Close the view, write the summary, and tell the launcher; the exit status of the run.
+
+        report: prints how the run ended, if it was started by hand.
+        """
         safe = self._recording.close() if self._recording is not None else True
         try:
             summary = {**(self._final or self._summary(how)), "ended": how}
@@ -360,10 +365,8 @@ class Observation:
         accused = list(self._accused)
         tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
         if self._by_hand:
-            from emulator.runs.closing import print_ending  # noqa: PLC0415 - a launched observer has no use for it
-
             with suppress(FileNotFoundError):
-                print_ending(self.folder, status, how)
+                report(self.folder, status, how)
         if not safe:
             os._exit(status)
         return status

@@ -25,7 +25,7 @@ from emulator.network.session import Session
 from emulator.runs.conductor import Stop
 from emulator.runs.folder import new_folder
 from emulator.runs.heartbeat import set_news_apart, tell
-from emulator.runs.observation import Observation
+from emulator.runs.observation import Observation, Report
 from emulator.runs.scorekeeper import write_resolved
 from emulator.runs.summary_file import unwritten
 from emulator.runs.viewer import Stand
@@ -34,11 +34,11 @@ from emulator.scenario import Scenario
 _ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone
 
 
-def observe(brief: Brief, serve: str | None = None) -> int:
+def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
     """Run the observer of a brief; the exit status of the run.
 
-    serve: HOST:PORT where browsers may see it, if anywhere. Raises UsageError, BriefError, RunError or Interrupted, of one
-    started by hand, as long as nothing has begun.
+    report: prints how a run ended that was started by hand. serve: HOST:PORT where browsers may see it, if anywhere.
+    Raises UsageError, BriefError, RunError or Interrupted, of one started by hand, as long as nothing has begun.
     """
     stand = None if serve is None else Stand.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
@@ -77,7 +77,7 @@ def observe(brief: Brief, serve: str | None = None) -> int:
     except Exception as error:  # a mistake of ours must not cost what was measured
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
-    status = observation.finish(status, how)
+    status = observation.finish(status, how, report)
     if viewer is not None:
         viewer.stop()
     return status

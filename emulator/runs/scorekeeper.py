@@ -30,7 +30,7 @@ from emulator.runs.loop_tally import Acted
 from emulator.runs.score import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from emulator.runs.totals import Totals
 from emulator.runs.verdict import Secrecy, secrecy
-from emulator.runs.verification import verification_of
+from emulator.runs.verified import verification_of
 from emulator.scenario import Scenario
 
 _ENOUGH_TO_SURPRISE = 10  # trials

@@ -21,7 +21,7 @@ from emulator.errors import Interrupted, RunError, UsageError
 from emulator.runs.children import News
 from emulator.runs.folder import new_folder
 from emulator.runs.held import HeldFolder
-from emulator.runs.launcher import Ended, launch_one
+from emulator.runs.one_launch import Ended, launch_one
 from emulator.runs.ports import Places, loopback_places
 from emulator.runs.viewer import Viewer
 from emulator.scenario import Scenario
