@@ -14,18 +14,18 @@ import tempfile
 import time
 from pathlib import Path
 
-from emulator import compare
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.link import Link
-from emulator.model.process import Trajectory
-from emulator.model.receiver import Heard
-from emulator.model.schemes import scheme_of
-from emulator.runs.briefs import StreamKeys
-from emulator.runs.expectation import expectations_of
-from emulator.runs.montecarlo import Plan
-from emulator.scenario import Scenario, load
-from emulator.streams import Batch
+from evedrop import compare
+from evedrop.expected.expectations import expectations_of
+from evedrop.live.launch.briefs import StreamKeys
+from evedrop.memory.montecarlo import Plan
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.process import Trajectory
+from evedrop.model.receiver import Heard
+from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.link import Link
+from evedrop.scenario import Scenario, load
+from evedrop.streams import Batch
 
 MARGINAL = "bayesian"
 """The shipped scenario that all of it is measured on: two states, marginally stable."""

@@ -20,9 +20,9 @@ from typing import Any
 import tomli_w
 from processes import watch
 
-from emulator.model.links import LOSS_MODELS, loss_of
-from emulator.scenario import shipped
-from emulator.streams import Batch, BlockReader, root_of_seed, stream_key
+from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.scenario import shipped
+from evedrop.streams import Batch, BlockReader, root_of_seed, stream_key
 
 WALK = [[0, 120.0, 0.0], [100_000, -60.0, 200.0]]
 RADIO = {"model": "distance", "sender": [0, 0], "reference_snr": 80.0, "exponent": 3.0, "threshold": 10.0}
@@ -102,7 +102,7 @@ def run(spec: dict[str, Any], trials: int, slots: int) -> tuple[float, float]:
         command = [
             sys.executable,
             "-m",
-            "emulator",
+            "evedrop",
             "run",
             str(file),
             "--view",

@@ -19,14 +19,14 @@ from pathlib import Path
 import raw
 from processes import Usage, watch
 
-from emulator.brief import Brief
-from emulator.network.access import LEGITIMATE, ROUTER, SENSOR
-from emulator.network.packets import uplink
-from emulator.network.session import Session
-from emulator.network.wire import progress
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port
-from emulator.scenario import load
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.ports import free_port
+from evedrop.live.network.access import LEGITIMATE, ROUTER, SENSOR
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.codec import progress
+from evedrop.live.protocol.packets import uplink
+from evedrop.scenario import load
 
 RECEIVERS = 4
 
@@ -34,7 +34,7 @@ RECEIVERS = 4
 def run(*options: str) -> tuple[dict[str, float], dict[str, Usage]]:
     """One live run without a view: its summary, and what its processes used."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "emulator", "run", "eavesdroppers", "--view", "off", "--json"]
+        command = [sys.executable, "-m", "evedrop", "run", "eavesdroppers", "--view", "off", "--json"]
         process = subprocess.Popen([*command, "--out", f"{folder}/run", *options], stdout=subprocess.PIPE)
         usage = watch(process)
         assert process.stdout is not None
@@ -78,7 +78,7 @@ def _routed_latency(slots: int, rate: float) -> tuple[float, float]:
         observation = Observation(Path(folder), False)
         briefs = briefs_of(scenario, f"tcp/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
         paths = {name: str(brief.write(Path(folder))) for name, brief in briefs.items()}
-        router = subprocess.Popen([sys.executable, "-m", "emulator", "router", paths[ROUTER]])
+        router = subprocess.Popen([sys.executable, "-m", "evedrop", "router", paths[ROUTER]])
         command = [sys.executable, __file__]
         sender = subprocess.Popen([*command, "send", paths[SENSOR]], stdout=subprocess.PIPE)
         watcher = subprocess.Popen([*command, "watch", paths["observer"]])
@@ -131,7 +131,7 @@ def _receive(brief: Brief) -> None:
 
 def _watch(brief: Brief) -> None:
     """The conductor's part: start when all are there, end when the journal is complete."""
-    from emulator.runs.conductor import Conductor, Stop  # noqa: PLC0415
+    from evedrop.live.observer.conductor import Conductor, Stop  # noqa: PLC0415
 
     receivers = tuple(brief.part["scenario"]["eavesdroppers"])
     with Session(brief) as session:
@@ -177,7 +177,7 @@ def connections(rounds: int) -> None:
 
 def start_up(rounds: int) -> None:
     """How long --help takes, and a run until its first slot."""
-    times = {"evedrop --help": [sys.executable, "-m", "emulator", "--help"]}
+    times = {"evedrop --help": [sys.executable, "-m", "evedrop", "--help"]}
     for what, command in times.items():
         taken = []
         for _ in range(rounds):
@@ -189,8 +189,8 @@ def start_up(rounds: int) -> None:
     for view in ["off"] * rounds + ["web"] * rounds:
         with tempfile.TemporaryDirectory() as folder:
             code = (
-                "import sys, time\nfrom pathlib import Path\nfrom emulator.scenario import load\n"
-                "from emulator.runs.launcher import launch\n"
+                "import sys, time\nfrom pathlib import Path\nfrom evedrop.scenario import load\n"
+                "from evedrop.live.launch.launcher import launch\n"
                 "def tell(news):\n    if news['event'] == 'started': print(time.monotonic(), flush=True)\n"
                 f"launch(load('eavesdroppers', {{'slots': 10}}), Path({folder!r}) / 'run', {view!r}, None, tell)\n"
             )
@@ -212,7 +212,7 @@ def main(quick: bool) -> None:
 
 
 if __name__ == "__main__":
-    from emulator.brief import read_brief
+    from evedrop.live.protocol.brief import read_brief
 
     if sys.argv[1:] == ["tls"]:
         connections(3)

@@ -25,12 +25,12 @@ from unittest.mock import patch
 
 import numpy as np
 
-from emulator.model.digest import DIGEST_BYTES, BeliefLog
-from emulator.runs.montecarlo import Plan, simulate
-from emulator.runs.simulation import Mode, Simulation
-from emulator.runs.sweep import sweep_over
-from emulator.scenario import Scenario, checked
-from emulator.streams import Batch, BlockReader
+from evedrop.memory.montecarlo import Plan, simulate
+from evedrop.memory.simulation import Mode, Simulation
+from evedrop.model.digest import DIGEST_BYTES, BeliefLog
+from evedrop.scenario import Scenario, checked
+from evedrop.streams import Batch, BlockReader
+from evedrop.studies.sweep import sweep_over
 
 TRIALS = 2000  # side by side, as many as a worker takes at once
 ROUNDS = 5

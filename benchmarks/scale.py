@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from emulator import run
-from emulator.view.figures_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+from evedrop import run
+from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _TICK = os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")

@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from emulator import run, montecarlo, compare, design, load_results
+    from evedrop import run, montecarlo, compare, design, load_results
 
 Names are loaded when they are used: a peer imports this package too, and needs none of them.
 """
@@ -12,17 +12,17 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from emulator.api import compare, design, montecarlo, run
-    from emulator.runs.results import load_results
+    from evedrop.api import compare, design, montecarlo, run
+    from evedrop.results.writer import load_results
 
 __all__ = ["compare", "design", "load_results", "montecarlo", "run"]
 
 _HOMES = {
-    "compare": "emulator.api",
-    "design": "emulator.api",
-    "load_results": "emulator.runs.results",
-    "montecarlo": "emulator.api",
-    "run": "emulator.api",
+    "compare": "evedrop.api",
+    "design": "evedrop.api",
+    "load_results": "evedrop.results.writer",
+    "montecarlo": "evedrop.api",
+    "run": "evedrop.api",
 }
 
 

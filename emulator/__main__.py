@@ -1,13 +1,13 @@
-"""The command `evedrop`, which `python -m emulator` is too."""
+"""The command `evedrop`, which `python -m evedrop` is too."""
 
 from __future__ import annotations
 
-# What `signal` wraps; see `emulator.entry`.
+# What `signal` wraps; see `evedrop.interrupts`.
 import _signal as signal  # type: ignore[import-not-found]
 import os
 import sys
 
-from emulator.entry import heed_signals, heeded
+from evedrop.interrupts import heed_signals, heeded
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ def program() -> NoReturn:
     """Run the command line, and end."""
     heed_signals()
 
-    from emulator.cli import is_role, main  # noqa: PLC0415 - the handlers come first
+    from evedrop.cli.main import is_role, main  # noqa: PLC0415 - the handlers come first
 
     status = main()
     if is_role(sys.argv[1:]):

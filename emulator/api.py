@@ -8,21 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.errors import UsageError
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.link_law import law_of
-from emulator.model.outcomes import GENIE_SCHEMES
-from emulator.model.schemes import SCHEMES
-from emulator.network.access import LEGITIMATE
-from emulator.runs.folder import results_folder
-from emulator.runs.results import Results, load_results
-from emulator.scenario import Scenario, checked, load
-from emulator.scenario.words import listed
+from evedrop.errors import UsageError
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.outcomes import GENIE_SCHEMES
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.slot.link_law import law_of
+from evedrop.results.folder import results_folder
+from evedrop.results.writer import Results, load_results
+from evedrop.scenario import Scenario, checked, load
+from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:
-    from emulator.model.design import Design
-    from emulator.runs.compare import Comparison
-    from emulator.runs.montecarlo import Plan
+    from evedrop.memory.montecarlo import Plan
+    from evedrop.model.theory.design import Design
+    from evedrop.studies.compare import Comparison
 
 Tell = Callable[[Mapping[str, Any]], None]
 
@@ -53,7 +53,7 @@ def run(
     >>> results.summary["peers"]["smart"]["mean_squared_error"]         # doctest: +SKIP
     >>> results.slots.to_pandas()                                       # doctest: +SKIP
     """
-    from emulator.runs.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
+    from evedrop.live.launch.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
 
     made = _prepared(scenario, changes)
     with results_folder(out, _name(scenario)) as folder:
@@ -76,8 +76,8 @@ def montecarlo(
 
     Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: mode and workers.
     """
-    from emulator.runs.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
-    from emulator.runs.simulation import Mode  # noqa: PLC0415 - the same
+    from evedrop.memory.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
+    from evedrop.memory.simulation import Mode  # noqa: PLC0415 - the same
 
     plan = plan or Plan()
     made = _prepared(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
@@ -110,9 +110,9 @@ def compare(
     >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
     >>> found.table.to_pandas()                                                        # doctest: +SKIP
     """
-    from emulator.runs.compare import compare_all  # noqa: PLC0415 - no other call needs it
-    from emulator.runs.matchups import matchups_of  # noqa: PLC0415 - the same
-    from emulator.runs.montecarlo import Plan  # noqa: PLC0415 - the same
+    from evedrop.memory.montecarlo import Plan  # noqa: PLC0415 - the same
+    from evedrop.studies.compare import compare_all  # noqa: PLC0415 - no other call needs it
+    from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
 
     made = _prepared(scenario, {**changes, "trials": trials})
     matchups = matchups_of(made, schemes, adversaries, parameters)
@@ -129,8 +129,8 @@ def design(
 
     Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω or the scheme is not one of states and innovations.
     """
-    from emulator.model.design import Adversary  # noqa: PLC0415 - a run does not need it
-    from emulator.model.design import design as design_of  # noqa: PLC0415 - the same
+    from evedrop.model.theory.design import Adversary  # noqa: PLC0415 - a run does not need it
+    from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
     if made.encoding.scheme not in GENIE_SCHEMES:

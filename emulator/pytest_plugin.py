@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from emulator.collect import is_scenario
+from evedrop.discovery import is_scenario
 
 if TYPE_CHECKING:
-    from emulator.runs.testing import Finding
+    from evedrop.studies.scenario_tests import Finding
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -45,8 +45,8 @@ class ScenarioItem(pytest.Item):
 
     def runtest(self) -> None:
         """Run it. Raises ScenarioFailed if it does not pass."""
-        from emulator.errors import Interrupted  # noqa: PLC0415 - only where there is a scenario to run
-        from emulator.runs.testing import Manner, Outcome, carry_out  # noqa: PLC0415 - the same
+        from evedrop.errors import Interrupted  # noqa: PLC0415 - only where there is a scenario to run
+        from evedrop.studies.scenario_tests import Manner, Outcome, carry_out  # noqa: PLC0415 - the same
 
         options = self.config.option
         manner = Manner(options.evedrop_in_memory, options.evedrop_trials, options.evedrop_out)

@@ -18,7 +18,7 @@ import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from numpy.typing import NDArray
 
-from emulator.model.elementary import normal_quantile
+from evedrop.kernels.elementary import normal_quantile
 
 Words = NDArray[np.uint64]
 Floats = NDArray[np.float64]

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time
 
-from emulator.brief import Brief
-from emulator.model.controllers import CONTROLLERS
-from emulator.model.controllers.controller import Assignment
-from emulator.model.plant import Plant
-from emulator.network.access import CONTROLLER
-from emulator.network.loop_wire import decided, read_known
-from emulator.network.reporting import DecisionReporter
-from emulator.network.resending import Due
-from emulator.network.session import Session
-from emulator.network.wire import Reader
-from peers.loop import disturbances_in, kept_decisive
+from evedrop.live.network.access import CONTROLLER
+from evedrop.live.network.reporting import DecisionReporter
+from evedrop.live.network.resending import Due
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.closed_loop import decided, read_known
+from evedrop.live.protocol.codec import Reader
+from evedrop.model.controllers import CONTROLLERS
+from evedrop.model.controllers.controller import Assignment
+from evedrop.model.plant import Plant
+from evedrop.peers.closed_loop import disturbances_in, kept_decisive
 
 
 def steer(brief: Brief) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from emulator.brief import Brief
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from peers.following import follow
+from evedrop.live.protocol.brief import Brief
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.peers.following import follow
 
 
 def eavesdrop(brief: Brief) -> None:

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.brief import Brief
-from emulator.model.follower import Follower
-from emulator.model.receiver import Belief, Receiver
-from emulator.model.transit import Arrival
-from emulator.network.declared import Inbox
-from emulator.network.packets import acknowledgement, is_hold, read_acknowledgement, read_delivery
-from emulator.network.reporting import BeliefReporter
-from emulator.network.resending import Due
-from emulator.network.session import Session
-from emulator.network.telemetry import leaving
-from emulator.network.wire import Reader
-from peers.loop import Consultation
+from evedrop.live.network.declared import Inbox
+from evedrop.live.network.reporting import BeliefReporter
+from evedrop.live.network.resending import Due
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.packets import acknowledgement, is_hold, read_acknowledgement, read_delivery
+from evedrop.live.protocol.telemetry import leaving
+from evedrop.model.receiver import Belief, Receiver
+from evedrop.model.slot.intermittent_receiver import Follower
+from evedrop.model.slot.transit import Arrival
+from evedrop.peers.closed_loop import Consultation
 
 
 def follow(

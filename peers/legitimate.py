@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 
-from emulator.brief import Brief
-from emulator.model.informed import Informed
-from emulator.model.plant import Plant
-from emulator.model.schemes import scheme_of
-from peers.following import follow
-from peers.loop import Consultation
+from evedrop.live.protocol.brief import Brief
+from evedrop.model.input_aware import Informed
+from evedrop.model.plant import Plant
+from evedrop.model.schemes import scheme_of
+from evedrop.peers.closed_loop import Consultation
+from evedrop.peers.following import follow
 
 
 def estimate(brief: Brief) -> None:

@@ -5,23 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Collection
 
-from emulator.brief import Brief
-from emulator.errors import RunError
-from emulator.model.detection import Chart, Watch
-from emulator.model.plant import Plant
-from emulator.model.process import Trajectory
-from emulator.model.receiver import Flags
-from emulator.model.schemes import scheme_of
-from emulator.model.schemes.scheme import Encoder, Packet, Scheme
-from emulator.network.access import OBSERVER, SENSOR
-from emulator.network.mailbox import Mailbox
-from emulator.network.packets import Beside, hold, once_more, read_acknowledgement, uplink
-from emulator.network.reporting import TruthReporter
-from emulator.network.resending import Due, Kept
-from emulator.network.session import Session
-from emulator.network.telemetry import held
-from emulator.network.wire import Reader, read_progress, shown
-from peers.loop import Actuator
+from evedrop.errors import RunError
+from evedrop.live.network.access import OBSERVER, SENSOR
+from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.reporting import TruthReporter
+from evedrop.live.network.resending import Due, Kept
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.codec import Reader, read_progress, shown
+from evedrop.live.protocol.packets import Beside, hold, once_more, read_acknowledgement, uplink
+from evedrop.live.protocol.telemetry import held
+from evedrop.model.numeric.detection import Chart, Watch
+from evedrop.model.plant import Plant
+from evedrop.model.process import Trajectory
+from evedrop.model.receiver import Flags
+from evedrop.model.schemes import scheme_of
+from evedrop.model.schemes.scheme import Encoder, Packet, Scheme
+from evedrop.peers.closed_loop import Actuator
 
 _PROGRESS_BYTES = 16 * 2**20  # of one follower: far more than are ever under way
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed

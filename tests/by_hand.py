@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from emulator import montecarlo
-from emulator.brief import read_brief
-from emulator.network.endpoint import Endpoint
-from emulator.runs.briefs import write_briefs
-from emulator.runs.ports import places_at
-from emulator.runs.results import load_results
-from emulator.scenario import Scenario
+from evedrop import montecarlo
+from evedrop.live.launch.briefs import write_briefs
+from evedrop.live.launch.ports import places_at
+from evedrop.live.network.endpoint import Endpoint
+from evedrop.live.protocol.brief import read_brief
+from evedrop.results.writer import load_results
+from evedrop.scenario import Scenario
 from tests.conftest import wait_until
 
 LONG = 90.0
@@ -66,7 +66,7 @@ class ByHand:
             names = self.names[1:]
         for name in names or self.names:
             path = self.folder / "briefs" / f"{name}.json"
-            command = [sys.executable, "-m", "emulator", read_brief(path).role, str(path)]
+            command = [sys.executable, "-m", "evedrop", read_brief(path).role, str(path)]
             with self.log(name).open("ab") as log:
                 self.processes[name] = subprocess.Popen(
                     [*self.entered.get(name, ()), *command],

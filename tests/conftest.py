@@ -22,9 +22,9 @@ from unittest.mock import patch
 import pytest
 from hypothesis import HealthCheck, settings
 
-from emulator import cli
-from emulator.brief import Brief, read_brief
-from emulator.runs.results import Results, load_results
+from evedrop.cli import main as cli
+from evedrop.live.protocol.brief import Brief, read_brief
+from evedrop.results.writer import Results, load_results
 from tests.privileged import say_what_was_skipped
 
 LIMIT = 120.0
@@ -158,12 +158,12 @@ class Live:
 
 
 TELLING = """
-from emulator.entry import heed_signals
+from evedrop.interrupts import heed_signals
 heed_signals()
 import resource, sys
 from pathlib import Path
-from emulator.cli import main
-from emulator.runs.report import ProgressLine
+from evedrop.cli.main import main
+from evedrop.cli.report import ProgressLine
 
 show, news, largest = ProgressLine.tell, Path(sys.argv[1]), int(sys.argv[2])
 if largest:
@@ -242,7 +242,7 @@ class Evedrop:
 
     def begun(self, *arguments: str, **options: Any) -> Live:
         """The same, without waiting for its end."""
-        return Live(self._start(["-m", "emulator"], arguments, options), self.temporary, self.folder)
+        return Live(self._start(["-m", "evedrop"], arguments, options), self.temporary, self.folder)
 
     def started(self, *arguments: str, out: str = "run", largest_file: int = 0, **options: Any) -> Live:
         """Start a command in a process of its own, to be followed and disturbed."""

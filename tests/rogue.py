@@ -8,17 +8,17 @@ from tests.conftest import Evedrop
 
 ROGUE = """
 import dataclasses
-import peers.sensor
-from emulator.network import reporting
-from emulator.network.packets import uplink
-from emulator.network.telemetry import Journal, Report
-from emulator.network.wire import pack
+import evedrop.peers.sensor
+from evedrop.network import reporting
+from evedrop.live.protocol.packets import uplink
+from evedrop.live.protocol.telemetry import Journal, Report
+from evedrop.live.protocol.codec import pack
 
 def change(how, honest=Report.pack):
     Report.pack = lambda self: honest(dataclasses.replace(self, **how(self)))
 
 def packets(how):
-    peers.sensor.uplink = lambda k, z: how(k, z) if k else uplink(k, z)
+    evedrop.peers.sensor.uplink = lambda k, z: how(k, z) if k else uplink(k, z)
 
 """
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.brief import Brief, Flow, Model, read_brief
-from emulator.brief_use import expect_usable
-from emulator.errors import BriefError
-from emulator.runs.briefs import Observation, StreamKeys, briefs_of
-from emulator.scenario import Scenario, load
+from evedrop.errors import BriefError
+from evedrop.live.launch.briefs import Observation, StreamKeys, briefs_of
+from evedrop.live.protocol.brief import Brief, Flow, Model, read_brief
+from evedrop.live.protocol.brief_use import expect_usable
+from evedrop.scenario import Scenario, load
 from tests.conftest import Evedrop
 
 BRIEF = Brief(

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from emulator.runs.results import load_results
-from emulator.scenario import load, shipped
+from evedrop.results.writer import load_results
+from evedrop.scenario import load, shipped
 from tests.conftest import Done, Evedrop
 
 QUICK = ("--slots", "40", "--view", "off")
@@ -200,7 +200,7 @@ def test_a_scenario_names_a_secret_in_its_own_folder(evedrop: Evedrop) -> None:
     for folder, secret in ((inner, b"1" * 32), (elsewhere, b"2" * 32)):
         folder.mkdir()
         (folder / "secret.bin").write_bytes(secret)
-    text = (Path(str(resources.files("scenarios"))) / "eavesdroppers.toml").read_text()
+    text = (Path(str(resources.files("evedrop.scenarios"))) / "eavesdroppers.toml").read_text()
     (inner / "mine.toml").write_text(f'secret_file = "secret.bin"\n{text}')
     base = ("montecarlo", "inner/mine.toml", "--slots", "20", "--trials", "1", "--json", "--out")
     first = evedrop(*base, "a").summary
@@ -258,8 +258,8 @@ def test_the_selftest_passes(evedrop: Evedrop) -> None:
 
 def test_a_wrong_golden_digest_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit 3, and the receiver whose digest is not the golden one is marked."""
-    from emulator import cli
-    from emulator.runs import selftest
+    from evedrop.cli import main as cli
+    from evedrop.cli import selftest
 
     monkeypatch.setattr(selftest, "GOLDEN", {**selftest.GOLDEN, "smart": "0" * 64})
     assert cli.main(["selftest"]) == 3
@@ -321,7 +321,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What fails within a study is said as it is, exit 3."""
-    from emulator.runs import sweep
+    from evedrop.studies import sweep
 
     def fail(_: object) -> None:
         raise OSError(errno.EMFILE, "Too many open files")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from emulator.collect import is_scenario, scenarios_in
-from emulator.runs.testing import scenarios_of
-from emulator.scenario import shipped
+from evedrop.discovery import is_scenario, scenarios_in
+from evedrop.scenario import shipped
+from evedrop.studies.scenario_tests import scenarios_of
 
 SCENARIO = shipped()["eavesdroppers"].read_text(encoding="utf-8")
 

@@ -7,30 +7,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.conformance.eavesdroppers import Listening, eavesdropper_verdicts
-from emulator.conformance.examine import examined
-from emulator.conformance.links import DelayChecks, LossChecks
-from emulator.conformance.rules import Broken, Verdict
-from emulator.conformance.schemes import scheme_verdicts
-from emulator.errors import UsageError
-from emulator.model.delays import DELAY_MODELS
-from emulator.model.delays.normal import Normal
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.naive import Naive
-from emulator.model.eavesdroppers.suspicious import Suspicious
-from emulator.model.links import LOSS_MODELS
-from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.gilbert_elliott import GilbertElliott
-from emulator.model.links.link import fates_of
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Belief, Codes, Flags, Heard
-from emulator.model.registry import asked
-from emulator.model.schemes import SCHEMES
-from emulator.model.schemes.cipher import Cipher, CipherEstimator
-from emulator.model.schemes.innovation import Innovation, SharedSecret
-from emulator.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
-from emulator.model.schemes.scheme import NoInnovations, Packet, Scheme
-from emulator.model.theory import Outcomes
+from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
+from evedrop.conformance.examine import examined
+from evedrop.conformance.links import DelayChecks, LossChecks
+from evedrop.conformance.rules import Broken, Verdict
+from evedrop.conformance.schemes import scheme_verdicts
+from evedrop.errors import UsageError
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.delays.normal import Normal
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.suspicious import Suspicious
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.links.gilbert_elliott import GilbertElliott
+from evedrop.model.links.link import fates_of
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Belief, Codes, Flags, Heard
+from evedrop.model.registry import asked
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes.cipher import Cipher, CipherEstimator
+from evedrop.model.schemes.innovation import Innovation, SharedSecret
+from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
+from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme
+from evedrop.model.theory.covariances import Outcomes
 
 EVERY = [
     (option, name)

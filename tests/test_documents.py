@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator import cli
+from evedrop.cli import main as cli
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from emulator.errors import ScenarioError
-from emulator.model.link import NEVER
-from emulator.model.links.link import Fate
-from emulator.scenario import Scenario, checked
+from evedrop.errors import ScenarioError
+from evedrop.model.links.link import Fate
+from evedrop.model.slot.link import NEVER
+from evedrop.scenario import Scenario, checked
 
 
 def tables(*events: dict[str, Any], **more: Any) -> dict[str, Any]:

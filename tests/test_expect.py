@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import tomli_w
 
-from emulator.errors import ScenarioError
-from emulator.scenario import Scenario, parse
+from evedrop.errors import ScenarioError
+from evedrop.scenario import Scenario, parse
 
 GOOD: dict[str, Any] = {
     "title": "A vehicle",

@@ -18,17 +18,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.errors import TraceError
-from emulator.fitting import losses
-from emulator.fitting.candidate import wilson
-from emulator.fitting.delays import delay_candidates
-from emulator.fitting.fit import fit
-from emulator.fitting.hidden import TwoStates, _Chunks, log_likelihood
-from emulator.fitting.runs import RunLaw, lengths_of, p_value
-from emulator.model.links import loss_of
-from emulator.model.links.link import Fate
-from emulator.scenario import load
-from emulator.traces import Outcomes
+from evedrop.errors import TraceError
+from evedrop.fitting import losses
+from evedrop.fitting.candidate import wilson
+from evedrop.fitting.delays import delay_candidates
+from evedrop.fitting.fit import fit
+from evedrop.fitting.hidden import TwoStates, _Chunks, log_likelihood
+from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Fate
+from evedrop.recordings.link_recording import Outcomes
+from evedrop.scenario import load
 from tests.conftest import Evedrop
 
 BERNOULLI = {"model": "bernoulli", "quality": 0.9}

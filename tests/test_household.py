@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.household import appliances, day, sun
-from emulator.household.draws import Draws
-from emulator.plant_data import read_disturbances
+from evedrop.applications.microgrid import appliances, day, sun
+from evedrop.applications.microgrid.draws import Draws
+from evedrop.recordings.disturbance_file import read_disturbances
 
-KEPT = Path(str(resources.files("scenarios")))
+KEPT = Path(str(resources.files("evedrop.scenarios")))
 TOLD = json.loads((KEPT / f"{day.NAME}.json").read_text(encoding="utf-8"))
 
 

@@ -46,7 +46,7 @@ def packages(names: set[str]) -> set[str]:
 
 
 def ours(names: set[str]) -> set[str]:
-    """Our own parts among modules: such as emulator.runs."""
+    """Our own parts among modules: such as evedrop.runs."""
     return {".".join(name.split(".")[:2]) for name in names if name.startswith(("emulator.", "peers."))}
 
 
@@ -54,13 +54,13 @@ def test_peers_and_network_stay_light() -> None:
     """Peers and network load zenoh, msgpack, numpy, cryptography, and neither view nor results nor scenarios."""
     for module, names in loaded_by(*modules_of("peers"), *modules_of("emulator/network")).items():
         assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "_cffi_backend"}, module
-        assert not ours(names) & {"emulator.view", "emulator.runs", "emulator.scenario", "emulator.api"}, module
+        assert not ours(names) & {"evedrop.view", "evedrop.runs", "evedrop.scenario", "evedrop.api"}, module
 
 
 def test_a_solver_is_loaded_by_who_uses_it_alone() -> None:
     """The strategy that needs one is part of the model, and registered in it, but loads it with its first controller."""
-    names = loaded_by("emulator.model.controllers")["emulator.model.controllers"]
-    assert "emulator.model.controllers.mpc" in names
+    names = loaded_by("evedrop.model.controllers")["evedrop.model.controllers"]
+    assert "evedrop.model.controllers.mpc" in names
     assert not packages(names) & {"osqp", "scipy"}
 
 
@@ -73,17 +73,17 @@ def test_model_is_mathematics() -> None:
     assert len(model) > 15
     for module, names in loaded_by(*model).items():
         assert packages(names) <= {"numpy", "cryptography", "_cffi_backend"}, module
-        assert ours(names) <= {"emulator.model", "emulator.streams"}, module
+        assert ours(names) <= {"evedrop.model", "evedrop.streams"}, module
 
 
 def test_theory_may_use_scipy_and_no_more() -> None:
     """Theory and design load scipy besides, and still neither network nor view nor results."""
-    for module, names in loaded_by(*(f"emulator.model.{name}" for name in THEORY)).items():
+    for module, names in loaded_by(*(f"evedrop.model.{name}" for name in THEORY)).items():
         assert packages(names) <= {"numpy", "scipy", "cryptography", "_cffi_backend"}, module
-        assert ours(names) <= {"emulator.model", "emulator.streams", "emulator.errors"}, module
+        assert ours(names) <= {"evedrop.model", "evedrop.streams", "evedrop.errors"}, module
 
 
-@pytest.mark.parametrize("module", ["emulator.runs.launcher", "emulator.runs.montecarlo", "emulator.api"])
+@pytest.mark.parametrize("module", ["evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api"])
 def test_launcher_and_memory_load_neither_zenoh_nor_rerun(module: str) -> None:
     """The launcher stays clear of what could hang, so that it can end it; Monte Carlo and the Python calls need neither."""
     assert not packages(loaded_by(module)[module]) & {"zenoh", "rerun", "matplotlib"}
@@ -91,15 +91,15 @@ def test_launcher_and_memory_load_neither_zenoh_nor_rerun(module: str) -> None:
 
 def test_the_command_line_loads_nothing_to_say_help() -> None:
     """What `evedrop --help` loads is Python's own and ours."""
-    assert packages(loaded_by("emulator.cli")["emulator.cli"]) == set()
+    assert packages(loaded_by("evedrop.cli.main")["evedrop.cli.main"]) == set()
 
 
 def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
     """It is loaded in every project of an environment that has Evedrop in it."""
-    found = loaded_by("pytest", "emulator.pytest_plugin")
-    more = found["emulator.pytest_plugin"] - found["pytest"]
+    found = loaded_by("pytest", "evedrop.pytest_plugin")
+    more = found["evedrop.pytest_plugin"] - found["pytest"]
     assert packages(more) == set()
-    assert ours(more) == {"emulator.pytest_plugin", "emulator.collect", "emulator.files"}
+    assert ours(more) == {"evedrop.pytest_plugin", "evedrop.discovery", "evedrop.files"}
 
 
 def test_only_the_view_loads_rerun_and_matplotlib() -> None:

@@ -16,12 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.errors import EvedropError, ScenarioError, UsageError
-from emulator.files import Limit, Unreadable, contents, lines_of
-from emulator.model.horizon import horizon
-from emulator.model.process import MOST_STATES, Process
-from emulator.runs.folder import claimed, default_folder
-from emulator.scenario import load, parse
+from evedrop.errors import EvedropError, ScenarioError, UsageError
+from evedrop.files import Limit, Unreadable, contents, lines_of
+from evedrop.model.process import MOST_STATES, Process
+from evedrop.model.theory.horizon import horizon
+from evedrop.results.folder import claimed, default_folder
+from evedrop.scenario import load, parse
 from tests.conftest import Evedrop
 
 BASE = """
@@ -173,7 +173,7 @@ def bomb(path: Path, size: int, block: bytes) -> Path:
 
 CHECKED = """
 import resource, sys
-from emulator.cli import main
+from evedrop.cli.main import main
 resource.setrlimit(resource.RLIMIT_AS, (1_500_000_000, 1_500_000_000))
 status = main(sys.argv[1:])
 # Not ru_maxrss: that begins with what the process had that started this one.
@@ -321,7 +321,7 @@ def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(
     process = Process(A * radius / np.abs(np.linalg.eigvals(A)).max(), 1e-3 * np.eye(n), np.eye(n))
     halves = []
     for each in (2**12, 2**26):
-        monkeypatch.setattr("emulator.model.horizon._EACH", each)
+        monkeypatch.setattr("evedrop.model.theory.horizon._EACH", each)
         halves.append(horizon(process, 10_000_000))
     assert halves[0] is not None
     assert halves[0] == pytest.approx(halves[1], rel=1e-5)

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.api import montecarlo, run
-from emulator.errors import ScenarioError
-from emulator.model.link import NEVER
-from emulator.runs.scorekeeper import write_resolved
-from emulator.scenario import Scenario, checked, load
+from evedrop.api import montecarlo, run
+from evedrop.errors import ScenarioError
+from evedrop.model.slot.link import NEVER
+from evedrop.scenario import Scenario, checked, load
+from evedrop.score.scorekeeper import write_resolved
 
 NEMESIS: dict[str, Any] = {"faults": ["kill", "pause", "cut"], "every": 20, "lasting": 8}
 LOOP: dict[str, Any] = {

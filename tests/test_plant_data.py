@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator import plant_data
-from emulator.errors import DisturbanceError
-from emulator.plant_data import disturbances_text, read_disturbances
+from evedrop.errors import DisturbanceError
+from evedrop.recordings import disturbance_file as plant_data
+from evedrop.recordings.disturbance_file import disturbances_text, read_disturbances
 
 NAMES = ("P_solar", "P_load")
 UNITS = ("kW", "kW")

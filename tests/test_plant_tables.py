@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.errors import ScenarioError
-from emulator.runs.scorekeeper import write_resolved
-from emulator.scenario import Scenario, checked, load
-from emulator.scenario.disturbances import disturbances_of
+from evedrop.errors import ScenarioError
+from evedrop.scenario import Scenario, checked, load
+from evedrop.scenario.disturbances import disturbances_of
+from evedrop.score.scorekeeper import write_resolved
 
 LOOP: dict[str, Any] = {
     "title": "Loop",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scenario import load, parse
+from evedrop.scenario import load, parse
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -55,7 +55,7 @@ def test_every_command_is_one() -> None:
     assert len(quoted) >= 9
     for words in quoted:
         done = subprocess.run(
-            [sys.executable, "-m", "emulator", words[1], "--help"], check=False, capture_output=True, text=True
+            [sys.executable, "-m", "evedrop", words[1], "--help"], check=False, capture_output=True, text=True
         )
         assert done.returncode == 0, words
         for option in (word for word in words if word.startswith("--")):

@@ -12,10 +12,10 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.errors import ScenarioError, UsageError
-from emulator.runs.estimates import warnings_of
-from emulator.runs.scorekeeper import resolved, write_resolved
-from emulator.scenario import Scenario, load, parse, shipped, value_of, write_new
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.expected.estimates import warnings_of
+from evedrop.scenario import Scenario, load, parse, shipped, value_of, write_new
+from evedrop.score.scorekeeper import resolved, write_resolved
 
 GOOD: dict[str, Any] = {
     "title": "A vehicle",

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.streams import Batch, BlockReader, Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.streams import Batch, BlockReader, Stream, normals, root_of_seed, stream_key, uniforms
 
 KEY = bytes(range(32))
 SLOTS = st.integers(0, 2**45)

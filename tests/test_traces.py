@@ -14,12 +14,12 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator import traces
-from emulator.api import montecarlo
-from emulator.errors import ScenarioError, TraceError
-from emulator.model.links.checks import as_toml
-from emulator.scenario import load
-from emulator.traces import Recording
+from evedrop.api import montecarlo
+from evedrop.errors import ScenarioError, TraceError
+from evedrop.model.links.checks import as_toml
+from evedrop.recordings import link_recording as traces
+from evedrop.recordings.link_recording import Recording
+from evedrop.scenario import load
 from tests.conftest import Evedrop
 
 GOOD: dict[str, Any] = {

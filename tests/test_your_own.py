@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from emulator.errors import ScenarioError
-from emulator.model.eavesdroppers import ANSWERS
-from emulator.runs.results import load_results
-from emulator.scenario import load
-from emulator.scenario.amended import with_event
+from evedrop.errors import ScenarioError
+from evedrop.loading.amended import with_event
+from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.results.writer import load_results
+from evedrop.scenario import load
 from tests.conftest import Evedrop
 
 PAGE = Path(__file__).parents[1] / "docs" / "your-own.md"
@@ -167,13 +167,13 @@ def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: 
 
 HEAD = """
 import numpy as np
-from emulator.model.schemes.plain import Plain, PlainEncoder
-from emulator.model.schemes.scheme import NoInnovations, Packet, Scheme
-from emulator.model.eavesdroppers.naive import Naive
-from emulator.model.eavesdroppers.eavesdropper import PacketReader
-from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.delays.constant import Constant
-from emulator.model.schemes.plain import PlainEstimator
+from evedrop.model.schemes.plain import Plain, PlainEncoder
+from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme
+from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.eavesdropper import PacketReader
+from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.delays.constant import Constant
+from evedrop.model.schemes.plain import PlainEstimator
 
 
 class Sends(Plain):
@@ -204,7 +204,7 @@ MISTAKES = {
             "reaches for the key of 'noise', and has asked for none"),
     "abstract": ("scheme", "Mine(Scheme):\n    def outcomes(self, mu): return None",
                  "which lacks shared; expected a class with this method"),
-    "other": ("scheme", "Mine(Naive):\n    pass", "which is no Scheme; expected a class that inherits from emulator.model"),
+    "other": ("scheme", "Mine(Naive):\n    pass", "which is no Scheme; expected a class that inherits from evedrop.model"),
     "absent": ("scheme", "Mein(Plain):\n    pass", "has no Mine; did you mean case_absent:Mein?"),
     "syntax": ("scheme", "Mine(Plain)\n    pass", "cannot be imported (SyntaxError: "),
     "fails": ("scheme", "Mine(Plain):\n    pass\n\nimport nowhere_at_all",
@@ -304,7 +304,7 @@ def test_a_module_called_like_an_installed_one_is_refused(name: str, entry: str,
 
 def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -> None:
     """The scenario is refused without the table, with what to write, and runs with it."""
-    body = "from emulator.model.schemes.acknowledged import Acknowledged\n\n\nclass Mine(Acknowledged):\n    pass\n"
+    body = "from evedrop.model.schemes.acknowledged import Acknowledged\n\n\nclass Mine(Acknowledged):\n    pass\n"
     (evedrop.folder / "heeds.py").write_text(body)
     (evedrop.folder / "mine.toml").write_text(SCENARIO.replace('"plain"', '"heeds:Mine"'))
     done = evedrop("run", "mine.toml", "--view", "off", "--out", "run")
@@ -335,7 +335,7 @@ def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
 def test_another_shape_in_a_later_slot_is_not_sent(evedrop: Evedrop) -> None:
     """Turned round, a packet has as many bytes as ever: live as in memory the run ends with status 3 and says what it was."""
     lines = (
-        "from emulator.model.schemes.plain import Plain",
+        "from evedrop.model.schemes.plain import Plain",
         "class Turns(Plain):",
         "    def shared(self, keys, batch):",
         "        found = super().shared(keys, batch)",

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.conformance.packets import SchemeOf, Slot, expect_belief, frozen_belief, made, played, row_of
-from emulator.conformance.problems import Problem, large, small
-from emulator.conformance.receivers import Step, expect_actions, expect_expected, expect_pure
-from emulator.conformance.rules import (
+from evedrop.conformance.packets import SchemeOf, Slot, expect_belief, frozen_belief, made, played, row_of
+from evedrop.conformance.problems import Problem, large, small
+from evedrop.conformance.receivers import Step, expect_actions, expect_expected, expect_pure
+from evedrop.conformance.rules import (
     Broken,
     Keys,
     Row,
@@ -28,9 +28,9 @@ from emulator.conformance.rules import (
     frozen,
     judged,
 )
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
-from emulator.model.outcomes import eavesdropper_outcomes
-from emulator.model.schemes.scheme import Scheme
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from evedrop.model.outcomes import eavesdropper_outcomes
+from evedrop.model.schemes.scheme import Scheme
 
 _COLUMN = (
     "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "

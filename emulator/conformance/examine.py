@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emulator.conformance.eavesdroppers import Listening, eavesdropper_verdicts
-from emulator.conformance.links import DelayChecks, LossChecks
-from emulator.conformance.rules import Broken, Verdict, calling
-from emulator.conformance.schemes import scheme_verdicts
-from emulator.errors import UsageError
-from emulator.model.delays import DELAY_MODELS
-from emulator.model.eavesdroppers import READERS, STRATEGIES
-from emulator.model.links import LOSS_MODELS
-from emulator.model.registry import NotRegistered, Registry, asked
-from emulator.model.schemes import SCHEMES, scheme_of
-from emulator.modules import look_in
+from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
+from evedrop.conformance.links import DelayChecks, LossChecks
+from evedrop.conformance.rules import Broken, Verdict, calling
+from evedrop.conformance.schemes import scheme_verdicts
+from evedrop.errors import UsageError
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.registry import NotRegistered, Registry, asked
+from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.plugins import look_in
 
 _REGISTRIES: Mapping[str, Registry[Any]] = {
     "scheme": SCHEMES,

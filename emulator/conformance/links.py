@@ -12,9 +12,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from emulator.conformance.problems import Problem, large, small
-from emulator.conformance.receivers import SIGMAS
-from emulator.conformance.rules import (
+from evedrop.conformance.problems import Problem, large, small
+from evedrop.conformance.receivers import SIGMAS
+from evedrop.conformance.rules import (
     Broken,
     Verdict,
     calling,
@@ -26,11 +26,11 @@ from emulator.conformance.rules import (
     judged,
     key,
 )
-from emulator.model.delays.delay import DelayModel
-from emulator.model.links.link import Chain, Fate, LossModel
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes
-from emulator.streams import BlockReader
+from evedrop.model.delays.delay import DelayModel
+from evedrop.model.links.link import Chain, Fate, LossModel
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+from evedrop.streams import BlockReader
 
 _COLUMN = "compute each trial from its own column of numbers alone"
 _PIECES = (

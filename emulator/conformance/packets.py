@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from emulator.conformance.problems import Problem
-from emulator.conformance.rules import Broken, Keys, Row, calling, expect_array, expect_finite, frozen, key
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Belief, Heard, Receiver
-from emulator.model.schemes.scheme import Encoder, Packet, Scheme
+from evedrop.conformance.problems import Problem
+from evedrop.conformance.rules import Broken, Keys, Row, calling, expect_array, expect_finite, frozen, key
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Belief, Heard, Receiver
+from evedrop.model.schemes.scheme import Encoder, Packet, Scheme
 
 _TRIALS = "one for each of the R trials"
 

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from emulator.conformance.rules import key
-from emulator.model.process import Process
-from emulator.model.receiver import Flags
-from emulator.streams import Batch, BlockReader
+from evedrop.conformance.rules import key
+from evedrop.model.process import Process
+from evedrop.model.receiver import Flags
+from evedrop.streams import Batch, BlockReader
 
 QUALITY = 0.7
 """Of the link of every problem."""

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from emulator.conformance.packets import expect_belief, row_of
-from emulator.conformance.problems import QUALITY, Problem
-from emulator.conformance.rules import Broken, calling, expect_array, expect_same
-from emulator.model import update
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Heard, Receiver
-from emulator.model.theory import ExpectedCovariance, OutcomesAt
+from evedrop.conformance.packets import expect_belief, row_of
+from evedrop.conformance.problems import QUALITY, Problem
+from evedrop.conformance.rules import Broken, calling, expect_array, expect_same
+from evedrop.model import update
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Heard, Receiver
+from evedrop.model.theory.covariances import ExpectedCovariance, OutcomesAt
 
 SIGMAS = 6.0
 """Standard deviations that chance is allowed."""

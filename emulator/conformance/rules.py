@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.registry import place_of
-from emulator.model.theory import Outcomes
-from emulator.streams import root_of_seed, stream_key
+from evedrop.model.registry import place_of
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import root_of_seed, stream_key
 
 Array = NDArray[Any]
 _ROOT = root_of_seed(0)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.conformance.packets import SchemeOf, Slot, made, played, row_of
-from emulator.conformance.problems import Problem, large, small
-from emulator.conformance.receivers import SIGMAS, expect_actions, expect_expected, expect_pure
-from emulator.conformance.rules import (
+from evedrop.conformance.packets import SchemeOf, Slot, made, played, row_of
+from evedrop.conformance.problems import Problem, large, small
+from evedrop.conformance.receivers import SIGMAS, expect_actions, expect_expected, expect_pure
+from evedrop.conformance.rules import (
     Broken,
     Keys,
     Verdict,
@@ -22,8 +22,8 @@ from emulator.conformance.rules import (
     expect_same,
     judged,
 )
-from emulator.model.outcomes import legitimate_outcomes
-from emulator.model.schemes.scheme import Scheme
+from evedrop.model.outcomes import legitimate_outcomes
+from evedrop.model.schemes.scheme import Scheme
 
 _COLUMN = (
     "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from emulator.fitting.candidate import Candidate, normal_interval, rounded
-from emulator.model.process import Floats
+from evedrop.fitting.candidate import Candidate, normal_interval, rounded
+from evedrop.model.process import Floats
 
 
 def delay_candidates(delays: Floats) -> list[Candidate]:

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import TraceError
-from emulator.fitting import losses
-from emulator.fitting.candidate import Candidate, wilson
-from emulator.fitting.delays import delay_candidates
-from emulator.fitting.runs import RunLaw, lengths_of, p_value
-from emulator.model.links.checks import toml_of
-from emulator.traces import Outcomes, Recording
+from evedrop.errors import TraceError
+from evedrop.fitting import losses
+from evedrop.fitting.candidate import Candidate, wilson
+from evedrop.fitting.delays import delay_candidates
+from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
+from evedrop.model.links.checks import toml_of
+from evedrop.recordings.link_recording import Outcomes, Recording
 
 FEWEST = 100
 """Outcomes from which something can be estimated."""

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats
-from emulator.model.receiver import Flags
-from emulator.traces import Outcomes
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags
+from evedrop.recordings.link_recording import Outcomes
 
 _SCOUTED = 50_000  # outcomes by which starts are compared
 _SCOUTING, _MOST = 40, 400  # steps

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from emulator.fitting.candidate import Candidate, rounded, wilson
-from emulator.fitting.hidden import TwoStates, most_likely
-from emulator.traces import Outcomes
+from evedrop.fitting.candidate import Candidate, rounded, wilson
+from evedrop.fitting.hidden import TwoStates, most_likely
+from evedrop.recordings.link_recording import Outcomes
 
 
 def bernoulli(outcomes: Outcomes) -> Candidate:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.model.receiver import Flags
-from emulator.streams import Batch, BlockReader
+from evedrop.model.receiver import Flags
+from evedrop.streams import Batch, BlockReader
 
 Attack = Callable[[Flags, Flags], Flags]
 """(γ of the user, γᵉ of the jammer) → the acknowledgements on the air, all (R,)."""

@@ -26,7 +26,7 @@ from typing import Any
 
 _SECONDS = 60.0  # for an answer; a class may import much
 _MOST_BYTES = 2**20  # of an answer
-_MODULE = "emulator.answering"
+_MODULE = "evedrop.conformance.answering"
 # Libraries that are not where the system looks for them; nothing else of our environment.
 _NEEDED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH", "PYTHONHOME")
 
@@ -54,7 +54,7 @@ class Answers:
 
         Raises NotRegistered if the name stands for no class, NoAnswer if it has no answer.
         """
-        from emulator.model.registry import NotRegistered  # noqa: PLC0415 - the registries ask us
+        from evedrop.model.registry import NotRegistered  # noqa: PLC0415 - the registries ask us
 
         question = json.dumps([name, do, *given], default=str)
         with self._lock:

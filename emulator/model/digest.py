@@ -18,8 +18,8 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Codes, Flags
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Codes, Flags
 
 BLOCK_SLOTS = 256
 DIGEST_BYTES = 32

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.model.process import Floats
+from evedrop.model.process import Floats
 
 _HOUR = 3600.0
 

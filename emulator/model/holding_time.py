@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.receiver import Flags
+from evedrop.model.receiver import Flags
 
 _NEVER = -(2**62)
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.model.controllers import Assignment, Controller
-from emulator.model.controllers.lqr import held
-from emulator.model.process import Floats, product
+from evedrop.model.controllers import Assignment, Controller
+from evedrop.model.controllers.lqr import held
+from evedrop.model.process import Floats, product
 
 _BELIEVED = 0.9
 """Share of a guess that the copy of the controller is told. A controller that makes up for the load at once leaves nothing in the

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.model.elementary import inverse, semidefinite_factor
-from emulator.model.plant import Plant
-from emulator.model.process import Floats, Process, product
-from emulator.streams import Batch, BlockReader
+from evedrop.kernels.elementary import inverse, semidefinite_factor
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process, product
+from evedrop.streams import Batch, BlockReader
 
 _SETTLED = 1e-14
 _LONGEST = 200_000  # slots after which a filter counts as never settled

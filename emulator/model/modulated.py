@@ -19,12 +19,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.model.leak import RemainingCovariances, remaining_limit
-from emulator.model.link_law import LinkLaw, Segment
-from emulator.model.links.link import Chain
-from emulator.model.modulated_block import BLOCK, PARTS, Block
-from emulator.model.process import Floats, Process
-from emulator.model.theory import LARGEST_OPERATOR, NOBODY, ExpectedCovariance, Outcomes, OutcomesAt, lyapunov, radius
+from evedrop.model.links.link import Chain
+from evedrop.model.modulated_block import BLOCK, PARTS, Block
+from evedrop.model.process import Floats, Process
+from evedrop.model.slot.link_law import LinkLaw, Segment
+from evedrop.model.theory.covariances import (
+    LARGEST_OPERATOR,
+    NOBODY,
+    ExpectedCovariance,
+    Outcomes,
+    OutcomesAt,
+    lyapunov,
+    radius,
+)
+from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
 
 class ModulatedCovariance:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.model.links.link import Chain
-from emulator.model.process import Floats, Process
+from evedrop.model.links.link import Chain
+from evedrop.model.process import Floats, Process
 
 BLOCK = 128
 """Slots of a block, a power of 2."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.eavesdroppers import READERS, STRATEGIES
-from emulator.model.eavesdroppers.constant import Constant
-from emulator.model.eavesdroppers.eavesdropper import PacketTaker
-from emulator.model.schemes.innovation import Innovation
-from emulator.model.schemes.scheme import Scheme
-from emulator.model.theory import Outcomes, OutcomesAt
+from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.eavesdroppers.constant import Constant
+from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
+from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 GENIE_SCHEMES = ("innovation", "plain")
 """Schemes whose packets are states and innovations, so that nobody without the secret outdoes the genie."""

@@ -6,8 +6,8 @@ from abc import abstractmethod
 
 import numpy as np
 
-from emulator.model import update
-from emulator.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver
+from evedrop.model import update
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver
 
 _ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)
 

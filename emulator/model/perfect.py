@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model.controllers import Controller
-from emulator.model.plant import Plant
-from emulator.model.process import Floats, Process
+from evedrop.model.controllers import Controller
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process
 
 
 class PerfectLoop:

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.process import Floats, product
-from emulator.model.receiver import Flags
+from evedrop.model.process import Floats, product
+from evedrop.model.receiver import Flags
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats
+from evedrop.model.process import Floats
 
 Flags = NDArray[np.bool_]
 

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.elementary import Rows, cholesky, semidefinite_factor, triangular_factor
-from emulator.streams import Batch, BlockReader
+from evedrop.kernels.elementary import Rows, cholesky, semidefinite_factor, triangular_factor
+from evedrop.streams import Batch, BlockReader
 
 Floats = NDArray[np.float64]
 

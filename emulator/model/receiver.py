@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats, Process
+from evedrop.model.process import Floats, Process
 
 Flags = NDArray[np.bool_]
 Codes = NDArray[np.uint8]

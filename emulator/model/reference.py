@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.elementary import inverse
-from emulator.model.horizon import TOLERANCE, UNIT_ROUNDOFF
-from emulator.model.process import Dynamics, Floats, Process, product
-from emulator.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver, trace_of
-from emulator.model.theory import radius
+from evedrop.kernels.elementary import inverse
+from evedrop.model.process import Dynamics, Floats, Process, product
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver, trace_of
+from evedrop.model.theory.covariances import radius
+from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 
 Slots = NDArray[np.int64]
 

@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from emulator.model.answers import NoAnswer
+from evedrop.model.answers import NoAnswer
 
 T = TypeVar("T")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from emulator.model.receiver import Flags
-from emulator.streams import Batch, BlockReader
+from evedrop.model.receiver import Flags
+from evedrop.streams import Batch, BlockReader
 
 
 class Schedule:

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model.elementary import Rows, cholesky, triangular_factor
-from emulator.model.factored import Factor
-from emulator.model.process import Floats, Process, product
+from evedrop.kernels.elementary import Rows, cholesky, triangular_factor
+from evedrop.model.numeric.factored import Factor
+from evedrop.model.process import Floats, Process, product
 
 
 class Apart:

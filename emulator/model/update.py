@@ -18,8 +18,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Action, Codes, Flags, cleared, select
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Action, Codes, Flags, cleared, select
 
 _STATE, _INNOVATION = int(Action.STATE), int(Action.INNOVATION)  # numpy compares with an int ten times as fast
 

@@ -3,9 +3,9 @@
 Source: docs/scenario.md.
 """
 
-from emulator.scenario.expect import FIGURES, ExpectTable, link_figure
-from emulator.scenario.file import checked, load, parse, read, shipped, value_of, write_new
-from emulator.scenario.tables import SECRET_BYTES, Scenario
+from evedrop.loading.file import checked, load, parse, read, shipped, value_of, write_new
+from evedrop.scenario.expect import FIGURES, ExpectTable, link_figure
+from evedrop.scenario.tables import SECRET_BYTES, Scenario
 
 __all__ = [
     "FIGURES",

@@ -11,12 +11,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from emulator.model.schemes import SCHEMES
-from emulator.network.access import LEGITIMATE
-from emulator.scenario.events import EventTable
-from emulator.scenario.link_table import LinkTable, changed_link
-from emulator.scenario.timeline import Act, acts_of
-from emulator.scenario.words import as_toml, listed
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.schemes import SCHEMES
+from evedrop.scenario.events import EventTable
+from evedrop.scenario.link_table import LinkTable, changed_link
+from evedrop.scenario.timeline import Act, acts_of
+from evedrop.scenario.words import as_toml, listed
 
 Sentences = Callable[[ValidationError], list[str]]
 

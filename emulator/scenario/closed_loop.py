@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from emulator.model.controllers import CONTROLLERS
-from emulator.model.elementary import semidefinite_factor
-from emulator.network.access import LEGITIMATE
-from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
-from emulator.scenario.process import ProcessTable
-from emulator.scenario.table import numbers
-from emulator.scenario.tables import LegitimateTable
-from emulator.scenario.words import as_toml, listed
+from evedrop.kernels.elementary import semidefinite_factor
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.controllers import CONTROLLERS
+from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
+from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.table import numbers
+from evedrop.scenario.tables import LegitimateTable
+from evedrop.scenario.words import as_toml, listed
 
 
 def loop_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:

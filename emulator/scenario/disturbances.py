@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import DisturbanceError
-from emulator.model.links.checks import is_number
-from emulator.model.process import Floats
-from emulator.plant_data import found_file, read_disturbances
-from emulator.scenario.tables import Scenario
+from evedrop.errors import DisturbanceError
+from evedrop.model.links.checks import is_number
+from evedrop.model.process import Floats
+from evedrop.recordings.disturbance_file import found_file, read_disturbances
+from evedrop.scenario.tables import Scenario
 
 
 def disturbances_beside(tables: Mapping[str, Any], folder: Path) -> None:

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from emulator.model.elementary import log
-from emulator.model.link import NEVER
-from emulator.model.process import Floats
-from emulator.network.access import LEGITIMATE
-from emulator.scenario.across import Sentences
-from emulator.scenario.link_table import changed_link
-from emulator.scenario.nemesis import FAULTS, NEMESIS, NemesisTable
-from emulator.scenario.tables import Scenario
-from emulator.scenario.timeline import acts_of
-from emulator.streams import Stream, root_of_seed, stream_key, uniforms
+from evedrop.kernels.elementary import log
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.process import Floats
+from evedrop.model.slot.link import NEVER
+from evedrop.scenario.across import Sentences
+from evedrop.scenario.link_table import changed_link
+from evedrop.scenario.nemesis import FAULTS, NEMESIS, NemesisTable
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.timeline import acts_of
+from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
 MOST_EVENTS = 10_000
 """Of a scenario, those of the file included."""

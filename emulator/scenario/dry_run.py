@@ -10,24 +10,24 @@ from dataclasses import astuple
 from functools import partial
 from typing import Any
 
-from emulator.conformance.eavesdroppers import EavesdropperChecks, Listening
-from emulator.conformance.links import DelayChecks, LossChecks
-from emulator.conformance.problems import Problem
-from emulator.conformance.rules import how_broken
-from emulator.conformance.schemes import SchemeChecks
-from emulator.model.answers import NoAnswer
-from emulator.model.delays import DELAY_MODELS, delay_of
-from emulator.model.eavesdroppers import ANSWERS, STRATEGIES
-from emulator.model.links import LOSS_MODELS, loss_of
-from emulator.model.process import Process
-from emulator.model.schemes import SCHEMES, scheme_of
-from emulator.model.schemes.scheme import Scheme
-from emulator.modules import names_in
-from emulator.network.access import LEGITIMATE
-from emulator.scenario.table import model_mistakes
-from emulator.scenario.tables import EavesdropperTable, Scenario
-from emulator.scenario.words import as_toml
-from emulator.streams import Batch
+from evedrop.conformance.eavesdroppers import EavesdropperChecks, Listening
+from evedrop.conformance.links import DelayChecks, LossChecks
+from evedrop.conformance.problems import Problem
+from evedrop.conformance.rules import how_broken
+from evedrop.conformance.schemes import SchemeChecks
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.answers import NoAnswer
+from evedrop.model.delays import DELAY_MODELS, delay_of
+from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.process import Process
+from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.plugins import names_in
+from evedrop.scenario.table import model_mistakes
+from evedrop.scenario.tables import EavesdropperTable, Scenario
+from evedrop.scenario.words import as_toml
+from evedrop.streams import Batch
 
 _SLOTS = 4
 _TRIALS = 3

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from emulator.scenario.table import Found, Table
-from emulator.scenario.words import listed
+from evedrop.scenario.table import Found, Table
+from evedrop.scenario.words import listed
 
 LASTING = ("set", "cut", "partition", "kill", "pause", "jam")
 """What can last `from` a slot `to` another."""

@@ -14,11 +14,11 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from emulator.scenario.household import FIGURES as HOUSE_FIGURES
-from emulator.scenario.household import HOUSEHOLD
-from emulator.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
-from emulator.scenario.table import Found, Number, Table, expected, one_of
-from emulator.scenario.words import as_toml, listed
+from evedrop.scenario.household import FIGURES as HOUSE_FIGURES
+from evedrop.scenario.household import HOUSEHOLD
+from evedrop.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
+from evedrop.scenario.table import Found, Number, Table, expected, one_of
+from evedrop.scenario.words import as_toml, listed
 
 FIGURES = (
     "mean_squared_error",

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from emulator.model.elementary import semidefinite_factor
-from emulator.model.local_filter import MOST_STATES, Step, settled
-from emulator.model.process import Floats, Process
-from emulator.scenario.plant import PlantTable, plant_of
-from emulator.scenario.process import ProcessTable
-from emulator.scenario.table import numbers
+from evedrop.kernels.elementary import semidefinite_factor
+from evedrop.model.local_filter import MOST_STATES, Step, settled
+from evedrop.model.process import Floats, Process
+from evedrop.scenario.plant import PlantTable, plant_of
+from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.table import numbers
 
 FILTER = "filter"
 _INVERTS_NOISE = ("bayesian", "genie", "likelihood", "tracker")

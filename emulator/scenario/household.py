@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from emulator.scenario.table import Table
-from emulator.scenario.words import as_toml, listed
+from evedrop.scenario.table import Table
+from evedrop.scenario.words import as_toml, listed
 
 FIGURES = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
 """Of the house."""

@@ -10,11 +10,11 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from emulator.model.delays import DELAY_MODELS
-from emulator.model.links import LOSS_MODELS, loss_of
-from emulator.model.links.link import LossModel
-from emulator.scenario.table import Found, Probability, Table, model_mistakes
-from emulator.scenario.words import as_toml
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links.link import LossModel
+from evedrop.scenario.table import Found, Probability, Table, model_mistakes
+from evedrop.scenario.words import as_toml
 
 _QUEUE = 100  # packets that wait before a link of limited rate, if the scenario does not say
 

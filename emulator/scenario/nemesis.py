@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from emulator.scenario.events import Slot
-from emulator.scenario.table import Found, Table, one_of
-from emulator.scenario.words import as_toml, listed
+from evedrop.scenario.events import Slot
+from evedrop.scenario.table import Found, Table, one_of
+from evedrop.scenario.words import as_toml, listed
 
 NEMESIS = "nemesis"
 FAULTS = ("kill", "pause", "cut", "set", "partition")

@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
-from emulator.model.controllers import CONTROLLERS, Assignment
-from emulator.model.plant import Plant
-from emulator.model.process import MOST_STATES, Floats, Process
-from emulator.scenario.table import Found, Matrix, Number, Table, numbers, one_of
-from emulator.scenario.words import as_toml, listed
+from evedrop.model.controllers import CONTROLLERS, Assignment
+from evedrop.model.plant import Plant
+from evedrop.model.process import MOST_STATES, Floats, Process
+from evedrop.scenario.table import Found, Matrix, Number, Table, numbers, one_of
+from evedrop.scenario.words import as_toml, listed
 
 Numbers = list[Number]
 Names = list[Annotated[str, Field(strict=True, min_length=1)]]

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from emulator.model.process import Process, mistakes_of
-from emulator.scenario.table import Found, Matrix, Number, Table, numbers
-from emulator.scenario.words import as_toml, listed
+from evedrop.model.process import Process, mistakes_of
+from evedrop.scenario.table import Found, Matrix, Number, Table, numbers
+from evedrop.scenario.words import as_toml, listed
 
 _MATRICES = ("A", "Q", "initial_covariance")
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.errors import TraceError
-from emulator.model.delays.trace import MOST_DELAYS
-from emulator.scenario.words import as_toml
-from emulator.traces import Recording
+from evedrop.errors import TraceError
+from evedrop.model.delays.trace import MOST_DELAYS
+from evedrop.recordings.link_recording import Recording
+from evedrop.scenario.words import as_toml
 
 _STAND_IN = "1"  # for a recording that cannot be read: it is complained of once
 

@@ -17,9 +17,9 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from emulator.model.registry import NotRegistered, Registry, asked
-from emulator.network.access import RESERVED
-from emulator.scenario.words import as_toml, listed, near
+from evedrop.live.network.access import RESERVED
+from evedrop.model.registry import NotRegistered, Registry, asked
+from evedrop.scenario.words import as_toml, listed, near
 
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 

@@ -12,33 +12,26 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, ConfigDict, Field
 
-from emulator.model.acknowledgements import ATTACKS
-from emulator.model.controllers import Assignment
-from emulator.model.eavesdroppers import ANSWERS, READERS, STRATEGIES
-from emulator.model.link import Course
-from emulator.model.plant import Plant
-from emulator.model.registry import asked, is_own
-from emulator.model.schemes import SCHEMES
-from emulator.modules import elsewhere, look_in, trusted_in
-from emulator.network.access import CONTROLLER, LEGITIMATE
-from emulator.scenario.events import EventTable
-from emulator.scenario.expect import ExpectTable
-from emulator.scenario.household import HouseholdTable
-from emulator.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
-from emulator.scenario.nemesis import NemesisTable
-from emulator.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
-from emulator.scenario.process import ProcessTable
-from emulator.scenario.table import (
-    Found,
-    Probability,
-    ProcessName,
-    Table,
-    one_of,
-    registered,
-)
-from emulator.scenario.timeline import Timeline
-from emulator.scenario.values import MOST_EAVESDROPPERS
-from emulator.scenario.words import as_toml, listed, no_entry
+from evedrop.live.network.access import CONTROLLER, LEGITIMATE
+from evedrop.model.acknowledgements import ATTACKS
+from evedrop.model.controllers import Assignment
+from evedrop.model.eavesdroppers import ANSWERS, READERS, STRATEGIES
+from evedrop.model.plant import Plant
+from evedrop.model.registry import asked, is_own
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.slot.link import Course
+from evedrop.plugins import elsewhere, look_in, trusted_in
+from evedrop.scenario.events import EventTable
+from evedrop.scenario.expect import ExpectTable
+from evedrop.scenario.household import HouseholdTable
+from evedrop.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
+from evedrop.scenario.nemesis import NemesisTable
+from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
+from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.table import Found, Probability, ProcessName, Table, one_of, registered
+from evedrop.scenario.timeline import Timeline
+from evedrop.scenario.values import MOST_EAVESDROPPERS
+from evedrop.scenario.words import as_toml, listed, no_entry
 
 SECRET_BYTES = 32
 MOST_SECRET_BYTES = 2**20
@@ -253,7 +246,7 @@ class Scenario(Table):
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Whether there is a folder of modules; they are looked for in it from now on, so that entries can name classes.
 
-        Without a scheme or a link of somebody's own nothing in it is imported here: see `emulator.model.answers`.
+        Without a scheme or a link of somebody's own nothing in it is imported here: see `evedrop.model.answers`.
         """
         folder = table.get("modules")
         if not isinstance(folder, str):

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emulator.model.link import NEVER, Change, Outage
-from emulator.model.links.link import Fate
-from emulator.scenario.events import EventTable
-from emulator.scenario.words import as_toml
+from evedrop.model.links.link import Fate
+from evedrop.model.slot.link import NEVER, Change, Outage
+from evedrop.scenario.events import EventTable
+from evedrop.scenario.words import as_toml
 
 _REASONS = {"kill": Fate.DOWN, "pause": Fate.PAUSED}
 _ENDS = {"cut": "heal", "partition": "heal", "jam": "jammed", "kill": "restart", "pause": "resume"}

@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Iterator
 from typing import Any
 
-from emulator.scenario.words import as_toml
+from evedrop.scenario.words import as_toml
 
 _DEEPEST = 16  # tables and lists in one another; what is in use has half of that
 _LARGEST_BITS = 4096  # of a whole number; a seed has 256

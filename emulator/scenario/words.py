@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from emulator.model.links.checks import as_toml
+from evedrop.model.links.checks import as_toml
 
 __all__ = ["as_toml", "listed", "near"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
-from emulator.view import driven, lanes, paths, plane
-from emulator.view.palette import GROUND
-from emulator.view.scene import Scene
+from evedrop.view import driven, lanes, paths, plane
+from evedrop.view.palette import GROUND
+from evedrop.view.scene import Scene
 
 _WINDOW = 105  # slots; with a slot below four pixels, Rerun merges it with its neighbours to grey
 _LANES_OF_A_SCREEN = 23.0  # lanes that would fill the usual window from top to bottom

@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats
-from emulator.view import paths
+from evedrop.model.process import Floats
+from evedrop.view import paths
 
 
 @dataclass(frozen=True)

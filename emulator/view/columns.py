@@ -8,14 +8,14 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes
-from emulator.view import driven, lanes, paths, plane
-from emulator.view.column import Column, scalars
-from emulator.view.events import Event, Watcher
-from emulator.view.lanes import Lane
-from emulator.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
-from emulator.view.scene import PeerSlots, Scene, Slots
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+from evedrop.view import driven, lanes, paths, plane
+from evedrop.view.column import Column, scalars
+from evedrop.view.events import Event, Watcher
+from evedrop.view.lanes import Lane
+from evedrop.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
+from evedrop.view.scene import PeerSlots, Scene, Slots
 
 
 class Columns:

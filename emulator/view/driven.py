@@ -15,10 +15,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from emulator.view import paths
-from emulator.view.column import Column, scalars
-from emulator.view.palette import TRUTH_CURVE, Colour, colour
-from emulator.view.scene import Moved, Scene, Slots
+from evedrop.view import paths
+from evedrop.view.column import Column, scalars
+from evedrop.view.palette import TRUTH_CURVE, Colour, colour
+from evedrop.view.scene import Moved, Scene, Slots
 
 _MOST_POINTS = 20_000  # of a curve over a run: a day of seconds is drawn every five seconds
 _MOVING: tuple[Colour, ...] = (

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.model.receiver import Action, Codes, Flags
-from emulator.view.lanes import MISLED, SILENT
-from emulator.view.scene import Scene, Shown
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.view.lanes import MISLED, SILENT
+from evedrop.view.scene import Scene, Shown
 
 _SHORTEST = 3  # packets in a row; fewer missed ones are everyday life
 _LINES = 200  # about how many stretches a receiver may have reported in a whole run

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.model.receiver import Action, Codes, Flags
-from emulator.view.palette import Colour
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.view.palette import Colour
 
 BLUE: Colour = (84, 150, 250)
 GREEN: Colour = (30, 128, 96)

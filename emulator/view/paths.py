@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulator.view.scene import Scene
+from evedrop.view.scene import Scene
 
 TIMELINE = "slot_number"
 """Rerun makes the events' first column as wide as this name, and "slot" is too narrow for a number."""

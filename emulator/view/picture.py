@@ -17,11 +17,11 @@ from pathlib import Path
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
-from emulator.errors import UsageError
-from emulator.runs.environment import viewer_environment
-from emulator.runs.ports import free_port
-from emulator.runs.viewer_process import end, guarded, spawn
-from emulator.view.paths import TIMELINE
+from evedrop.environment import viewer_environment
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import free_port
+from evedrop.view.paths import TIMELINE
+from evedrop.view.viewer_process import end, guarded, spawn
 
 _LOAD_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
@@ -49,7 +49,7 @@ def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
         sys.executable,
         "-P",
         "-m",
-        "emulator.view.picture",
+        "evedrop.view.picture",
         str(rrd),
         str(png),
         *([] if slot is None else [str(slot)]),

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats
-from emulator.view.scene import Scene
+from evedrop.model.process import Floats
+from evedrop.view.scene import Scene
 
 Points = NDArray[np.float32]
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from emulator.model.receiver import Flags
-from emulator.runs.folder import private_file
-from emulator.view.blueprint import layout
-from emulator.view.column import Column
-from emulator.view.columns import Columns, lines, log_styles
-from emulator.view.events import Event, introduction
-from emulator.view.paths import NOTES
-from emulator.view.scene import Moved, PeerSlots, Scene, Shown, Slots
+from evedrop.model.receiver import Flags
+from evedrop.results.folder import private_file
+from evedrop.view.blueprint import layout
+from evedrop.view.column import Column
+from evedrop.view.columns import Columns, lines, log_styles
+from evedrop.view.events import Event, introduction
+from evedrop.view.paths import NOTES
+from evedrop.view.scene import Moved, PeerSlots, Scene, Shown, Slots
 
 __all__ = ["PeerSlots", "Recording", "Scene", "Shown", "Slots"]
 

@@ -9,14 +9,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from emulator.errors import UsageError
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Flags
-from emulator.runs.results import Results, load_results
-from emulator.runs.scorekeeper import event_line
-from emulator.runs.shown import open_recording, showing_of
-from emulator.scenario import load
-from emulator.view.scene import PeerSlots, Slots
+from evedrop.errors import UsageError
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Flags
+from evedrop.results.writer import Results, load_results
+from evedrop.scenario import load
+from evedrop.score.scorekeeper import event_line
+from evedrop.view.scene import PeerSlots, Slots
+from evedrop.view.scored_slots import open_recording, showing_of
 
 _CHUNK = 1000  # slots handed over at once
 _CODES = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes, Flags
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
 
 
 @dataclass(frozen=True)

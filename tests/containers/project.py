@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emulator.runs.results import Results, load_results
+from evedrop.results.writer import Results, load_results
 from tests.conftest import wait_until
 from tests.containers.base import ROOT
 from tests.containers.machine import Docker

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from emulator.api import montecarlo
+from evedrop.api import montecarlo
 from tests.conftest import wait_until
 from tests.containers.project import ENDLESS, ROLES, Project
 

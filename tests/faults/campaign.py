@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from emulator.runs.results import load_results
+from evedrop.results.writer import load_results
 from tests.faults import ours
 from tests.faults.cases import PATIENT_SECONDS, Case, case_of
 from tests.faults.disturbed import Disturbed, disturbed

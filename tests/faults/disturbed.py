@@ -56,7 +56,7 @@ class Disturbed:
         self.begun = time.monotonic()
         with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as err:
             self.launcher = subprocess.Popen(
-                [sys.executable, "-m", "emulator", "run", variant.path(folder), *variant.options, *options, "--out", self.out],
+                [sys.executable, "-m", "evedrop", "run", variant.path(folder), *variant.options, *options, "--out", self.out],
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=out,

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from emulator.errors import UsageError
-from emulator.runs.results import Results, load_results
+from evedrop.errors import UsageError
+from evedrop.results.writer import Results, load_results
 from tests.faults import ours
 from tests.faults.disturbed import Disturbed
 from tests.faults.kinds import SIGNALS, Fault

@@ -10,9 +10,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from emulator import montecarlo
-from emulator.runs.results import Results
-from emulator.scenario import Scenario
+from evedrop import montecarlo
+from evedrop.results.writer import Results
+from evedrop.scenario import Scenario
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "slots": ("slot", "peer"),

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.runs.results import JOURNAL, load_results
+from evedrop.results.writer import JOURNAL, load_results
 from tests.faults import judge, ours
 from tests.faults.cases import HASTY_SECONDS, PATIENT_SECONDS, case_of
 from tests.faults.kinds import EVERYBODY, KINDS, Fault

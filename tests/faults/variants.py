@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulator.scenario import Scenario, load
+from evedrop.scenario import Scenario, load
 
 _RICH = """
 title = "Disturbed by the campaign"

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from emulator.errors import EvedropError
+from evedrop.errors import EvedropError
 from tests.fuzz.mutation import Mutator
 from tests.fuzz.readers import READERS, Reader
 

@@ -25,23 +25,23 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
 
-from emulator.brief import read_brief
-from emulator.brief_use import expect_usable
-from emulator.control import Control, read_controls
-from emulator.errors import EvedropError
-from emulator.modules import named_in
-from emulator.plant_data import read_disturbances
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.diff import difference
-from emulator.runs.estimates import warnings_of
-from emulator.runs.montecarlo import simulate
-from emulator.runs.reading import load_results
-from emulator.runs.results import ResultsWriter
-from emulator.runs.score import SlotSums
-from emulator.runs.scorekeeper import write_resolved
-from emulator.scenario import load, parse, shipped, value_of
-from emulator.traces import Recording
-from emulator.view.replay import replay
+from evedrop.errors import EvedropError
+from evedrop.expected.estimates import warnings_of
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.network.control_file import Control, read_controls
+from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.brief_use import expect_usable
+from evedrop.memory.montecarlo import simulate
+from evedrop.plugins import named_in
+from evedrop.recordings.disturbance_file import read_disturbances
+from evedrop.recordings.link_recording import Recording
+from evedrop.results.diff import difference
+from evedrop.results.reading import load_results
+from evedrop.results.writer import ResultsWriter
+from evedrop.scenario import load, parse, shipped, value_of
+from evedrop.score.scorekeeper import write_resolved
+from evedrop.score.sums import SlotSums
+from evedrop.view.replay import replay
 from tests.fuzz.mutation import Mutator, words_of
 from tests.network import test_protocol
 
@@ -282,7 +282,7 @@ def _replayed(place: Path) -> None:
 
 def _look_at(place: Path) -> None:
     """As view, diff and their likes do, but for the drawing."""
-    from emulator.runs.closing import print_results
+    from evedrop.cli.closing_report import print_results
 
     results = load_results(place)
     for table in ("slots", "trials", "journal", "digests", "inputs"):

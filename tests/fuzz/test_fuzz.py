@@ -16,9 +16,9 @@ import tomli_w
 from hypothesis import example, given, seed, settings
 from hypothesis import strategies as st
 
-from emulator.errors import UsageError
-from emulator.runs.estimates import warnings_of
-from emulator.scenario import parse, shipped
+from evedrop.errors import UsageError
+from evedrop.expected.estimates import warnings_of
+from evedrop.scenario import parse, shipped
 from tests.fuzz.fuzzing import CORPUS, broken_by, campaign
 from tests.fuzz.mutation import REALS
 from tests.fuzz.readers import FILES, MESSAGES, READERS

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from emulator.brief import read_brief
-from emulator.runs.results import load_results
-from emulator.scenario import Scenario, checked
+from evedrop.live.protocol.brief import read_brief
+from evedrop.results.writer import load_results
+from evedrop.scenario import Scenario, checked
 from tests.by_hand import ByHand, as_if_undisturbed, by_hand
 from tests.conftest import wait_until
 from tests.hosts.lan import Lan, lan
@@ -115,7 +115,7 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
     with apart(tmp_path, scenario) as (network, run), captured(network, "router", tmp_path / "capture"):
         run.start()
         run.running()
-        evedrop = (sys.executable, "-m", "emulator")
+        evedrop = (sys.executable, "-m", "evedrop")
         network.run("observer", *evedrop, "pause", str(run.folder / "run"))  # however long the scan takes
         router = network.addresses["router"]
         found = network.run("eve", sys.executable, "-c", SCAN, "65535", router)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emulator.model.process import Floats, Process, Trajectory
-from emulator.model.receiver import Belief, Flags, Heard, Receiver
-from emulator.model.schemes.innovation import Innovation
-from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.process import Floats, Process, Trajectory
+from evedrop.model.receiver import Belief, Flags, Heard, Receiver
+from evedrop.model.schemes.innovation import Innovation
+from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 EXAMPLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), 1e-3 * np.eye(2))
 """The paper's numerical illustration with Σ0 = Q."""

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Belief, Heard, Receiver
-from emulator.model.schemes.scheme import Packet, Scheme
-from emulator.streams import Batch, root_of_seed, stream_key
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Belief, Heard, Receiver
+from evedrop.model.schemes.scheme import Packet, Scheme
+from evedrop.streams import Batch, root_of_seed, stream_key
 
 ROOT = root_of_seed(4)
 UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.eye(2))

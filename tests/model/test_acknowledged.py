@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from slot_loop import DRIFTING, STABLE, UNSTABLE, Played, play
 
-from emulator.model.closed_forms import reference_covariances
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.process import Process
-from emulator.model.receiver import Action, Heard
-from emulator.model.reference import ReferenceCode, ReferenceReceiver, stationary_covariance
-from emulator.model.schemes.acknowledged import Acknowledged
-from emulator.model.theory import expected_covariances
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.process import Process
+from evedrop.model.receiver import Action, Heard
+from evedrop.model.reference import ReferenceCode, ReferenceReceiver, stationary_covariance
+from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.theory.closed_forms import reference_covariances
+from evedrop.model.theory.covariances import expected_covariances
+from evedrop.streams import Batch
 
 
 def played_over(process: Process, gamma: np.ndarray, gamma_e: np.ndarray, acks: np.ndarray) -> Played:

@@ -12,13 +12,13 @@ from scipy.optimize import brentq
 from scipy.stats import binomtest
 from slot_loop import ROOT, UNSTABLE, coins, play
 
-from emulator.model.acknowledgements import ATTACKS, WayBack, rates_of
-from emulator.model.closed_forms import reference_covariances
-from emulator.model.detection import Chart, chart_for
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.schemes.acknowledged import Acknowledged
-from emulator.streams import Batch, stream_key
+from evedrop.model.acknowledgements import ATTACKS, WayBack, rates_of
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.numeric.detection import Chart, chart_for
+from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.theory.closed_forms import reference_covariances
+from evedrop.streams import Batch, stream_key
 
 KEY = stream_key(ROOT, "link/acknowledgements")
 

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.model.eavesdroppers import READERS, STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.link import link_of
-from emulator.model.links import loss_of
-from emulator.model.links.link import Fate
-from emulator.model.links.pooled import pooled
-from emulator.model.process import Floats, Process, Trajectory
-from emulator.model.receiver import Heard
-from emulator.model.theory import Outcomes, expected_traces, state_covariances
-from emulator.streams import Batch, Stream, uniforms
+from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Fate
+from evedrop.model.links.pooled import pooled
+from evedrop.model.process import Floats, Process, Trajectory
+from evedrop.model.receiver import Heard
+from evedrop.model.slot.link import link_of
+from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
+from evedrop.streams import Batch, Stream, uniforms
 from tests.model.listening import EXAMPLE, MARGINAL, MICROGRID, Slot, followed, keys, slots
 
 HALVES = {"quality": 0.6, "model": "bernoulli"}, {"quality": 0.5, "model": "bernoulli"}

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.bayesian import CAPACITY, Bayesian
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Action, Heard, Receiver
-from emulator.model.theory import Outcomes, expected_traces
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.bayesian import CAPACITY, Bayesian
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Action, Heard, Receiver
+from evedrop.model.theory.covariances import Outcomes, expected_traces
+from evedrop.streams import Batch
 from tests.model.listening import EXAMPLE, MARGINAL, MICROGRID, followed, keys, slots
 
 SURE = 4.5  # standard errors: a normal mean is beyond with a probability below 7e-6

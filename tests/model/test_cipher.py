@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from scipy import stats
 from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, coins, play
 
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.masking import Mask
-from emulator.model.process import Process
-from emulator.model.schemes.cipher import Cipher
-from emulator.model.theory import expected_covariances, state_covariances
-from emulator.streams import Batch, Stream, stream_key
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.numeric.masking import Mask
+from evedrop.model.process import Process
+from evedrop.model.schemes.cipher import Cipher
+from evedrop.model.theory.covariances import expected_covariances, state_covariances
+from evedrop.streams import Batch, Stream, stream_key
 
 KEY = stream_key(ROOT, "mask")
 

@@ -6,8 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.errors import UsageError
-from emulator.model.design import (
+from evedrop.errors import UsageError
+from evedrop.model.process import Process
+from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
+from evedrop.model.theory.design import (
     Adversary,
     adversary_bound,
     best_difference,
@@ -17,8 +19,6 @@ from emulator.model.design import (
     perfect_secrecy,
     relative_secrecy,
 )
-from emulator.model.process import Process
-from emulator.model.theory import Outcomes, limit_trace, stability_bound
 
 EXAMPLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.eye(2))
 MICROGRID = Process(np.eye(2), 1e-5 * np.eye(2), 1e-5 * np.eye(2))

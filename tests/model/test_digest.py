@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.digest import BLOCK_SLOTS, BeliefLog, RunDigest
-from emulator.model.receiver import Belief
+from evedrop.model.digest import BLOCK_SLOTS, BeliefLog, RunDigest
+from evedrop.model.receiver import Belief
 
 
 def random_beliefs(slots: int, n: int, trials: int, seed: int) -> list[Belief]:

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.eavesdroppers import READERS, STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.process import Process
-from emulator.model.receiver import Action, Belief, Heard, Receiver
-from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.process import Process
+from evedrop.model.receiver import Action, Belief, Heard, Receiver
+from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(12)
 KEYS = {name: stream_key(ROOT, name) for name in ("schedule", "coin")}

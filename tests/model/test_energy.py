@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from emulator.model.energy import Difference, Meter, energy
+from evedrop.model.energy import Difference, Meter, energy
 
 
 def difference(run: np.ndarray, reference: np.ndarray) -> Difference:

@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 
-from emulator.model.design import Adversary, best_difference, design, relative_secrecy
-from emulator.model.process import Floats, Process, Trajectory, mistakes_of
-from emulator.model.schemes.innovation import Innovation
-from emulator.model.theory import Outcomes, expected_covariances, expected_traces, limit_trace, state_covariances
-from emulator.streams import Batch, root_of_seed, stream_key
-from emulator.view import figures_microgrid as microgrid
+from evedrop.model.process import Floats, Process, Trajectory, mistakes_of
+from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.theory.covariances import (
+    Outcomes,
+    expected_covariances,
+    expected_traces,
+    limit_trace,
+    state_covariances,
+)
+from evedrop.model.theory.design import Adversary, best_difference, design, relative_secrecy
+from evedrop.paper import microgrid
+from evedrop.streams import Batch, root_of_seed, stream_key
 
 A = np.array([[1.0, 0.3], [0.5, 1.001]])
 Q = 1e-3 * np.eye(2)

@@ -9,15 +9,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from emulator.model import modulated
-from emulator.model.eavesdroppers import READERS
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.leak import Leaks, RemainingCovariances, remaining_limit
-from emulator.model.link_law import LinkLaw
-from emulator.model.links import loss_of
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Action
-from emulator.model.theory import (
+from evedrop.model import modulated
+from evedrop.model.eavesdroppers import READERS
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.links import loss_of
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Action
+from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.theory.covariances import (
     Outcomes,
     expected_covariances,
     expected_traces,
@@ -27,7 +26,8 @@ from emulator.model.theory import (
     state_covariances,
     tail_index,
 )
-from emulator.streams import Batch
+from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
+from evedrop.streams import Batch
 from tests.model.listening import EXAMPLE, MARGINAL, followed, keys, slots
 
 SURE = 4.5  # standard errors: a normal mean is beyond with a probability below 7e-6

@@ -10,18 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, Played, coins, play
 
-from emulator.model import closed_forms
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.masking import Mask
-from emulator.model.process import Process
-from emulator.model.receiver import Action
-from emulator.model.schemes import scheme_of
-from emulator.model.schemes.encrypted_schedule import EncryptedSchedule
-from emulator.model.schemes.scheduled import Scheduled
-from emulator.model.theory import limit
-from emulator.model.transmission_design import best_policy
-from emulator.streams import Batch, stream_key
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.numeric.masking import Mask
+from evedrop.model.process import Process
+from evedrop.model.receiver import Action
+from evedrop.model.schemes import scheme_of
+from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
+from evedrop.model.schemes.scheduled import Scheduled
+from evedrop.model.theory import closed_forms
+from evedrop.model.theory.covariances import limit
+from evedrop.model.theory.transmission_design import best_policy
+from evedrop.streams import Batch, stream_key
 
 MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 READERS = {"scheduled": "naive", "encrypted-schedule": "selective"}

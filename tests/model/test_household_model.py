@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emulator.model.controllers import CONTROLLERS, Assignment
-from emulator.model.load_guess import House, LoadGuess
-from emulator.model.perfect import PerfectLoop
-from emulator.model.plant import Plant
-from emulator.model.process import Process
+from evedrop.model.controllers import CONTROLLERS, Assignment
+from evedrop.model.load_guess import House, LoadGuess
+from evedrop.model.perfect import PerfectLoop
+from evedrop.model.plant import Plant
+from evedrop.model.process import Process
 
 PERIOD, SLOTS = 5, 60
 A = np.array([[1.0, 0.01], [0.0, 0.99]])

@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.account import COUNTED_BURSTS, Accountant
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.follower import Absence, Follower
-from emulator.model.link import Course, Fates, Link, streams_of
-from emulator.model.links.link import Fate
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Action, Belief, Heard, Receiver, prior
-from emulator.model.schemes.innovation import Innovation
-from emulator.model.transit import Arrival, Late, Transit
-from emulator.streams import Batch, root_of_seed, stream_key
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.links.link import Fate
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Action, Belief, Heard, Receiver, prior
+from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.slot.account import COUNTED_BURSTS, Accountant
+from evedrop.model.slot.intermittent_receiver import Absence, Follower
+from evedrop.model.slot.link import Course, Fates, Link, streams_of
+from evedrop.model.slot.transit import Arrival, Late, Transit
+from evedrop.streams import Batch, root_of_seed, stream_key
 
 PROCESS = Process(np.array([[1.0, 0.1], [0.0, 0.9]]), np.diag([0.1, 0.2]), np.eye(2))
 BATCH = Batch(40, 9)

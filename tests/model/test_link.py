@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.delays import DELAY_MODELS, delay_of
-from emulator.model.link import NEVER, Change, Course, Fates, Link, Outage, streams_of
-from emulator.model.links.link import Fate
-from emulator.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.model.delays import DELAY_MODELS, delay_of
+from evedrop.model.links.link import Fate
+from evedrop.model.slot.link import NEVER, Change, Course, Fates, Link, Outage, streams_of
+from evedrop.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(77)
 PLAIN = {"loss": {"model": "bernoulli", "quality": 0.8}}

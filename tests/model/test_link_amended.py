@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from emulator.model.link import Change, Course, Fates, Link, streams_of
-from emulator.streams import Batch
+from evedrop.model.slot.link import Change, Course, Fates, Link, streams_of
+from evedrop.streams import Batch
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}
 COINS = {"model": "bernoulli", "quality": 0.6}

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.model.delays import delay_of
-from emulator.model.link import NEVER, Change, Course, Outage
-from emulator.model.link_law import law_of
-from emulator.model.links import loss_of
-from emulator.model.links.link import Fate
-from emulator.model.modulated import ModulatedCovariance, limit_of
-from emulator.model.process import Process
-from emulator.model.theory import Outcomes
-from emulator.runs.expectation import Expectation
-from emulator.scenario.timeline import Away
+from evedrop.expected.expectations import Expectation
+from evedrop.model.delays import delay_of
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Fate
+from evedrop.model.modulated import ModulatedCovariance, limit_of
+from evedrop.model.process import Process
+from evedrop.model.slot.link import NEVER, Change, Course, Outage
+from evedrop.model.slot.link_law import law_of
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.scenario.timeline import Away
 
 WALK = Process(np.eye(1), np.array([[0.3]]), np.array([[2.0]]))
 SLOTS = 60

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.link import link_of
-from emulator.model.links import LOSS_MODELS
-from emulator.model.links.link import Fate, losses
-from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.links.link import Fate, losses
+from evedrop.model.slot.link import link_of
+from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(8), "link/eve")
 SPECS: dict[str, dict[str, Any]] = {

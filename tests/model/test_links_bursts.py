@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.link import link_of
-from emulator.model.links import LOSS_MODELS, loss_of
-from emulator.model.links.link import Fate
-from emulator.model.links.markov import stationary
-from emulator.model.process import Floats
-from emulator.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links.link import Fate
+from evedrop.model.links.markov import stationary
+from evedrop.model.process import Floats
+from evedrop.model.slot.link import link_of
+from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(21), "link/eve")
 BURSTS = {"model": "gilbert-elliott", "p": 0.02, "r": 0.25}

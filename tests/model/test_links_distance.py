@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import quad
 
-from emulator.model.links import loss_of
-from emulator.model.links.distance import Distance
-from emulator.model.links.fading import delivery_probability
-from emulator.model.links.link import Fate
-from emulator.model.links.way import Way
-from emulator.streams import Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.links import loss_of
+from evedrop.model.links.distance import Distance
+from evedrop.model.links.fading import delivery_probability
+from evedrop.model.links.link import Fate
+from evedrop.model.links.way import Way
+from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(31), "link/eve")
 STANDS: dict[str, Any] = {

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.links import LOSS_MODELS, loss_of
-from emulator.model.links.counting import count_variance
-from emulator.model.links.link import Fate
-from emulator.model.links.markov import stationary
-from emulator.model.links.trace import MOST_OUTCOMES, Trace
-from emulator.model.process import Floats
-from emulator.streams import Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links.counting import count_variance
+from evedrop.model.links.link import Fate
+from evedrop.model.links.markov import stationary
+from evedrop.model.links.trace import MOST_OUTCOMES, Trace
+from evedrop.model.process import Floats
+from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(5), "link/eve")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from emulator.model.local_filter import LocalFilter, Steps, settled
-from emulator.model.plant import Drive, Plant
-from emulator.model.process import Process, Trajectory, mistakes_of
-from emulator.streams import Batch, root_of_seed, stream_key
+from evedrop.model.local_filter import LocalFilter, Steps, settled
+from evedrop.model.plant import Drive, Plant
+from evedrop.model.process import Process, Trajectory, mistakes_of
+from evedrop.streams import Batch, root_of_seed, stream_key
 
 A = np.array([[1.0, 0.1], [0.0, 0.95]])
 W = np.array([[1e-4, 0.0], [0.0, 4e-4]])

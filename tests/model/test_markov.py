@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.model.markov import in_sync_probability, step_probabilities, word_probability
-from emulator.model.process import Process
-from emulator.model.theory import Outcomes, limit
-from emulator.view import figures_chain as chain
+from evedrop.model.process import Process
+from evedrop.model.theory.covariances import Outcomes, limit
+from evedrop.model.theory.estimator_chain import in_sync_probability, step_probabilities, word_probability
+from evedrop.paper import chain
 
 inner = st.floats(0.05, 0.95)
 

@@ -11,19 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.link_law import LinkLaw
-from emulator.model.links import loss_of
-from emulator.model.links.link import Chain
-from emulator.model.modulated import ModulatedCovariance, limit_trace, tail_outcomes
-from emulator.model.process import Floats, Process
-from emulator.model.theory import (
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Chain
+from evedrop.model.modulated import ModulatedCovariance, limit_trace, tail_outcomes
+from evedrop.model.process import Floats, Process
+from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.theory.covariances import (
     Outcomes,
     expected_traces,
     has_infinite_variance,
     misled_covariances,
     tail_index,
 )
-from emulator.model.theory import limit_trace as independent_limit
+from evedrop.model.theory.covariances import limit_trace as independent_limit
 
 MARGINAL = Process(np.array([[1.0, 0.05], [0.0, 1.0]]), np.diag([1e-3, 1e-4]), np.diag([1.0, 0.01]))
 UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from emulator.model.controllers import CONTROLLERS, Assignment, mpc
-from emulator.model.controllers.mpc import Mpc
-from emulator.model.plant import Plant
-from emulator.model.process import Process
+from evedrop.model.controllers import CONTROLLERS, Assignment, mpc
+from evedrop.model.controllers.mpc import Mpc
+from evedrop.model.plant import Plant
+from evedrop.model.process import Process
 
 pytest.importorskip("osqp", reason="model predictive control needs the extra `microgrid`")
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from emulator.model.controllers import CONTROLLERS, Assignment
-from emulator.model.controllers.lqr import Lqr, gain, held
-from emulator.model.elementary import semidefinite_factor
-from emulator.model.informed import Informed, Offset
-from emulator.model.plant import Drive, Plant
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Action, Heard
-from emulator.model.schemes import scheme_of
-from emulator.streams import Batch, root_of_seed, stream_key
+from evedrop.kernels.elementary import semidefinite_factor
+from evedrop.model.controllers import CONTROLLERS, Assignment
+from evedrop.model.controllers.lqr import Lqr, gain, held
+from evedrop.model.input_aware import Informed, Offset
+from evedrop.model.plant import Drive, Plant
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Action, Heard
+from evedrop.model.schemes import scheme_of
+from evedrop.streams import Batch, root_of_seed, stream_key
 
 B = 1e-3 * np.array([[1.56, 1.56], [-5.66, 0.0]])
 KEY = stream_key(root_of_seed(9), "process")

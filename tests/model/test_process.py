@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.horizon import horizon
-from emulator.model.process import Process, StateFactors, Trajectory, mistakes_of, product
-from emulator.model.theory import state_covariances
-from emulator.streams import Batch, root_of_seed, stream_key
+from evedrop.model.process import Process, StateFactors, Trajectory, mistakes_of, product
+from evedrop.model.theory.covariances import state_covariances
+from evedrop.model.theory.horizon import horizon
+from evedrop.streams import Batch, root_of_seed, stream_key
 
 A = np.array([[1.0, 0.3], [0.5, 1.001]])
 Q = 1e-3 * np.eye(2)

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Action, Belief, Heard
-from emulator.model.schemes import SCHEMES, scheme_of
-from emulator.model.schemes.scheme import Scheme
-from emulator.model.theory import state_covariances
-from emulator.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Action, Belief, Heard
+from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.theory.covariances import state_covariances
+from evedrop.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(4)
 STREAMS = {stream for scheme in SCHEMES.values() for stream in scheme.secret_streams}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from slot_loop import STABLE, UNSTABLE, Played, coins, keys_of, play
 
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Heard
-from emulator.model.schemes import SCHEMES, scheme_of
-from emulator.model.schemes.scheme import Scheme
-from emulator.streams import Batch
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Heard
+from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.streams import Batch
 
 
 def made(name: str, process: Process, **changes: Any) -> Scheme:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.process import Floats, Process
-from emulator.model.theory import (
+from evedrop.model.process import Floats, Process
+from evedrop.model.theory.covariances import (
     NOBODY,
     ExpectedCovariance,
     Outcomes,
@@ -347,7 +347,7 @@ def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
 
 def test_importing_theory_and_design_does_not_import_scipy() -> None:
     """Both are on start-up paths: scipy waits until a function needs it."""
-    code = "import sys, emulator.model.design, emulator.model.theory; sys.exit('scipy' in sys.modules)"
+    code = "import sys, evedrop.model.theory.design, evedrop.model.theory.covariances; sys.exit('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

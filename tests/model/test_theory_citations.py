@@ -1,9 +1,9 @@
 import re
 from pathlib import Path
 
-import emulator
+import evedrop
 
-ROOT = Path(emulator.__file__).parents[1]
+ROOT = Path(evedrop.__file__).parents[1]
 
 
 def test_every_cited_section_exists() -> None:

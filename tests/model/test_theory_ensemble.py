@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Action
-from emulator.model.theory import Outcomes, expected_traces, misled_covariances
-from emulator.model.update import actual_covariance
-from emulator.view import figures_strategies as strategies
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Action
+from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
+from evedrop.model.update import actual_covariance
+from evedrop.paper import strategies
 
 TRIALS = 20_000
 SLOTS = 25

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, coins, keys_of
 
-from emulator.model.closed_forms import twin_track_bound
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
-from emulator.model.eavesdroppers.tracker import Tracker
-from emulator.model.process import Process, Trajectory
-from emulator.model.receiver import Action, Belief, Heard
-from emulator.model.schemes.twin_track import Tracks, TwinTrack
-from emulator.streams import Batch, stream_key
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from evedrop.model.eavesdroppers.tracker import Tracker
+from evedrop.model.process import Process, Trajectory
+from evedrop.model.receiver import Action, Belief, Heard
+from evedrop.model.schemes.twin_track import Tracks, TwinTrack
+from evedrop.model.theory.closed_forms import twin_track_bound
+from evedrop.streams import Batch, stream_key
 
 KEYS = keys_of(("start", "track"))
 CLOSE = Process(UNSTABLE.A, UNSTABLE.Q, UNSTABLE.Q)

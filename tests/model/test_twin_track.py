@@ -7,13 +7,13 @@ import pytest
 from scipy import stats
 from slot_loop import DRIFTING, STABLE, UNSTABLE, coins, keys_of, play
 
-from emulator.model.closed_forms import twin_track_bound
-from emulator.model.eavesdroppers import READERS
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.process import Process
-from emulator.model.schemes.twin_track import Tracks, TwinTrack
-from emulator.model.theory import expected_covariances
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers import READERS
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.process import Process
+from evedrop.model.schemes.twin_track import Tracks, TwinTrack
+from evedrop.model.theory.closed_forms import twin_track_bound
+from evedrop.model.theory.covariances import expected_covariances
+from evedrop.streams import Batch
 
 KEYS = keys_of(("start", "track"))
 

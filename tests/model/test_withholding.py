@@ -6,11 +6,11 @@ import numpy as np
 from scipy import stats
 from slot_loop import DRIFTING, UNSTABLE, coins, play
 
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.schemes.withholding import Withholding
-from emulator.model.theory import expected_covariances, limit, lyapunov
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.schemes.withholding import Withholding
+from evedrop.model.theory.covariances import expected_covariances, limit, lyapunov
+from evedrop.streams import Batch
 
 
 def test_packets_are_sent_with_their_probability() -> None:

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from emulator.brief import Brief, Flow
-from emulator.network.access import Keys
-from emulator.network.envelope import enclosed, payload_of
-from emulator.network.session import client_config
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port, loopback_places
-from emulator.scenario import Scenario
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.ports import free_port, loopback_places
+from evedrop.live.network.access import Keys
+from evedrop.live.network.session import client_config
+from evedrop.live.protocol.brief import Brief, Flow
+from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.scenario import Scenario
 
 LIMIT_SECONDS = 60.0
 """After which what a test waits for counts as never come: far above what a busy machine needs."""
@@ -136,7 +136,7 @@ class Bench:
         with (folder / f"{name}.log").open("wb") as log:
             process = stack.enter_context(
                 subprocess.Popen(
-                    [sys.executable, "-m", "emulator", name, str(self.briefs[name].write(folder))],
+                    [sys.executable, "-m", "evedrop", name, str(self.briefs[name].write(folder))],
                     stdin=subprocess.DEVNULL,
                     stdout=log,
                     stderr=log,

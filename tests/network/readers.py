@@ -8,13 +8,16 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from emulator.model.account import COUNTED_BURSTS, Account
-from emulator.model.digest import Blocks
-from emulator.model.links.link import REASONS
-from emulator.model.receiver import Belief, Heard
-from emulator.model.transit import Late
-from emulator.network import loop_wire, operator, packets, router, telemetry, whereabouts, wire
-from emulator.network.wire import Reader
+from evedrop.live.network import operator, router
+from evedrop.live.protocol import closed_loop as loop_wire
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets, telemetry, whereabouts
+from evedrop.live.protocol.codec import Reader
+from evedrop.model.digest import Blocks
+from evedrop.model.links.link import REASONS
+from evedrop.model.receiver import Belief, Heard
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.transit import Late
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
 SHAPE = (N, TRIALS)

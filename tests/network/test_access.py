@@ -18,9 +18,10 @@ import pytest
 import zenoh
 from bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
 
-from emulator.network import packets, telemetry, wire
-from emulator.network.access import Grant, access_control, grants
-from emulator.network.envelope import enclosed
+from evedrop.live.network.access import Grant, access_control, grants
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.envelope import enclosed
 
 EVE = "eve"
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -336,7 +337,7 @@ def test_a_process_with_a_wrong_brief_says_so(stage: Bench, tmp_path: Path) -> N
     """An eavesdropper's program whose password is not of this run ends with status 2 and one line."""
     path = replace(stage.briefs[EVE], password="of another run").write(tmp_path)  # noqa: S106 - that is the point
     ended = subprocess.run(
-        [sys.executable, "-m", "emulator", "eavesdropper", str(path)],
+        [sys.executable, "-m", "evedrop", "eavesdropper", str(path)],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from emulator.errors import MalformedMessage
-from emulator.network.wire import Reader, read_refusal, refusal
-from emulator.runs.ports import free_port
-from emulator.scenario import load
+from evedrop.errors import MalformedMessage
+from evedrop.live.launch.ports import free_port
+from evedrop.live.protocol.codec import Reader, read_refusal, refusal
+from evedrop.scenario import load
 from tests.by_hand import by_hand
 from tests.conftest import Evedrop, Live
 from tests.rogue import with_rogue
@@ -129,22 +129,22 @@ import threading
 def hang(): threading.Event().wait()
 """
 RECEIVER = """
-from emulator.network.reporting import BeliefReporter
+from evedrop.live.network.reporting import BeliefReporter
 def add(self, k, *rest, honest=BeliefReporter.add): hang() if k == SLOT else honest(self, k, *rest)
 BeliefReporter.add = add
 """
 SENSOR = """
-import peers.sensor as sensor
+import evedrop.peers.sensor as sensor
 def sent(k, z, honest=sensor.uplink, **rest): return hang() if k == SLOT else honest(k, z, **rest)
 sensor.uplink = sent
 """
 ROUTER = """
-import emulator.network.router as router
+import evedrop.live.network.router as router
 def read(message, k, shape, honest=router.read_uplink): return hang() if k == SLOT else honest(message, k, shape)
 router.read_uplink = read
 """
 CONTROLLER = """
-import peers.controller as controller
+import evedrop.peers.controller as controller
 def told(k, u, failed, honest=controller.decided): return hang() if k >= SLOT else honest(k, u, failed)
 controller.decided = told
 """
@@ -243,7 +243,7 @@ def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
 
 
 BOMB = """
-from emulator.network.reporting import BeliefReporter
+from evedrop.live.network.reporting import BeliefReporter
 def add(self, k, *rest, honest=BeliefReporter.add):
     if k % 500 == 0:
         for _ in range(5):

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.model.answers import Answers, NoAnswer
-from emulator.model.eavesdroppers import ANSWERS
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.eavesdroppers.stand_in import StandIns
-from emulator.model.process import Process
-from emulator.runs.results import load_results
-from emulator.streams import Batch
+from evedrop.model.answers import Answers, NoAnswer
+from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.eavesdroppers.stand_in import StandIns
+from evedrop.model.process import Process
+from evedrop.results.writer import load_results
+from evedrop.streams import Batch
 from tests.conftest import Evedrop, Live, wait_until
 
 SEED = 7318529640182736451
@@ -27,11 +27,11 @@ SPY = f'''
 import gc, json, os, sys
 from pathlib import Path
 
-from emulator.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.naive import Naive
 
 SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its constants are no find
-RUNS = tuple(f"emulator.runs.{{name}}" for name in ("briefs", "children", "launcher", "observer", "results", "scorekeeper"))
-OURS = (*RUNS, "emulator.scenario", "emulator.network.router", "peers.sensor", "peers.legitimate")
+RUNS = tuple(f"evedrop.runs.{{name}}" for name in ("briefs", "children", "launcher", "observer", "results", "scorekeeper"))
+OURS = (*RUNS, "evedrop.scenario", "evedrop.live.network.router", "evedrop.peers.sensor", "evedrop.peers.legitimate")
 
 
 def held(value):
@@ -128,7 +128,7 @@ def written(folder: Path) -> None:
 def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) -> None:
     """Of a run's processes only the eavesdropper's imports it, and whoever asks it about itself knows neither seed nor brief."""
     written(evedrop.folder)
-    command = ["-P", "-m", "emulator"]  # as the script `evedrop` does, not looking for modules where it was typed
+    command = ["-P", "-m", "evedrop"]  # as the script `evedrop` does, not looking for modules where it was typed
     typed = ("run", "spy.toml", "--view", "off", "--pace", "0.005", "--out", "run")
     live = Live(evedrop._start(command, typed, {}), evedrop.temporary, evedrop.folder / "run")
     children = wait_until(lambda: len(found := live.children()) == 5 and found, "five processes")
@@ -175,7 +175,7 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
     for body, said in wrong.items():
         ANSWERS.forget()
         text = (
-            "import os\nfrom emulator.model.eavesdroppers.naive import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
+            "import os\nfrom evedrop.model.eavesdroppers.naive import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
         )
         (evedrop.folder / "spy.py").write_text(f"{text}    def use_probabilities(cls, parameters):\n        {body}\n")
         done = evedrop("run", "spy.toml", "--view", "off", "--out", "run")

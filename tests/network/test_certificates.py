@@ -19,16 +19,17 @@ from bench import Bench, Ear, bench_of, connect, scenario_of, until
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from emulator.brief import Brief, Identity, read_brief
-from emulator.control import Control, read_control
-from emulator.errors import BriefError, RunError, UsageError
-from emulator.network import packets, wire
-from emulator.network.certificates import check_identity
-from emulator.network.connecting import Door, connected
-from emulator.network.session import client_config, door_of
-from emulator.runs.authority import Authority
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port, places_at
+from evedrop.errors import BriefError, RunError, UsageError
+from evedrop.live.launch.authority import Authority
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.ports import free_port, places_at
+from evedrop.live.network.certificates import check_identity
+from evedrop.live.network.connecting import Door, connected
+from evedrop.live.network.control_file import Control, read_control
+from evedrop.live.network.session import client_config, door_of
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets
+from evedrop.live.protocol.brief import Brief, Identity, read_brief
 
 EVE, MALLORY = "eve", "mallory"
 NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)

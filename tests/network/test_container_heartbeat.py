@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.network.heartbeat import VARIABLE, Heartbeat
+from evedrop.live.network.container_heartbeat import VARIABLE, Heartbeat
 from tests.conftest import wait_until
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from bench import Bench, bench_of, scenario_of
 
-from emulator import cli
-from emulator.network.health import is_there
+from evedrop.cli import main as cli
+from evedrop.live.network.health import is_there
 
 EVE = "eve"
 

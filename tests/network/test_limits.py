@@ -9,16 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.errors import MalformedMessage
-from emulator.model.account import COUNTED_BURSTS, Account
-from emulator.model.links.link import REASONS
-from emulator.model.receiver import Belief, Heard
-from emulator.model.transit import Late
-from emulator.network import loop_wire, packets, telemetry, wire
-from emulator.network.envelope import head_of
-from emulator.network.limits import Sizes
-from emulator.network.mailbox import Mailbox, allowance
-from emulator.network.whereabouts import Whereabouts
+from evedrop.errors import MalformedMessage
+from evedrop.live.network.mailbox import Mailbox, allowance
+from evedrop.live.protocol import closed_loop as loop_wire
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.envelope import head_of
+from evedrop.live.protocol.message_limits import Sizes
+from evedrop.live.protocol.whereabouts import Whereabouts
+from evedrop.model.links.link import REASONS
+from evedrop.model.receiver import Belief, Heard
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.transit import Late
 
 SIZES = st.builds(
     Sizes,

@@ -18,15 +18,16 @@ import pytest
 import zenoh
 from bench import LIMIT_SECONDS, Ear, connect, until
 
-from emulator import montecarlo
-from emulator.brief import Brief, read_brief
-from emulator.network import packets, wire
-from emulator.network.access import Keys
-from emulator.network.envelope import enclosed
-from emulator.runs.briefs import StreamKeys
-from emulator.runs.results import load_results
-from emulator.scenario import Scenario, load
-from emulator.streams import stream_key
+from evedrop import montecarlo
+from evedrop.live.launch.briefs import StreamKeys
+from evedrop.live.network.access import Keys
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets
+from evedrop.live.protocol.brief import Brief, read_brief
+from evedrop.live.protocol.envelope import enclosed
+from evedrop.results.writer import load_results
+from evedrop.scenario import Scenario, load
+from evedrop.streams import stream_key
 
 SCENARIO = """
 title = "Under attack"
@@ -58,8 +59,8 @@ link = { quality = 0.9 }
 KEEPING_BRIEFS = """
 import sys
 from pathlib import Path
-from emulator.brief import Brief, read_brief
-from emulator.cli import main
+from evedrop.live.protocol.brief import Brief, read_brief
+from evedrop.cli.main import main
 write = Brief.write
 Brief.write = lambda brief, folder: write(brief, Path(sys.argv[1])) and write(brief, folder)
 raise SystemExit(main(sys.argv[2:]))
@@ -145,7 +146,7 @@ def processes_of(pid: int) -> dict[str, int]:
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         arguments = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
         *options, path, _ = arguments if len(arguments) > 1 else (b"", b"")
-        if b"emulator" in options and path.endswith(b".json"):
+        if b"evedrop" in options and path.endswith(b".json"):
             found[Path(path.decode()).stem] = int(child)
     return found
 

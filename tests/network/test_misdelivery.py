@@ -14,18 +14,18 @@ import pytest
 import zenoh
 from bench import LIMIT_SECONDS, scenario_of, until
 
-from emulator.brief import Brief
-from emulator.control import Control
-from emulator.errors import MalformedMessage
-from emulator.network.access import Keys
-from emulator.network.declared import InboxClosedError, Question
-from emulator.network.doorkeeping import users_file
-from emulator.network.envelope import enclosed, head_of, named_in
-from emulator.network.operator import Answer, Request, ask
-from emulator.network.session import Session
-from emulator.network.wire import Reader, control, progress
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port
+from evedrop.errors import MalformedMessage
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.ports import free_port
+from evedrop.live.network.access import Keys
+from evedrop.live.network.control_file import Control
+from evedrop.live.network.declared import InboxClosedError, Question
+from evedrop.live.network.operator import Answer, Request, ask
+from evedrop.live.network.router_users import users_file
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.codec import Reader, control, progress
+from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from tests.proxy import Cable, cable
 
 GOOD = progress(7)

@@ -14,13 +14,13 @@ import pytest
 import zenoh
 from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
-from emulator.brief import Brief
-from emulator.control import Control
-from emulator.errors import MalformedMessage
-from emulator.network.access import Keys
-from emulator.network.envelope import enclosed, payload_of
-from emulator.network.operator import Answer, Request, ask, read_request
-from emulator.network.wire import pack
+from evedrop.errors import MalformedMessage
+from evedrop.live.network.access import Keys
+from evedrop.live.network.control_file import Control
+from evedrop.live.network.operator import Answer, Request, ask, read_request
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.codec import pack
+from evedrop.live.protocol.envelope import enclosed, payload_of
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
 PATIENCE = 5.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from queue import SimpleQueue
 
-from emulator.network.postman import Postman
+from evedrop.live.network.delayed_sender import Postman
 
 
 def test_messages_go_out_when_they_are_due_and_in_order() -> None:

@@ -11,17 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.brief import read_brief
-from emulator.errors import MalformedMessage
-from emulator.model.account import COUNTED_BURSTS, Account
-from emulator.model.digest import BeliefLog, Blocks, RunDigest
-from emulator.model.elementary import normal_quantile
-from emulator.model.receiver import Belief, Heard
-from emulator.model.transit import Late
-from emulator.network import envelope, loop_wire, operator, packets, telemetry, wire
-from emulator.network.access import Keys, Wiring, grants
-from emulator.network.whereabouts import Whereabouts, read_whereabouts
-from emulator.streams import Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.errors import MalformedMessage
+from evedrop.kernels.elementary import normal_quantile
+from evedrop.live.network import operator
+from evedrop.live.network.access import Keys, Wiring, grants
+from evedrop.live.protocol import closed_loop as loop_wire
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import envelope, packets, telemetry
+from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
+from evedrop.model.digest import BeliefLog, Blocks, RunDigest
+from evedrop.model.receiver import Belief, Heard
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.transit import Late
+from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
 TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.network.resending import Kept
+from evedrop.live.network.resending import Kept
 
 
 def slot_message(k: int) -> bytes:

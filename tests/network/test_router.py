@@ -13,7 +13,8 @@ import pytest
 from bench import LIMIT_SECONDS, Bench
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
-from emulator.network import packets, telemetry, wire
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets, telemetry
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:

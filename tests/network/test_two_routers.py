@@ -13,15 +13,16 @@ import pytest
 import zenoh
 from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
-from emulator.brief import Brief
-from emulator.errors import UsageError
-from emulator.network import packets, wire
-from emulator.network.access import RELAY, Grant, Keys, access_control, grants
-from emulator.network.envelope import enclosed
-from emulator.network.health import is_there
-from emulator.network.linked import at_relay, at_router
-from emulator.network.session import client_config
-from emulator.runs.ports import loopback_places, places_at
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import loopback_places, places_at
+from evedrop.live.network.access import RELAY, Grant, Keys, access_control, grants
+from evedrop.live.network.health import is_there
+from evedrop.live.network.linked_routers import at_relay, at_router
+from evedrop.live.network.session import client_config
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.envelope import enclosed
 
 EVE = "eve"
 RECEIVERS = ("legitimate", "eve", "mallory", "nadia")

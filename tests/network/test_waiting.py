@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from bench import scenario_of
 
-from emulator.errors import RunError
-from emulator.network import connecting
-from emulator.network.session import Session
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.ports import free_port
+from evedrop.errors import RunError
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.ports import free_port
+from evedrop.live.network import connecting
+from evedrop.live.network.session import Session
 
 
 def test_a_process_says_that_it_waits_for_its_router(

@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 from independent_legitimate import Estimator
 
-from emulator import montecarlo
-from emulator.model.digest import BeliefLog, Blocks, RunDigest
-from emulator.model.process import Trajectory
-from emulator.model.receiver import Heard
-from emulator.model.schemes import SCHEMES
-from emulator.network import packets, telemetry, wire
-from emulator.runs.briefs import Observation, StreamKeys, briefs_of
-from emulator.runs.ports import free_port
-from emulator.runs.results import load_results
-from emulator.scenario import Scenario, load
-from emulator.streams import Batch
+from evedrop import montecarlo
+from evedrop.live.launch.briefs import Observation, StreamKeys, briefs_of
+from evedrop.live.launch.ports import free_port
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets, telemetry
+from evedrop.model.digest import BeliefLog, Blocks, RunDigest
+from evedrop.model.process import Trajectory
+from evedrop.model.receiver import Heard
+from evedrop.model.schemes import SCHEMES
+from evedrop.results.writer import load_results
+from evedrop.scenario import Scenario, load
+from evedrop.streams import Batch
 from tests.conftest import LIMIT
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
@@ -107,7 +108,7 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
     with ExitStack() as stack:
         running = {}
         for name, brief in briefs.items():
-            program = [str(PEER)] if name == "legitimate" else ["-m", "emulator", brief.role]
+            program = [str(PEER)] if name == "legitimate" else ["-m", "evedrop", brief.role]
             running[name] = stack.enter_context(
                 subprocess.Popen(
                     [sys.executable, *program, str(brief.write(tmp_path))],
@@ -134,4 +135,4 @@ def test_it_is_independent() -> None:
     ]
     code = f"import sys; sys.path.insert(0, {str(PEER.parent)!r}); import independent_legitimate; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert not {"emulator", "peers", "numpy"} & set(modules)
+    assert not {"evedrop", "numpy"} & set(modules)

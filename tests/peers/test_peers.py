@@ -13,22 +13,23 @@ import msgpack
 import numpy as np
 import pytest
 
-import emulator.network.mailbox
-import peers.following
-import peers.sensor
-from emulator.brief import Brief, Flow
-from emulator.errors import Gap, MalformedMessage
-from emulator.model.digest import Blocks
-from emulator.network import packets, telemetry, wire
-from emulator.network.access import Keys
-from emulator.network.reporting import is_due
-from emulator.network.resending import Kept
-from emulator.network.whereabouts import Place
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.scenario import Scenario
-from peers.eavesdropper import eavesdrop
-from peers.legitimate import estimate
-from peers.sensor import Window, sense
+import evedrop.live.network.mailbox
+import evedrop.peers.following
+import evedrop.peers.sensor
+from evedrop.errors import Gap, MalformedMessage
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.network.access import Keys
+from evedrop.live.network.reporting import is_due
+from evedrop.live.network.resending import Kept
+from evedrop.live.protocol import codec as wire
+from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.brief import Brief, Flow
+from evedrop.live.protocol.whereabouts import Place
+from evedrop.model.digest import Blocks
+from evedrop.peers.eavesdropper import eavesdrop
+from evedrop.peers.legitimate import estimate
+from evedrop.peers.sensor import Window, sense
+from evedrop.scenario import Scenario
 from tests.conftest import LIMIT
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
@@ -163,8 +164,8 @@ class FakeSession:
 def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     """A stage in the place of the network."""
     one = Stage()
-    monkeypatch.setattr(peers.following, "Session", one.session)
-    monkeypatch.setattr(peers.sensor, "Session", one.session)
+    monkeypatch.setattr(evedrop.peers.following, "Session", one.session)
+    monkeypatch.setattr(evedrop.peers.sensor, "Session", one.session)
     yield one
     one.commands.put(wire.control("end"))
 
@@ -422,7 +423,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
     slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
-    monkeypatch.setattr(emulator.network.mailbox, "SimpleQueue", News)
+    monkeypatch.setattr(evedrop.live.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
     window = Window(session, followers, 10, Kept(print))  # type: ignore[arg-type]

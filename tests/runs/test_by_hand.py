@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from emulator.errors import UsageError
-from emulator.runs.ports import Meeting, free_port, meeting_at
-from emulator.runs.results import load_results
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import Meeting, free_port, meeting_at
+from evedrop.results.writer import load_results
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 
 ROLES = ("router", "relay", "sensor", "legitimate", "observer")

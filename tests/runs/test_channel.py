@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.model.account import Accountant
-from emulator.model.link import Link
-from emulator.runs.briefs import StreamKeys
-from emulator.runs.channel import CONFIDENCE, channel_of, interval
-from emulator.runs.score import Tally
-from emulator.scenario import Scenario
-from emulator.streams import Batch
+from evedrop.live.launch.briefs import StreamKeys
+from evedrop.model.slot.account import Accountant
+from evedrop.model.slot.link import Link
+from evedrop.scenario import Scenario
+from evedrop.score.channel import CONFIDENCE, channel_of, interval
+from evedrop.score.sums import Tally
+from evedrop.streams import Batch
 
 LINKS: dict[str, dict[str, Any]] = {
     "coins": {"quality": 0.9},

@@ -12,11 +12,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.api import load_results, montecarlo
-from emulator.errors import UsageError
-from emulator.runs import workers
-from emulator.runs.montecarlo import Plan
-from emulator.runs.ports import free_port
+from evedrop.api import load_results, montecarlo
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import free_port
+from evedrop.memory import workers
+from evedrop.memory.montecarlo import Plan
 from tests.conftest import Evedrop, wait_until
 
 pytest.importorskip("distributed")

@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from emulator import compare, montecarlo
-from emulator.errors import ScenarioError, UsageError
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.schemes import SCHEMES
-from emulator.runs.compare import Comparison, Kept
-from emulator.runs.matchups import ATTACKERS, adversaries_of, matchups_of
-from emulator.runs.montecarlo import Plan
-from emulator.scenario import load
+from evedrop import compare, montecarlo
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.memory.montecarlo import Plan
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.schemes import SCHEMES
+from evedrop.scenario import load
+from evedrop.studies.compare import Comparison, Kept
+from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
 from tests.conftest import Evedrop
 
 MARGINAL = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}

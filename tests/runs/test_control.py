@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from emulator import load_results
-from emulator.cli import main
-from emulator.control import Control, read_control
-from emulator.errors import UsageError
+from evedrop import load_results
+from evedrop.cli.main import main
+from evedrop.errors import UsageError
+from evedrop.live.network.control_file import Control, read_control
 from tests.conftest import Done, Evedrop, Live, wait_until
 
 SCENARIO = """
@@ -232,7 +232,7 @@ def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedro
     run = steered(slots=100_000)
     run("pause")
     waiting = Live(
-        evedrop._start(["-m", "emulator"], ("step", str(run.live.folder), "90000"), {}),
+        evedrop._start(["-m", "evedrop"], ("step", str(run.live.folder), "90000"), {}),
         evedrop.temporary,
         evedrop.folder,
     )

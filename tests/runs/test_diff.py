@@ -12,10 +12,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.api import load_results, montecarlo
-from emulator.errors import UsageError
-from emulator.runs.diff import difference
-from emulator.runs.results import Results
+from evedrop.api import load_results, montecarlo
+from evedrop.errors import UsageError
+from evedrop.results.diff import difference
+from evedrop.results.writer import Results
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.errors import UsageError
-from emulator.runs.growing import UNFINISHED, goes_on, last_round
-from emulator.runs.results import Results, ResultsWriter, load_results
-from emulator.runs.score import SlotSums
-from emulator.view.replay import replay
+from evedrop.errors import UsageError
+from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
+from evedrop.results.writer import Results, ResultsWriter, load_results
+from evedrop.score.sums import SlotSums
+from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 
 ENDLESS = ("--slots", "1000000")
@@ -155,7 +155,7 @@ import subprocess, sys
 disk, size, *command = sys.argv[1:]
 if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], stderr=subprocess.DEVNULL).returncode:
     sys.exit(77)
-status = subprocess.run([sys.executable, "-m", "emulator", *command]).returncode
+status = subprocess.run([sys.executable, "-m", "evedrop", *command]).returncode
 subprocess.run(["cp", "-r", f"{disk}/run", f"{disk}-copy"], check=True)
 sys.exit(status)
 """

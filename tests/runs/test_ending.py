@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from emulator.network.access import Keys
-from emulator.network.wire import Reader, over
-from emulator.runs import conductor
-from emulator.runs.conductor import Conductor, Stop
+from evedrop.live.network.access import Keys
+from evedrop.live.observer import conductor
+from evedrop.live.observer.conductor import Conductor, Stop
+from evedrop.live.protocol.codec import Reader, over
 
 RUN = "r"
 NAMES = ("router", "relay", "sensor", "legitimate", "smart")

@@ -15,15 +15,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.api import montecarlo, run
-from emulator.model.receiver import Action
-from emulator.runs.judge import Evidence, told
-from emulator.runs.montecarlo import Plan
-from emulator.runs.results import Results, load_results
-from emulator.runs.score import Tally
-from emulator.runs.verdict import Secrecy, Verdict
-from emulator.runs.watched import IN_STEP, Watch, Watched
-from emulator.scenario import load
+from evedrop.api import montecarlo, run
+from evedrop.memory.montecarlo import Plan
+from evedrop.model.receiver import Action
+from evedrop.results.writer import Results, load_results
+from evedrop.scenario import load
+from evedrop.score.expectations_held import Evidence, told
+from evedrop.score.sums import Tally
+from evedrop.score.verdict import Secrecy, Verdict
+from evedrop.score.watched import IN_STEP, Watch, Watched
 from tests.conftest import Evedrop
 
 SLOTS, TRIALS, FIRST = 90, 12, 30

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.runs.growing import last_round
+from evedrop.results.growing_tables import last_round
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 from tests.rogue import with_rogue
 
@@ -109,7 +109,7 @@ def test_a_process_that_fails_is_named(evedrop: Evedrop, does: str, said: str) -
 def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
     """Packets that the journal calls delivered and nobody received end the run; slot and both who disagree are named."""
     lie = (
-        "import emulator.network.router as router\nhonest = router.delivery\n"
+        "import evedrop.live.network.router as router\nhonest = router.delivery\n"
         "router.delivery = lambda k, mask, z, *rest: honest(k, bytes(len(mask)), b'') if k == 7 else honest(k, mask, z, *rest)"
     )
     live = evedrop.live("eavesdroppers", "--slots", "40", env=with_rogue(evedrop, "router", lie))
@@ -191,7 +191,7 @@ def test_keys_of_a_killed_launcher_do_not_stay(evedrop: Evedrop, when: str) -> N
 def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: Path) -> None:
     """With the launcher if it is killed alone, by the next run if its guard is killed too; those in use are kept."""
     code = (
-        "import sys\nfrom emulator.runs.private import private_folder\n"
+        "import sys\nfrom evedrop.live.launch.private_folder import private_folder\n"
         "with private_folder() as folder:\n    print(folder, flush=True)\n    sys.stdin.read()\n"
     )
     environment = {**os.environ, "TMPDIR": str(tmp_path)}

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.links.link import REASONS
-from emulator.runs.gathered_tables import Gathered, Journals, Recorded, Statistics
-from emulator.runs.joined import ReceiverSlots, Slots
-from emulator.runs.results import ResultsWriter
-from emulator.runs.score import slot_sums, squared_errors
+from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
+from evedrop.model.links.link import REASONS
+from evedrop.results.writer import ResultsWriter
+from evedrop.score.joined import ReceiverSlots, Slots
+from evedrop.score.sums import slot_sums, squared_errors
 
 NAMES = ("legitimate", "smart", "naive")
 N, SLOTS, TRIALS, RECORDED = 2, 40, 11, 5

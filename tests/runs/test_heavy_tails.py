@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.api import montecarlo
-from emulator.model.process import Floats
-from emulator.runs.montecarlo import Plan
-from emulator.runs.simulation import Mode
-from emulator.runs.verdict import Bounds, mean_bounds, median_bounds
+from evedrop.api import montecarlo
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.model.process import Floats
+from evedrop.score.verdict import Bounds, mean_bounds, median_bounds
 from tests.conftest import Evedrop
 
 TRIES = 4000

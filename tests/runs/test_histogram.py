@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.model.process import Floats
-from emulator.runs.histogram import LEVELS, SlotHistograms
+from evedrop.model.process import Floats
+from evedrop.score.histogram import LEVELS, SlotHistograms
 
 SCALE = 2e-3
 QUARTER_OCTAVE = 1.25

@@ -11,14 +11,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from emulator import cli
-from emulator.api import montecarlo
-from emulator.errors import ScenarioError
-from emulator.model import privacy
-from emulator.model.controllers import mpc
-from emulator.model.energy import Meter, energy
-from emulator.runs.montecarlo import Plan
-from emulator.scenario import checked, load
+from evedrop.api import montecarlo
+from evedrop.cli import main as cli
+from evedrop.errors import ScenarioError
+from evedrop.memory.montecarlo import Plan
+from evedrop.model import privacy
+from evedrop.model.controllers import mpc
+from evedrop.model.energy import Meter, energy
+from evedrop.scenario import checked, load
 from tests.conftest import Evedrop
 from tests.test_plant_tables import LOOP
 

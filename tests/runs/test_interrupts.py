@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from emulator.runs.growing import UNFINISHED, last_round
-from emulator.runs.ports import free_port
-from emulator.runs.results import load_results
-from emulator.scenario import load
+from evedrop.live.launch.ports import free_port
+from evedrop.results.growing_tables import UNFINISHED, last_round
+from evedrop.results.writer import load_results
+from evedrop.scenario import load
 from tests.by_hand import by_hand
 from tests.conftest import Done, Evedrop, Live, wait_until
 
@@ -174,7 +174,7 @@ def test_a_hang_up_of_everybody_is_one_of_the_run(evedrop: Evedrop, first: str) 
 IN_TERMINAL = """
 import fcntl, os, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-os.execv(sys.executable, [sys.executable, "-m", "emulator", *sys.argv[1:]])
+os.execv(sys.executable, [sys.executable, "-m", "evedrop", *sys.argv[1:]])
 """
 """The command, as what a terminal was opened for."""
 

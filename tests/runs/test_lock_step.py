@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from emulator.network.router import Burst
-from emulator.runs.environment import lock_step_environment
+from evedrop.environment import lock_step_environment
+from evedrop.live.network.router import Burst
 
 
 def test_a_burst_passes_on_everything_in_order() -> None:

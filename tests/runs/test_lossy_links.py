@@ -10,12 +10,12 @@ import pyarrow.compute as pc
 import pytest
 import tomli_w
 
-from emulator.api import design, montecarlo, run
-from emulator.errors import UsageError
-from emulator.model.links import LOSS_MODELS
-from emulator.runs.estimates import warnings_of
-from emulator.runs.results import Results
-from emulator.scenario import Scenario, load
+from evedrop.api import design, montecarlo, run
+from evedrop.errors import UsageError
+from evedrop.expected.estimates import warnings_of
+from evedrop.model.links import LOSS_MODELS
+from evedrop.results.writer import Results
+from evedrop.scenario import Scenario, load
 from tests.conftest import Evedrop
 
 LOSSES: dict[str, dict[str, Any]] = {
@@ -162,7 +162,7 @@ def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
     """A replayed recording of a run in which one receiver's expected trace is nowhere."""
     from rerun.chunk import RrdReader
 
-    from emulator.view.replay import replay
+    from evedrop.view.replay import replay
 
     shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
     assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from emulator.api import montecarlo
-from emulator.runs.montecarlo import Plan
-from emulator.runs.results import Results
-from emulator.runs.simulation import Mode
-from emulator.scenario import checked, load
+from evedrop.api import montecarlo
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.results.writer import Results
+from evedrop.scenario import checked, load
 
 PAPER = 0.0158
 """The change of grid power flow that the paper keeps below, at μ_d = 0.1."""

@@ -13,15 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator import streams
-from emulator.api import montecarlo
-from emulator.errors import ScenarioError, UsageError
-from emulator.model.theory import Outcomes, expected_traces
-from emulator.runs.briefs import StreamKeys
-from emulator.runs.montecarlo import Plan
-from emulator.runs.results import Results
-from emulator.runs.simulation import Mode, Simulation
-from emulator.scenario import Scenario, checked, load
+from evedrop import streams
+from evedrop.api import montecarlo
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.live.launch.briefs import StreamKeys
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode, Simulation
+from evedrop.model.theory.covariances import Outcomes, expected_traces
+from evedrop.results.writer import Results
+from evedrop.scenario import Scenario, checked, load
 
 SURE = 4.5
 COVARIANCES, ERRORS = Plan(Mode.COVARIANCE_ONLY, workers=1), Plan(Mode.ERROR_COORDINATES, workers=1)

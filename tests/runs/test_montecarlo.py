@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from emulator.api import load_results, montecarlo
-from emulator.errors import UsageError
-from emulator.runs.montecarlo import Plan
-from emulator.runs.results import Results
+from evedrop.api import load_results, montecarlo
+from evedrop.errors import UsageError
+from evedrop.memory.montecarlo import Plan
+from evedrop.results.writer import Results
 from tests.conftest import Evedrop
 
 CASES: dict[str, dict[str, Any]] = {
@@ -129,7 +129,7 @@ def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -
 
 def test_a_scenario_of_ones_own_runs_with_changes(tmp_path: Path) -> None:
     """From Python, a checked scenario with dotted changes is what the command runs with --set."""
-    from emulator.scenario import load
+    from evedrop.scenario import load
 
     ours = montecarlo(load("eavesdroppers"), trials=3, slots=20, legitimate__link__quality=0.5, out=tmp_path / "a")
     named = montecarlo("eavesdroppers", trials=3, slots=20, legitimate__link__quality=0.5, out=tmp_path / "b")

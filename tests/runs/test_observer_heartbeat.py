@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from emulator.runs.growing import UNFINISHED, last_round
+from evedrop.results.growing_tables import UNFINISHED, last_round
 from tests.conftest import Evedrop, Live, wait_until
 
 SLOW = """
 import sys
 import time
 if sys.orig_argv[-1].endswith('/observer.json'):
-    import emulator.runs.heartbeat as heartbeat
-    import emulator.runs.results as results
+    import evedrop.live.observer.news as heartbeat
+    import evedrop.results.writer as results
     honest = results.finish
     def finish(folder):
         time.sleep({finish})
@@ -26,8 +26,8 @@ if sys.orig_argv[-1].endswith('/observer.json'):
     results.finish = finish
     heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
 elif not sys.orig_argv[-1].endswith('.json'):
-    import emulator.runs.children as children
-    import emulator.runs.launcher as launcher
+    import evedrop.live.launch.children as children
+    import evedrop.live.launch.launcher as launcher
     honest = children.Children.news
     def news(self, seconds):
         if self.started:
@@ -87,7 +87,7 @@ def test_a_run_on_a_starved_machine_comes_to_its_end(evedrop: Evedrop) -> None:
     """One processor for all its processes, at the lowest priority, beside six that never rest."""
     loops = [subprocess.Popen(["taskset", "-c", "0", sys.executable, "-c", BUSY]) for _ in range(6)]
     try:
-        command = ["taskset", "-c", "0", "nice", "-n", "10", sys.executable, "-m", "emulator"]
+        command = ["taskset", "-c", "0", "nice", "-n", "10", sys.executable, "-m", "evedrop"]
         words = ["run", "eavesdroppers", "--slots", "3000", "--view", "off", "--out", "run"]
         done = subprocess.run(
             [*command, *words], cwd=evedrop.folder, env=evedrop.environment, capture_output=True, text=True, check=False

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from emulator.errors import UsageError
-from emulator.runs.folder import new_folder, private_file
-from emulator.runs.scorekeeper import resolved
-from emulator.scenario import load
-from emulator.view.replay import replay
+from evedrop.errors import UsageError
+from evedrop.results.folder import new_folder, private_file
+from evedrop.scenario import load
+from evedrop.score.scorekeeper import resolved
+from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 
 OPEN = {"umask": 0o000}

@@ -10,12 +10,12 @@ import pyarrow.parquet as pq
 import pytest
 from pydantic import BaseModel
 
-from emulator import scenario
-from emulator.api import montecarlo
-from emulator.runs import growing
-from emulator.runs.growing import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish
-from emulator.runs.results import ACTIONS, DIGESTS, JOURNAL, Results, load_results
-from emulator.scenario import parse
+from evedrop import scenario
+from evedrop.api import montecarlo
+from evedrop.results import growing_tables as growing
+from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish
+from evedrop.results.writer import ACTIONS, DIGESTS, JOURNAL, Results, load_results
+from evedrop.scenario import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLES = [

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator import montecarlo, run
-from emulator.errors import ScenarioError, UsageError
-from emulator.model.detection import Chart
-from emulator.runs.acknowledging import Detection, chart_of
-from emulator.runs.briefs import Observation, briefs_of
-from emulator.runs.expectation import expectations_of
-from emulator.runs.montecarlo import check_mode
-from emulator.runs.results import Results
-from emulator.runs.simulation import Mode, Simulation
-from emulator.scenario import Scenario, checked
+from evedrop import montecarlo, run
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.expected.expectations import expectations_of
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.memory.montecarlo import check_mode
+from evedrop.memory.simulation import Mode, Simulation
+from evedrop.model.numeric.detection import Chart
+from evedrop.results.writer import Results
+from evedrop.scenario import Scenario, checked
+from evedrop.score.acknowledging import Detection, chart_of
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]

@@ -12,9 +12,9 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from emulator import montecarlo, run
-from emulator.runs.results import Results
-from emulator.scenario import load
+from evedrop import montecarlo, run
+from evedrop.results.writer import Results
+from evedrop.scenario import load
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import Evedrop
 from tests.runs.test_microgrid import part_of_day

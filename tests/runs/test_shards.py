@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator import load_results, montecarlo, run
-from emulator.errors import RunError, UsageError
-from emulator.runs.growing import last_round
-from emulator.runs.results import Results
-from emulator.runs.shards import OneProgress, shards_of
-from emulator.scenario import load
+from evedrop import load_results, montecarlo, run
+from evedrop.errors import RunError, UsageError
+from evedrop.live.launch.shards import OneProgress, shards_of
+from evedrop.results.growing_tables import last_round
+from evedrop.results.writer import Results
+from evedrop.scenario import load
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 
 TRIALS = 7
@@ -330,7 +330,7 @@ def test_a_secret_that_is_gone_leaves_no_folder(tmp_path: Path) -> None:
     secret.write_bytes(bytes(32))
     scenario = load("eavesdroppers", {"trials": 2, "shards": 2, "slots": 10, "secret_file": str(secret)})
     secret.unlink()
-    from emulator.runs.launcher import launch
+    from evedrop.live.launch.launcher import launch
 
     with pytest.raises(UsageError, match="--secret"):
         launch(scenario, tmp_path / "run", "off", None, lambda _: None)
@@ -343,7 +343,7 @@ def test_shards_that_cannot_be_made_one_are_kept(tmp_path: Path, monkeypatch: py
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("emulator.runs.gathering.summary_of", full)
+    monkeypatch.setattr("evedrop.live.launch.gathering.summary_of", full)
     with pytest.raises(RunError, match="No space left"):
         run("eavesdroppers", out=tmp_path / "run", trials=2, shards=2, slots=20, expect=[])
     for number in (1, 2):

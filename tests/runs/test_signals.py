@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from emulator.errors import Interrupted
-from emulator.runs.conductor import Stop
-from emulator.runs.signals import stop_on_signals
+from evedrop.errors import Interrupted
+from evedrop.live.observer.conductor import Stop
+from evedrop.signals import stop_on_signals
 
 
 def test_what_is_ignored_from_birth_stays_ignored() -> None:
@@ -19,7 +19,7 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
             assert stop.is_set()
     code = (
         "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "from emulator.runs.signals import stop_on_signals\n"
+        "from evedrop.signals import stop_on_signals\n"
         "with stop_on_signals() as stop:\n"
         "    signal.raise_signal(signal.SIGHUP)\n    print(stop.is_set())\n"
         "    signal.raise_signal(signal.SIGTERM)\n    print(stop.is_set())\n"
@@ -32,7 +32,7 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
 def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:
     """The other end of standard input is looked at, open with something to read in it, then closed."""
     code = (
-        "from emulator.launched import launcher_is_gone\n"
+        "from evedrop.live.network.launcher_watch import launcher_is_gone\n"
         "print(launcher_is_gone(), flush=True)\ninput()\nprint(launcher_is_gone(), flush=True)\n"
         "while not launcher_is_gone():\n    pass\nprint('gone')\n"
     )

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import pytest
 
-from emulator.errors import Silence
-from emulator.network.access import Keys
-from emulator.network.whereabouts import Whereabouts
-from emulator.runs import stall
-from emulator.runs.stall import Stall, patience_of, silent_of
+from evedrop.errors import Silence
+from evedrop.live.network.access import Keys
+from evedrop.live.observer import stall
+from evedrop.live.observer.stall import Stall, patience_of, silent_of
+from evedrop.live.protocol.whereabouts import Whereabouts
 
 KEYS = Keys("r")
 WINDOW = 100

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from emulator.network.operator import Answer, Request, read_answer
-from emulator.runs.orders import Order
-from emulator.runs.steering import Steering
-from emulator.scenario import Scenario, checked
+from evedrop.live.network.operator import Answer, Request, read_answer
+from evedrop.live.observer.operator_orders import Order
+from evedrop.live.observer.steering import Steering
+from evedrop.scenario import Scenario, checked
 
 SLOTS = 100
 TABLES: dict[str, Any] = {

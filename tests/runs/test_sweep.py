@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.api import montecarlo
-from emulator.errors import UsageError
-from emulator.runs.montecarlo import Plan
-from emulator.runs.simulation import Mode
-from emulator.runs.sweep import grid_of, sweep_over
-from emulator.scenario import FIGURES
+from evedrop.api import montecarlo
+from evedrop.errors import UsageError
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.scenario import FIGURES
+from evedrop.studies.sweep import grid_of, sweep_over
 from tests.conftest import Evedrop
 
 decimals = st.decimals(-1000, 1000, places=3, allow_nan=False, allow_infinity=False)

@@ -13,13 +13,13 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from emulator import cli
-from emulator.errors import RunError
-from emulator.runs import testing
-from emulator.runs.junit import junit_of
-from emulator.runs.results import load_results
-from emulator.runs.testing import Finding, Manner, Outcome
-from emulator.scenario import shipped
+from evedrop.cli import main as cli
+from evedrop.errors import RunError
+from evedrop.results.writer import load_results
+from evedrop.scenario import shipped
+from evedrop.studies import scenario_tests as testing
+from evedrop.studies.junit import junit_of
+from evedrop.studies.scenario_tests import Finding, Manner, Outcome
 from tests.conftest import Done, Evedrop, Live, wait_until
 
 SCENARIO = (
@@ -42,7 +42,7 @@ def written(folder: Path, **texts: str) -> None:
 
 def pytest_in(evedrop: Evedrop, *arguments: str) -> Done:
     """Run pytest with the plugin, found as it is in an environment with it, and with warnings as errors."""
-    command = [sys.executable, "-m", "pytest", "-p", "emulator.pytest_plugin", "-W", "error", "--color=no", *arguments]
+    command = [sys.executable, "-m", "pytest", "-p", "evedrop.pytest_plugin", "-W", "error", "--color=no", *arguments]
     environment = {**evedrop.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(command, cwd=evedrop.folder, env=environment, capture_output=True, text=True, check=False)
     return Done(done.returncode, done.stdout, done.stderr)
@@ -172,7 +172,7 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
     """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
     written(evedrop.folder / "cases", a=HOLDS, b=HOLDS.replace("slots = 60", "slots = 200000"))
     process = subprocess.Popen(
-        [sys.executable, "-m", "emulator", "test", "cases", "--jobs", jobs, "--junit", "report.xml"],
+        [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", jobs, "--junit", "report.xml"],
         cwd=evedrop.folder,
         env=evedrop.environment,
         stdout=subprocess.PIPE,
@@ -197,7 +197,7 @@ def test_tests_end_with_whoever_started_them(evedrop: Evedrop) -> None:
     """Kill -9 of `evedrop test` while two run: their processes end too."""
     written(evedrop.folder / "cases", a=HOLDS.replace("slots = 60", "slots = 200000"), b=HOLDS)
     process = subprocess.Popen(
-        [sys.executable, "-m", "emulator", "test", "cases", "--jobs", "2"],
+        [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", "2"],
         cwd=evedrop.folder,
         env=evedrop.environment,
         stdout=subprocess.DEVNULL,

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.model.link import Course
-from emulator.model.link_law import law_of
-from emulator.model.process import Floats, Process
-from emulator.model.theory import Outcomes
-from emulator.runs.expectation import Expectation
-from emulator.runs.score import WINDOWS, Tally, window_means, window_of
-from emulator.runs.verdict import Secrecy, Verdict, secrecy
+from evedrop.expected.expectations import Expectation
+from evedrop.model.process import Floats, Process
+from evedrop.model.slot.link import Course
+from evedrop.model.slot.link_law import law_of
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
+from evedrop.score.verdict import Secrecy, Verdict, secrecy
 
 STABLE = Process(np.diag([1.0, 0.9]), np.eye(2) * 1e-3, np.eye(2))
 SLOTS, TRIALS = 81, 60

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.errors import Contradiction, MalformedMessage
-from emulator.model.account import COUNTED_BURSTS, Account
-from emulator.model.digest import BeliefLog, Blocks
-from emulator.model.links.link import REASONS
-from emulator.model.receiver import Belief
-from emulator.network.telemetry import Extent, Journal, Report, read_journal, read_report
-from emulator.network.wire import Reader
-from emulator.runs.joined import ReceiverSlots, Slots
-from emulator.runs.verification import Verifier
+from evedrop.errors import Contradiction, MalformedMessage
+from evedrop.live.observer.verification import Verifier
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.telemetry import Extent, Journal, Report, read_journal, read_report
+from evedrop.model.digest import BeliefLog, Blocks
+from evedrop.model.links.link import REASONS
+from evedrop.model.receiver import Belief
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.score.joined import ReceiverSlots, Slots
 
 TRIALS, N, SLOTS, RECORDED = 4, 2, 600, 2
 CUTS = (300, 310)

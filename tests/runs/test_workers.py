@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.errors import RunError
-from emulator.runs.results import load_results
-from emulator.runs.simulation import Mode
-from emulator.runs.trials import BLOCK_TRIALS, tasks_of
-from emulator.runs.workers import in_processes
-from emulator.scenario import load
+from evedrop.errors import RunError
+from evedrop.memory.simulation import Mode
+from evedrop.memory.trials import BLOCK_TRIALS, tasks_of
+from evedrop.memory.workers import in_processes
+from evedrop.results.writer import load_results
+from evedrop.scenario import load
 from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 
 ENDLESS = ("--slots", "400000", "--trials", "1000")
@@ -119,11 +119,11 @@ def test_a_worker_is_given_no_tokens(evedrop: Evedrop, monkeypatch: pytest.Monke
 
 def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A fault after the first batch: the tables have its trials, the summary says how the study ended."""
-    from emulator.api import montecarlo
-    from emulator.runs import montecarlo as module
+    from evedrop.api import montecarlo
+    from evedrop.memory import montecarlo as module
 
     def failing(tasks: list[object], *_: object) -> object:
-        from emulator.runs.trials import carry_out
+        from evedrop.memory.trials import carry_out
 
         yield carry_out(tasks[0], lambda _: None, lambda: False)  # type: ignore[arg-type]
         raise RunError("a worker process died")

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.api import load_results, montecarlo, run
-from emulator.runs.results import Results
-from emulator.scenario import load, shipped
+from evedrop.api import load_results, montecarlo, run
+from evedrop.results.writer import Results
+from evedrop.scenario import load, shipped
 
 SLOTS = 300
 """Enough for a whole block of digests and a part of one."""

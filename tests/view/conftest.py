@@ -8,7 +8,7 @@ from unittest.mock import patch
 import pytest
 from simulated_run import Simulated, orbit, simulate
 
-from emulator.view import recording
+from evedrop.view import recording
 from tests.conftest import LIMIT
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
-from emulator.view import paths
+from evedrop.view import paths
 
 
 def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.model.eavesdroppers import STRATEGIES
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.process import Floats, Process, Trajectory
-from emulator.model.receiver import Heard, Receiver
-from emulator.model.schemes import SCHEMES
-from emulator.streams import Batch, root_of_seed, stream_key
-from emulator.view.recording import PeerSlots, Scene, Shown, Slots
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.process import Floats, Process, Trajectory
+from evedrop.model.receiver import Heard, Receiver
+from evedrop.model.schemes import SCHEMES
+from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.view.recording import PeerSlots, Scene, Shown, Slots
 
 STATE_PROBABILITY = 0.35
 USE_STATE, USE_INNOVATION = 0.8, 0.3

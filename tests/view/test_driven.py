@@ -7,12 +7,12 @@ import pytest
 from read_back import rows
 from test_picture import filled
 
-from emulator import load_results, montecarlo
-from emulator.errors import UsageError
-from emulator.runs.showing import Showing
-from emulator.scenario import checked, load
-from emulator.view.picture import opened
-from emulator.view.replay import replay
+from evedrop import load_results, montecarlo
+from evedrop.errors import UsageError
+from evedrop.scenario import checked, load
+from evedrop.view.picture import opened
+from evedrop.view.plant_slots import Showing
+from evedrop.view.replay import replay
 
 SLOTS = 300
 

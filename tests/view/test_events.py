@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.model.receiver import Codes
-from emulator.view.events import Event, Watcher
-from emulator.view.scene import Scene, Shown
+from evedrop.model.receiver import Codes
+from evedrop.view.events import Event, Watcher
+from evedrop.view.scene import Scene, Shown
 
 LOST, STATE, SILENT, MISLED = 0, 1, 4, 5
 

@@ -7,10 +7,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from emulator import cli
-from emulator.view import figures
-from emulator.view import figures_microgrid as microgrid
-from emulator.view.figures import Size
+from evedrop.cli import main as cli
+from evedrop.paper import figures, microgrid
+from evedrop.paper.figures import Size
 
 NAMES = ("numerical", "microgrid", "strategies", "chain")
 

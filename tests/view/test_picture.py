@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from simulated_run import Simulated
 
-from emulator.errors import UsageError
-from emulator.runs.viewer_process import guarded
-from emulator.view.picture import opened, picture, picture_apart
-from emulator.view.recording import Recording
+from evedrop.errors import UsageError
+from evedrop.view.picture import opened, picture, picture_apart
+from evedrop.view.recording import Recording
+from evedrop.view.viewer_process import guarded
 from tests.conftest import wait_until
 
 
@@ -128,7 +128,7 @@ def test_a_broken_recording_is_said_before_a_viewer_is_started(
     what: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One line with the file, what is wrong and a remedy; the viewer would wait for ever."""
-    monkeypatch.setattr("emulator.view.picture.spawn", lambda *_, **__: pytest.fail("a viewer was started"))
+    monkeypatch.setattr("evedrop.view.picture.spawn", lambda *_, **__: pytest.fail("a viewer was started"))
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
     rrd.write_bytes(BROKEN[what](rrd.read_bytes()))
     with pytest.raises(UsageError, match="is broken") as told:

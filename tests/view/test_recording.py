@@ -11,8 +11,8 @@ from read_back import lane, rows
 from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
-from emulator.view import plane
-from emulator.view.recording import Recording, Scene
+from evedrop.view import plane
+from evedrop.view.recording import Recording, Scene
 from tests.conftest import LIMIT
 
 SLOTS = 400
@@ -162,7 +162,7 @@ import os, resource, signal, sys
 sys.path.insert(0, sys.argv[1])
 from simulated_run import orbit, simulate
 from pathlib import Path
-from emulator.view.recording import Recording
+from evedrop.view.recording import Recording
 run = simulate(orbit(), 3000)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))

@@ -9,11 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 from read_back import lane, rows
 
-from emulator import load_results, montecarlo, run
-from emulator.errors import UsageError
-from emulator.runs.montecarlo import Plan
-from emulator.runs.simulation import Mode
-from emulator.view.replay import replay
+from evedrop import load_results, montecarlo, run
+from evedrop.errors import UsageError
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.view.replay import replay
 
 SLOTS = 120
 EVE = {"eve": {"strategy": "naive", "link": {"quality": 0.7}}}

@@ -8,9 +8,9 @@ from typing import Any
 
 from read_back import rows
 
-from emulator import load_results, montecarlo
-from emulator.cli import main
-from emulator.view.replay import replay
+from evedrop import load_results, montecarlo
+from evedrop.cli.main import main
+from evedrop.view.replay import replay
 
 EVENTS = [{"at": 3, "link": "legitimate", "set": {"quality": 0.2}}, {"from": 5, "to": 9, "cut": "smart"}]
 LINES = {3: ["link legitimate: quality = 0.2"], 5: ["cut smart"], 9: ["heal smart"]}

@@ -17,11 +17,11 @@ import pytest
 from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
-from emulator.errors import UsageError
-from emulator.runs.followed import Followed, feed
-from emulator.runs.ports import free_port
-from emulator.runs.viewer import Stand, Viewer, choose, open_run
-from emulator.view.recording import Recording
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import free_port
+from evedrop.view.growing_recording import Followed, feed
+from evedrop.view.recording import Recording
+from evedrop.view.viewer import Stand, Viewer, choose, open_run
 from tests.conftest import LIMIT, wait_until
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -148,7 +148,7 @@ def test_those_who_only_connect_keep_nobody_out_for_long(viewer: Viewer, tmp_pat
 @pytest.fixture
 def headless(monkeypatch: pytest.MonkeyPatch) -> None:
     """A window that needs no screen."""
-    monkeypatch.setattr("emulator.runs.viewer._WINDOW", ("--headless",))
+    monkeypatch.setattr("evedrop.view.viewer._WINDOW", ("--headless",))
     monkeypatch.setenv("DISPLAY", ":0")
 
 
@@ -184,7 +184,7 @@ def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("headless")
 def test_a_window_without_a_network_of_its_own_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the system allows none it is started all the same, and the user is told what others can do."""
-    monkeypatch.setattr("emulator.runs.viewer_process._APART", "")
+    monkeypatch.setattr("evedrop.view.viewer_process._APART", "")
     started = window(tmp_path / "logs", tmp_path / "r.rrd")
     try:
         assert started.warning is not None
@@ -251,7 +251,7 @@ def test_hung_viewer_is_stopped(viewer: Viewer) -> None:
 STARTER = """
 import sys, time
 from pathlib import Path
-from emulator.runs.viewer import Viewer
+from evedrop.view.viewer import Viewer
 viewer = Viewer.start("web", Path(sys.argv[1]), Path(sys.argv[1]) / "r.rrd")
 print(viewer._process.pid, flush=True)
 time.sleep(600)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulator.model.controllers.controller import Assignment, Controller
-from emulator.model.controllers.lqr import Lqr
-from emulator.model.controllers.mpc import Mpc
+from evedrop.model.controllers.controller import Assignment, Controller
+from evedrop.model.controllers.lqr import Lqr
+from evedrop.model.controllers.mpc import Mpc
 
 CONTROLLERS: Mapping[str, type[Controller]] = {"lqr": Lqr, "mpc": Mpc}
 

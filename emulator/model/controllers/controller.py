@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from emulator.model.plant import Plant
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Flags
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Flags
 
 
 @dataclass(frozen=True)

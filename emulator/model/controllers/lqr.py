@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model.controllers.controller import Assignment, Controller
-from emulator.model.elementary import inverse
-from emulator.model.process import Floats, product
+from evedrop.kernels.elementary import inverse
+from evedrop.model.controllers.controller import Assignment, Controller
+from evedrop.model.process import Floats, product
 
 _DOUBLINGS = 60  # 2⁶⁰ decisions: what has not settled by then never will
 _SETTLED = 1e-13

@@ -20,9 +20,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from emulator.model.controllers.controller import Assignment, Controller
-from emulator.model.controllers.lqr import held
-from emulator.model.process import Floats
+from evedrop.model.controllers.controller import Assignment, Controller
+from evedrop.model.controllers.lqr import held
+from evedrop.model.process import Floats
 
 _UNBOUNDED = 1e30
 _SETTINGS: Mapping[str, Any] = MappingProxyType(

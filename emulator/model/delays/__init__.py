@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.delays.constant import Constant
-from emulator.model.delays.delay import DelayModel
-from emulator.model.delays.normal import Normal
-from emulator.model.delays.pareto import Pareto
-from emulator.model.delays.trace import Trace
-from emulator.model.registry import Registry
+from evedrop.model.delays.constant import Constant
+from evedrop.model.delays.delay import DelayModel
+from evedrop.model.delays.normal import Normal
+from evedrop.model.delays.pareto import Pareto
+from evedrop.model.delays.trace import Trace
+from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[DelayModel]] = {
     "constant": Constant,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.delays.delay import LONGEST
+from evedrop.model.delays.delay import LONGEST
 
 
 def is_number(value: Any) -> bool:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.delays.checks import length_mistakes
-from emulator.model.delays.delay import DelayModel
-from emulator.model.process import Floats
+from evedrop.model.delays.checks import length_mistakes
+from evedrop.model.delays.delay import DelayModel
+from evedrop.model.process import Floats
 
 
 class Constant(DelayModel):

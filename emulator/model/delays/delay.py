@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from emulator.model.process import Floats
+from evedrop.model.process import Floats
 
 LONGEST = 1e6
 """Slots: a longer delay is cut to this, which no receiver waits for."""

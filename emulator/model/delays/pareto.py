@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.delays.checks import is_number, length_mistakes
-from emulator.model.delays.delay import LONGEST, DelayModel
-from emulator.model.elementary import exp, log
-from emulator.model.process import Floats
+from evedrop.kernels.elementary import exp, log
+from evedrop.model.delays.checks import is_number, length_mistakes
+from evedrop.model.delays.delay import LONGEST, DelayModel
+from evedrop.model.process import Floats
 
 
 class Pareto(DelayModel):

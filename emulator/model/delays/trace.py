@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.delays.checks import is_number
-from emulator.model.delays.delay import LONGEST, DelayModel
-from emulator.model.process import Floats
+from evedrop.model.delays.checks import is_number
+from evedrop.model.delays.delay import LONGEST, DelayModel
+from evedrop.model.process import Floats
 
 MOST_DELAYS = 900_000
 """Of all links of a scenario together: its results hold them in their copy of the scenario."""

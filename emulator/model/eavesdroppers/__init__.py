@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulator.model.eavesdroppers.colluding import Colluding
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
-from emulator.model.eavesdroppers.readers import ANSWERS, GROUP, READERS, RESERVED
-from emulator.model.eavesdroppers.replay_informed import ReplayInformed
-from emulator.model.eavesdroppers.stand_in import StandIns
-from emulator.model.registry import Registry
+from evedrop.model.eavesdroppers.colluding import Colluding
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
+from evedrop.model.eavesdroppers.readers import ANSWERS, GROUP, READERS, RESERVED
+from evedrop.model.eavesdroppers.replay_informed import ReplayInformed
+from evedrop.model.eavesdroppers.stand_in import StandIns
+from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     **READERS,

@@ -14,14 +14,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from emulator.model.elementary import cholesky, exp
-from emulator.model.factored import Factor, Factors, covariance, grown, squared_length
-from emulator.model.leak import Leak, Leaks
-from emulator.model.mixture import NEGLIGIBLE, Mixture, merge, pruned, summed, with_a_place
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Flags, Heard
-from emulator.streams import Batch
+from evedrop.kernels.elementary import cholesky, exp
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, squared_length
+from evedrop.model.numeric.mixture import NEGLIGIBLE, Mixture, merge, pruned, summed, with_a_place
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Flags, Heard
+from evedrop.model.theory.leak import Leak, Leaks
+from evedrop.streams import Batch
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 

@@ -6,7 +6,7 @@ better link, so there is nothing to do here.
 
 from __future__ import annotations
 
-from emulator.model.eavesdroppers.delegate import Delegate
+from evedrop.model.eavesdroppers.delegate import Delegate
 
 
 class Colluding(Delegate):

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.eavesdroppers.eavesdropper import PacketTaker
-from emulator.model.receiver import Flags
+from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
+from evedrop.model.receiver import Flags
 
 
 class Constant(PacketTaker):

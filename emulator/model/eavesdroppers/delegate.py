@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
-from emulator.model.eavesdroppers.readers import READERS
-from emulator.model.receiver import Belief, Codes, Flags, Heard
-from emulator.model.theory import OutcomesAt
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from evedrop.model.eavesdroppers.readers import READERS
+from evedrop.model.receiver import Belief, Codes, Flags, Heard
+from evedrop.model.theory.covariances import OutcomesAt
+from evedrop.streams import Batch
 
 
 class Delegate(Eavesdropper):

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from emulator.model.packet_user import PacketUser
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Belief, Codes, Flags, Receiver
-from emulator.model.theory import Outcomes, OutcomesAt
-from emulator.streams import Batch
+from evedrop.model.packet_user import PacketUser
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.streams import Batch
 
 
 @dataclass(frozen=True)

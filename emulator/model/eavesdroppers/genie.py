@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from emulator.model.leak import Leaks
-from emulator.model.receiver import Belief, Codes, Flags, Heard, cleared, select
-from emulator.model.schedule import Schedule
-from emulator.model.theory import Outcomes, OutcomesAt
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.receiver import Belief, Codes, Flags, Heard, cleared, select
+from evedrop.model.schedule import Schedule
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.model.theory.leak import Leaks
+from evedrop.streams import Batch
 
 
 class Genie(PacketReader):

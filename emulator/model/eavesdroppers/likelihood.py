@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from emulator.model.elementary import cholesky, log
-from emulator.model.factored import Factor, Factors, covariance, grown, squared_length
-from emulator.model.leak import Leak, Leaks
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Flags, Heard
-from emulator.streams import Batch
+from evedrop.kernels.elementary import cholesky, log
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, squared_length
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Flags, Heard
+from evedrop.model.theory.leak import Leak, Leaks
+from evedrop.streams import Batch
 
 
 class Likelihood(PacketReader):

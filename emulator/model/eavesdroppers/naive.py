@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.eavesdroppers.eavesdropper import PacketTaker
-from emulator.model.receiver import Flags
+from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
+from evedrop.model.receiver import Flags
 
 
 class Naive(PacketTaker):

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulator.model.answers import Answers
-from emulator.model.eavesdroppers.bayesian import Bayesian
-from emulator.model.eavesdroppers.constant import Constant
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper
-from emulator.model.eavesdroppers.genie import Genie
-from emulator.model.eavesdroppers.likelihood import Likelihood
-from emulator.model.eavesdroppers.naive import Naive
-from emulator.model.eavesdroppers.reference import Reference
-from emulator.model.eavesdroppers.selective import Selective
-from emulator.model.eavesdroppers.smart import Smart
-from emulator.model.eavesdroppers.stand_in import StandIns
-from emulator.model.eavesdroppers.suspicious import Suspicious
-from emulator.model.eavesdroppers.tracker import Tracker
-from emulator.model.registry import Registry
+from evedrop.model.answers import Answers
+from evedrop.model.eavesdroppers.bayesian import Bayesian
+from evedrop.model.eavesdroppers.constant import Constant
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
+from evedrop.model.eavesdroppers.genie import Genie
+from evedrop.model.eavesdroppers.likelihood import Likelihood
+from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.reference import Reference
+from evedrop.model.eavesdroppers.selective import Selective
+from evedrop.model.eavesdroppers.smart import Smart
+from evedrop.model.eavesdroppers.stand_in import StandIns
+from evedrop.model.eavesdroppers.suspicious import Suspicious
+from evedrop.model.eavesdroppers.tracker import Tracker
+from evedrop.model.registry import Registry
 
 GROUP = "evedrop.eavesdroppers"
 RESERVED = ("strategy", "link", "links", "window")

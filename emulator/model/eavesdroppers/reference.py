@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from emulator.model.process import Floats
-from emulator.model.receiver import Belief, Heard
-from emulator.model.reference import ReferenceReceiver
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Heard
+from evedrop.model.reference import ReferenceReceiver
+from evedrop.streams import Batch
 
 
 class Reference(PacketReader):

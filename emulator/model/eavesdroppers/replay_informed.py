@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from emulator.model.eavesdroppers.delegate import Delegate
-from emulator.model.eavesdroppers.eavesdropper import Knowledge
-from emulator.model.receiver import Belief, Heard
-from emulator.model.theory import OutcomesAt
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers.delegate import Delegate
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.receiver import Belief, Heard
+from evedrop.model.theory.covariances import OutcomesAt
+from evedrop.streams import Batch
 
 
 class ReplayInformed(Delegate):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model import update
-from emulator.model.eavesdroppers.eavesdropper import PacketReader
-from emulator.model.receiver import Action, Belief, Heard
+from evedrop.model import update
+from evedrop.model.eavesdroppers.eavesdropper import PacketReader
+from evedrop.model.receiver import Action, Belief, Heard
 
 
 class Selective(PacketReader):

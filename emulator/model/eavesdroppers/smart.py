@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
-from emulator.model.receiver import Flags
-from emulator.model.schedule import Schedule
-from emulator.streams import Batch
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
+from evedrop.model.receiver import Flags
+from evedrop.model.schedule import Schedule
+from evedrop.streams import Batch
 
 
 class Smart(PacketTaker):

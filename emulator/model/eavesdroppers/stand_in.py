@@ -9,10 +9,10 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
-from emulator.model.answers import Answers, NoAnswer
-from emulator.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
-from emulator.model.registry import NotRegistered
-from emulator.model.theory import Outcomes, OutcomesAt
+from evedrop.model.answers import Answers, NoAnswer
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
+from evedrop.model.registry import NotRegistered
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 _ROUNDING = 1e-9
 _SHARES = ("predicted", "state", "misled", "decoded", "leaked")
@@ -23,7 +23,7 @@ class StandIns:
     """Makes stand-ins, of classes that `answers` knows or asks. Final."""
 
     def __init__(self, answers: Answers, registry: str) -> None:
-        """registry: the attribute of `emulator.model.eavesdroppers` that has the classes."""
+        """registry: the attribute of `evedrop.model.eavesdroppers` that has the classes."""
         self.answers = answers
         self._registry = registry
 

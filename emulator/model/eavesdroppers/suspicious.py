@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
-from emulator.model.receiver import Flags
-from emulator.model.schedule import Schedule
-from emulator.streams import Batch, BlockReader
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
+from evedrop.model.receiver import Flags
+from evedrop.model.schedule import Schedule
+from evedrop.streams import Batch, BlockReader
 
 
 class Suspicious(PacketTaker):

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from emulator.model.elementary import cholesky, exp, log
-from emulator.model.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
-from emulator.model.mixture import Mixture, merge, pruned, summed, with_a_place
-from emulator.model.process import Floats
-from emulator.model.receiver import Action, Belief, Flags, Heard
-from emulator.model.twins import Twins
-from emulator.streams import Batch
+from evedrop.kernels.elementary import cholesky, exp, log
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from evedrop.model.numeric.mixture import Mixture, merge, pruned, summed, with_a_place
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Flags, Heard
+from evedrop.model.twins import Twins
+from evedrop.streams import Batch
 
 CAPACITY = 8
 """Histories that a trial may have of either kind; beyond it the two least probable ones become one."""

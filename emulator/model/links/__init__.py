@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.links.bernoulli import Bernoulli
-from emulator.model.links.distance import Distance
-from emulator.model.links.gilbert_elliott import GilbertElliott
-from emulator.model.links.link import LossModel
-from emulator.model.links.markov import Markov
-from emulator.model.links.pattern import Pattern
-from emulator.model.links.pooled import Pooled
-from emulator.model.links.trace import Trace
-from emulator.model.registry import Registry
+from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.links.distance import Distance
+from evedrop.model.links.gilbert_elliott import GilbertElliott
+from evedrop.model.links.link import LossModel
+from evedrop.model.links.markov import Markov
+from evedrop.model.links.pattern import Pattern
+from evedrop.model.links.pooled import Pooled
+from evedrop.model.links.trace import Trace
+from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[LossModel]] = {
     "bernoulli": Bernoulli,

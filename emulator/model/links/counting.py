@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emulator.model.process import Floats
+from evedrop.model.process import Floats
 
 
 def count_variance(transitions: Floats, law: Floats, quality: Floats, slots: int) -> float:

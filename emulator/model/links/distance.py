@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.elementary import exp, log, normal_quantile
-from emulator.model.links.checks import as_toml, number_mistakes
-from emulator.model.links.fading import count_variance, delivery_probability
-from emulator.model.links.link import LossModel, fates_of
-from emulator.model.links.way import FARTHEST, Way, way_mistakes
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes
+from evedrop.kernels.elementary import exp, log, normal_quantile
+from evedrop.model.links.checks import as_toml, number_mistakes
+from evedrop.model.links.fading import count_variance, delivery_probability
+from evedrop.model.links.link import LossModel, fates_of
+from evedrop.model.links.way import FARTHEST, Way, way_mistakes
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
 
 _NEPER = 0.23025850929940458  # ln 10 / 10: decibels as a natural logarithm
 _LONGEST_BLOCK = 1_000_000

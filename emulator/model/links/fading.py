@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from emulator.model.process import Floats
+from evedrop.model.process import Floats
 
 _AT_ONCE = 1 << 20  # numbers
 

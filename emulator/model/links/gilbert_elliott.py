@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.links.checks import probability_mistakes
-from emulator.model.links.link import Chain, LossModel, fates_of
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes, Flags
+from evedrop.model.links.checks import probability_mistakes
+from evedrop.model.links.link import Chain, LossModel, fates_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
 
 
 class GilbertElliott(LossModel):

@@ -1,4 +1,4 @@
-"""What a loss model is: from random numbers to which packets are lost. The rest of a link is in `emulator.model.link`."""
+"""What a loss model is: from random numbers to which packets are lost. The rest of a link is in `evedrop.model.slot.link`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.links.counting import count_variance
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes, Flags
+from evedrop.model.links.counting import count_variance
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
 
 
 class Fate(IntEnum):

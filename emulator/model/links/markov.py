@@ -11,10 +11,10 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.links.checks import as_toml, is_probability
-from emulator.model.links.link import Chain, LossModel, fates_of
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes
+from evedrop.model.links.checks import as_toml, is_probability
+from evedrop.model.links.link import Chain, LossModel, fates_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
 
 _SUM = 1e-9  # how far a row may be from summing to 1
 _MOST_STATES = 64

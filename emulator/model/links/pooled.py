@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from emulator.model.links.link import Chain, Fate, LossModel
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes
+from evedrop.model.links.link import Chain, Fate, LossModel
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
 
 _MOST_STATES = 1024  # of the chain of all links: more of them, and its transitions would fill the memory
 

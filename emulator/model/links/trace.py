@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.links.checks import flag_mistakes, word_mistakes
-from emulator.model.links.link import LossModel, fates_of
-from emulator.model.process import Floats
-from emulator.model.receiver import Codes
+from evedrop.model.links.checks import flag_mistakes, word_mistakes
+from evedrop.model.links.link import LossModel, fates_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
 
 MOST_OUTCOMES = 10_000_000
 

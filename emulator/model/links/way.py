@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.links.checks import as_toml, is_number
-from emulator.model.process import Floats
+from evedrop.model.links.checks import as_toml, is_number
+from evedrop.model.process import Floats
 
 FARTHEST = 1e9
 """Metres."""

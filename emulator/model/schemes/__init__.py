@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from emulator.model.process import Process
-from emulator.model.registry import Registry
-from emulator.model.schemes.acknowledged import Acknowledged
-from emulator.model.schemes.cipher import Cipher
-from emulator.model.schemes.encrypted_schedule import EncryptedSchedule
-from emulator.model.schemes.innovation import Innovation
-from emulator.model.schemes.plain import Plain
-from emulator.model.schemes.scheduled import Scheduled
-from emulator.model.schemes.scheme import Scheme
-from emulator.model.schemes.twin_track import TwinTrack
-from emulator.model.schemes.withholding import Withholding
+from evedrop.model.process import Process
+from evedrop.model.registry import Registry
+from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.schemes.cipher import Cipher
+from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
+from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.schemes.plain import Plain
+from evedrop.model.schemes.scheduled import Scheduled
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.schemes.twin_track import TwinTrack
+from evedrop.model.schemes.withholding import Withholding
 
 _BUILT_IN: Mapping[str, type[Scheme]] = {
     "acknowledged": Acknowledged,

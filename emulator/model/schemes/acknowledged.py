@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Flags, Receiver
-from emulator.model.reference import NONE, ReferenceCode, ReferenceReceiver
-from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Flags, Receiver
+from evedrop.model.reference import NONE, ReferenceCode, ReferenceReceiver
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch
 
 
 class AcknowledgedEncoder(Encoder):

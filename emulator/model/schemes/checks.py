@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from emulator.model.links.checks import probability_mistakes
+from evedrop.model.links.checks import probability_mistakes
 
 __all__ = ["choice_mistakes", "count_mistakes", "probability_mistakes"]
 

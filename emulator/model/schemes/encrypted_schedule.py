@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model import update
-from emulator.model.holding_time import HoldingTime
-from emulator.model.masking import Mask
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
-from emulator.model.schemes.checks import count_mistakes
-from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch
+from evedrop.model import update
+from evedrop.model.holding_time import HoldingTime
+from evedrop.model.numeric.masking import Mask
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from evedrop.model.schemes.checks import count_mistakes
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch
 
 
 class EncryptedScheduleEncoder(Encoder):

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model import update
-from emulator.model.process import Floats, Process, StateFactors, product
-from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
-from emulator.model.schedule import Schedule
-from emulator.model.schemes.checks import probability_mistakes
-from emulator.model.schemes.scheme import Encoder, Packet, Scheme, Shared
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch, BlockReader
+from evedrop.model import update
+from evedrop.model.process import Floats, Process, StateFactors, product
+from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from evedrop.model.schedule import Schedule
+from evedrop.model.schemes.checks import probability_mistakes
+from evedrop.model.schemes.scheme import Encoder, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch, BlockReader
 
 
 class SharedSecret(Shared):

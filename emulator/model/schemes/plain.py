@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from emulator.model.packet_user import PacketUser
-from emulator.model.process import Floats
-from emulator.model.receiver import Flags
-from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch
+from evedrop.model.packet_user import PacketUser
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch
 
 
 class PlainEncoder(Encoder):

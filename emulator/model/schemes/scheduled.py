@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.holding_time import HoldingTime
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Flags, Receiver
-from emulator.model.schemes.checks import count_mistakes
-from emulator.model.schemes.plain import PlainEstimator
-from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from emulator.streams import Batch
+from evedrop.model.holding_time import HoldingTime
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Flags, Receiver
+from evedrop.model.schemes.checks import count_mistakes
+from evedrop.model.schemes.plain import PlainEstimator
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.streams import Batch
 
 
 class ScheduledEncoder(Encoder):

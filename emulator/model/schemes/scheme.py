@@ -10,10 +10,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Flags, Receiver
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Flags, Receiver
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch
 
 _WORD_BITS = 64
 

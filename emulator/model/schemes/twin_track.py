@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from emulator.model import update
-from emulator.model.elementary import cholesky
-from emulator.model.process import Floats, Process, product
-from emulator.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
-from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch, BlockReader
+from evedrop.kernels.elementary import cholesky
+from evedrop.model import update
+from evedrop.model.process import Floats, Process, product
+from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch, BlockReader
 
 
 class Tracks:

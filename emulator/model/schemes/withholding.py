@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from emulator.model.process import Floats, Process
-from emulator.model.receiver import Receiver
-from emulator.model.schedule import Schedule
-from emulator.model.schemes.checks import probability_mistakes
-from emulator.model.schemes.plain import PlainEstimator
-from emulator.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from emulator.model.theory import Outcomes
-from emulator.streams import Batch
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Receiver
+from evedrop.model.schedule import Schedule
+from evedrop.model.schemes.checks import probability_mistakes
+from evedrop.model.schemes.plain import PlainEstimator
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch
 
 
 class WithholdingEncoder(Encoder):

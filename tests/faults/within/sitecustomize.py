@@ -10,7 +10,7 @@ import sys
 
 FOLDER = os.environ.get("EVEDROP_CAMPAIGN")
 
-if FOLDER and sys.orig_argv[1:4] == ["-m", "emulator", "run"]:
+if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
     from importlib.machinery import ModuleSpec, PathFinder
     from types import ModuleType
     from typing import Any
@@ -46,7 +46,7 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "emulator", "run"]:
 
         module.Brief.write = write  # type: ignore[attr-defined]
 
-    _CHANGES = {"emulator.runs.report": _telling, "emulator.brief": _wired}
+    _CHANGES = {"evedrop.cli.report": _telling, "evedrop.live.protocol.brief": _wired}
 
     class _Finder:
         """Finds the modules that are to be changed, and changes them when they have been run."""

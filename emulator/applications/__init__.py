@@ -1,0 +1,1 @@
+"""Applications of the emulator, each with its own data, figures and panels."""

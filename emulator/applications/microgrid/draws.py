@@ -1,0 +1,48 @@
+"""Random numbers in the order they are asked for, from a named stream: what makes a day, once.
+
+Source: docs/mathematics.md, random numbers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evedrop.kernels.elementary import log
+from evedrop.streams import Floats, Stream, normals, root_of_seed, stream_key, uniforms
+
+
+class Draws:
+    """Numbers of one stream, one after the other. Final."""
+
+    def __init__(self, seed: int, name: str) -> None:
+        self._stream = Stream(stream_key(root_of_seed(seed), name), range(1), 1)
+        self._next = 0
+
+    def uniform(self, low: float = 0.0, high: float = 1.0) -> float:
+        """A number between low and high."""
+        return float(low + (high - low) * self.uniforms(1)[0])
+
+    def uniforms(self, count: int) -> Floats:
+        """Numbers in [0, 1), (count,)."""
+        return uniforms(self._stream.words(self._ahead(count)))[:, 0, 0]
+
+    def normals(self, count: int) -> Floats:
+        """Standard normals, (count,)."""
+        return normals(self._stream.words(self._ahead(count)))[:, 0, 0]
+
+    def exponential(self, mean: float) -> float:
+        """A waiting time."""
+        return float(-mean * log(1.0 - self.uniforms(1))[0])
+
+    def times(self, rate: Floats) -> list[int]:
+        """Places of a Poisson process, in order: `rate` is how many are expected at each, (places,)."""
+        total = np.cumsum(rate)
+        found, reached = [], self.exponential(1.0)
+        while reached < total[-1]:
+            found.append(int(np.searchsorted(total, reached, side="right")))
+            reached += self.exponential(1.0)
+        return found
+
+    def _ahead(self, count: int) -> range:
+        self._next += count
+        return range(self._next - count, self._next)

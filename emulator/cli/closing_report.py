@@ -1,0 +1,58 @@
+"""The closing report of a results folder: printed when a run ends, and again whenever somebody asks for it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shlex
+import sys
+from pathlib import Path
+
+from evedrop.cli.report import print_summary
+from evedrop.errors import UsageError
+from evedrop.results.writer import load_results
+from evedrop.scenario import load
+
+
+def print_results(folder: Path, as_json: bool = False) -> None:
+    """Print the table and the verdict of a results folder, or its summary as JSON, to standard output.
+
+    Raises UsageError if it is not a results folder.
+    """
+    summary = load_results(folder).summary
+    if as_json:
+        sys.stdout.write(json.dumps(summary, ensure_ascii=False) + "\n")
+        return
+    try:
+        print_summary(summary, str(folder), None if summary["mode"] == "live" else replay_command(folder))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UsageError(
+            f"{folder / 'summary.json'} is not a run summary of this version ({error!r}); run the scenario again"
+        ) from error
+
+
+def print_ending(folder: Path, status: int, how: str) -> None:
+    """Print what `evedrop run` prints at its end: the closing report, and why the run failed. Nobody has to read it.
+
+    status: the exit status of the run; how: why it failed.
+    """
+    with contextlib.suppress(UsageError, OSError):
+        print_results(folder)
+        sys.stdout.flush()
+    if status not in {0, 1}:
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"evedrop: {how}\n")
+            sys.stderr.flush()
+
+
+def replay_command(folder: Path) -> str | None:
+    """The command that runs the scenario of a results folder live, one trial of it; None if it cannot be run live."""
+    try:
+        scenario = load(folder)
+    except UsageError:  # float64 cannot follow the states of so many slots
+        return None
+    recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
+    recorded += " --set shards=1" if scenario.shards > 1 else ""
+    # A quantile over trials can be expected of many alone.
+    expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
+    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"

@@ -1,0 +1,133 @@
+"""What people see of a comparison in the terminal: what each scheme costs and keeps, then every pair."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from evedrop.cli.report import terminal
+from evedrop.studies.compare import Kept
+
+if TYPE_CHECKING:
+    from evedrop.studies.compare import Cell, Comparison, Measured
+
+MARKS = {Kept.PERFECT: "●", Kept.RELATIVE: "◐", Kept.UNDECIDED: "?", Kept.BROKEN: "✕"}
+"""Verdicts as marks that can be told apart without colours."""
+WORDS = {Kept.PERFECT: "perfect", Kept.RELATIVE: "relative", Kept.UNDECIDED: "too few", Kept.BROKEN: "broken"}
+"""And in a word each."""
+
+
+def print_comparison(found: Comparison, folder: str) -> None:
+    """Everything, on standard output."""
+    console = terminal()
+    trials = f"{found.trials:,} trials" if found.trials > 1 else "1 trial"
+    console.print(f"{found.title} · {found.slots:,} slots · {trials}")
+    console.print(_schemes(found))
+    console.print(_pairs(found))
+    for line in (*_undefined(found), *_remarks(found)):
+        console.print(line)
+    console.print(f"results: {folder}/compare.json, compare.png, scenarios/")
+
+
+def _schemes(found: Comparison) -> Table:
+    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits", "secret", "once"))
+    for head in ("closest adversary", "verdict"):
+        table.add_column(head, no_wrap=True)
+    for name, one in found.schemes.items():
+        cell, needs = one.closest, one.needs
+        table.add_row(
+            name,
+            simulated(one.legitimate),
+            theory(one.legitimate),
+            "needed" if needs.acknowledgements else "–",
+            f"{needs.sent_fraction:.3g}",
+            f"{needs.payload_bits} + {needs.header_bits}" if needs.header_bits else f"{needs.payload_bits}",
+            f"{needs.secret_bits_per_slot}" if needs.secret_bits_per_slot else "–",
+            f"{needs.initial_secret_bits}" if needs.initial_secret_bits else "–",
+            *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
+        )
+    return table
+
+
+def _pairs(found: Comparison) -> Table:
+    table = _table("scheme", ())
+    table.add_column("adversary", no_wrap=True)
+    for head in ("its error", "theory", "legitimate", "theory", "ratio"):
+        table.add_column(head, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for name, one in found.schemes.items():
+        table.add_section()
+        shown = name
+        for adversary, cell in one.cells.items():
+            if cell.eavesdropper is None or cell.legitimate is None:
+                continue
+            table.add_row(
+                shown,
+                adversary if cell.match.attack == "none" else f"{adversary} ({cell.match.strategy})",
+                simulated(cell.eavesdropper),
+                theory(cell.eavesdropper),
+                simulated(cell.legitimate),
+                theory(cell.legitimate),
+                f"{cell.ratio:.3g}",
+                verdict(cell),
+            )
+            shown = ""
+    return table
+
+
+def _table(first: str, numbers: tuple[str, ...]) -> Table:
+    table = Table(box=SIMPLE_HEAD)
+    table.add_column(first, no_wrap=True)
+    for head in numbers:
+        table.add_column(head, justify="right", no_wrap=True)
+    return table
+
+
+def simulated(of: Measured) -> str:
+    """The mean over trials with its standard error, or where that is no measure the median."""
+    if of.infinite_variance:
+        return f"{of.typical:.3g} med"
+    return f"{of.mean:.3g}" if of.standard_error is None else f"{of.mean:.3g} ± {of.standard_error:.1g}"
+
+
+def theory(of: Measured) -> str:
+    """Over the same slots; ≥ before what is only a bound."""
+    return "–" if of.theory is None else f"{'≥ ' if of.theory.bound else ''}{of.theory.mean:.3g}"
+
+
+def verdict(cell: Cell) -> str:
+    """Its mark and word."""
+    return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
+
+
+def _undefined(found: Comparison) -> Iterator[str]:
+    """A line for each adversary and reason, with the schemes that it is the reason for."""
+    cells = [cell.match for one in found.schemes.values() for cell in one.cells.values()]
+    why = sorted((one.adversary, one.not_defined, one.scheme) for one in cells if one.not_defined is not None)
+    for (adversary, reason), some in groupby(why, lambda one: one[:2]):
+        yield f"not defined: {adversary} {reason} ({', '.join(scheme for _, _, scheme in some)})"
+
+
+def _remarks(found: Comparison) -> Iterator[str]:
+    yield (
+        "sent: the share of slots with a packet; bits: of its payload + header; secret: bits that a slot uses, at most, and "
+        "a trial once"
+    )
+    measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
+    if any(one is not None and one.infinite_variance for one in measured):
+        yield (
+            "med: the variance over trials is infinite, so the mean is no measure; the median trial, which lies far below "
+            "the expectation of theory"
+        )
+    if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
+        yield "≥: no closed form is known; what nobody without the secret can fall below in expectation"
+    if found.dominant:
+        more = "each of them dominates" if len(found.dominant) > 1 else "dominates"
+        yield (
+            f"{', '.join(found.dominant)}: {more}: none of the schemes costs the legitimate estimator less in the long run, "
+            "and with none is the closest adversary further off"
+        )

@@ -1,0 +1,350 @@
+"""What people see of a run in the terminal: a progress line, and a closing table with a sentence on secrecy."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from io import StringIO
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from evedrop.score.expectations_held import told
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from evedrop.model.theory.design import Design
+
+News = Mapping[str, Any]
+
+_DIGEST_WIDTH = 100  # columns of a terminal that has room for digests
+
+
+class _Unfailing:
+    """A stream that forgets what cannot be written to it: the terminal may be closed while the run is ended in order."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _unfailing(stream: TextIO | None) -> TextIO:
+    return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
+
+
+class ProgressLine:
+    """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
+
+    def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
+        self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
+        self._quiet = quiet
+        self._total = total
+        self.moved: Path | None = None
+        """Where the results folder is, if it was renamed."""
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            *([BarColumn(bar_width=24)] if self.console.width >= _DIGEST_WIDTH + 20 else []),
+            MofNCompleteColumn(),
+            TextColumn(f"{unit} · {{task.fields[rate]}}"),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[errors]}"),
+            console=self.console,
+            transient=True,
+            disable=quiet or not self.console.is_terminal,
+        )
+        self._task: TaskID = self._progress.add_task("starting", total=total, rate="", errors="")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def tell(self, news: News) -> None:
+        """Take one piece of news."""
+        kind = news["event"]
+        if kind == "view" and not self._quiet:
+            if news["address"]:
+                self.console.print(f"live view, for whoever has this address: {news['address']}", soft_wrap=True)
+            if news.get("warning"):
+                self.console.print(f"warning: {news['warning']}", soft_wrap=True)
+        elif kind == "started":
+            self._progress.update(self._task, description="running")
+        elif kind == "held":
+            self._progress.update(self._task, description=f"held before slot {news['before']}", rate="")
+        elif kind == "progress":
+            self._progress.update(
+                self._task,
+                description="running",
+                total=news.get("total", self._total),
+                completed=news["done"],
+                rate=f"{news['rate']:,.0f} {news['rate_unit']}",
+                errors="  ".join(f"{name} {error:.2g}" for name, error in news.get("squared_errors", {}).items()),
+            )
+        elif kind == "reconnected" and not self._quiet:
+            self.console.print(outage_line(news), soft_wrap=True)
+        elif kind == "moved":
+            self.moved = Path(news["folder"])
+            self.console.print(
+                f"the results folder was renamed while the run went on; it is {self.moved}", soft_wrap=True
+            )
+        elif kind == "ended" and news.get("view"):
+            self.console.print(f"the view stopped early: {news['view']}")
+
+
+def outage_line(outage: News) -> str:
+    """An outage of the summary as a sentence."""
+    went = "the run did not go on" if outage["until"] is None else f"the run went on after {outage['seconds']:.1f} s"
+    where = f" of shard {outage['shard']}" if "shard" in outage else ""
+    return f"{outage['process']}{where} cut off at slot {outage['slot']}; {went}"
+
+
+def closing_table(summary: News, width: int) -> Table:
+    """Per receiver: what it received, its error, what it believed of it, and, where there is room, its digest."""
+    trials = f"{summary['trials']:,} trials" if summary["trials"] > 1 else "1 trial"
+    rate = f"{summary['slots_per_second']:,.0f} slots/s"
+    if summary["mode"] != "live":
+        rate = f"{summary['slots_per_second'] * summary['trials']:,.0f} trial-slots/s in memory"
+    title = f"{summary['scenario']} · {summary['slots']:,} slots · {trials} · {rate}"
+    failed = [one["held"] for one in summary["expectations"]].count(False)
+    if failed:
+        title += f" · {failed} of {len(summary['expectations'])} expectations FAILED"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    table.add_column("receiver", no_wrap=True)
+    covariances = summary["mode"] == "covariance-only"
+    error = "actual tr P" if covariances else "mean |x−x̂|²"
+    for head in ("received", "used", error, "believed tr P", "expected tr P"):
+        table.add_column(head, justify="right", no_wrap=True)
+    wide = width >= _DIGEST_WIDTH
+    if wide:
+        table.add_column("digest", no_wrap=True)
+    for name, peer in summary["peers"].items():
+        error_figure = "mean_actual_trace_covariance" if covariances else "mean_squared_error"
+        table.add_row(
+            name,
+            _figure(peer["received_fraction"], ".4f"),
+            _figure(peer["used_fraction"], ".4f"),
+            _figure(peer[error_figure]),
+            _figure(peer["mean_trace_covariance"]),
+            _figure(peer["expected_trace_covariance"]),
+            *([(peer["digest"] or "–")[:12]] if wide else []),
+        )
+    return table
+
+
+def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
+    """The closing report on standard output; replay: the command that shows one trial live, to complete."""
+    console = terminal()
+    if summary["ended"] != "complete":
+        console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
+    console.print(closing_table(summary, console.width))
+    for line in _link_lines(summary["links"]):
+        console.print(line)
+    if summary["controller"] is not None:
+        console.print(_loop_line(summary["controller"]))
+    for verdict in summary["secrecy"].values():
+        console.print(verdict["sentence"])
+    for name, peer in summary["peers"].items():
+        if peer["infinite_variance"] and peer["error_quantiles"] and summary["trials"] > 1:
+            low, middle, high = (f"{float(value):.3g}" for value in peer["error_quantiles"].values())
+            console.print(
+                f"{name}: its error has infinite variance, so the mean over trials is no measure; "
+                f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
+            )
+    for line in household_lines(summary["household"]):
+        console.print(line)
+    for expectation in summary["expectations"]:
+        console.print(told(expectation))
+        if "replay" in expectation:
+            console.print(f"    see it again: {expectation['replay']}")
+    surprising = summary["surprising"]
+    if surprising is not None:
+        console.print(
+            f"most surprising: trial {surprising['trial']}, {surprising['receiver']}, mean error "
+            f"{surprising['mean_error']:.3g} against {surprising['median']:.3g} in the median trial"
+        )
+        if replay is not None:
+            console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
+    console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
+    """Which links let other shares through than their models say."""
+    for name, link in links.items():
+        if link.get("within_interval") is False:
+            low, high = link["interval"]
+            yield (
+                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
+                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
+            )
+
+
+def household_lines(house: Mapping[str, Any] | None) -> list[str]:
+    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it; or nothing."""
+    if house is None:
+        return []
+    seen = house["knowing_truth"]
+    lines = [
+        f"the house buys {_figure(house['bought_energy'], '.3f')} kWh and sells {_figure(house['sold_energy'], '.3f')} kWh; a "
+        f"controller that sees the truth, {_figure(seen['bought_energy'], '.3f')} and {_figure(seen['sold_energy'], '.3f')} kWh"
+    ]
+    shares = [house[f"{name}_difference"] for name in ("net", "total", "summed")]
+    if None not in shares:
+        net, total, summed = (f"{100 * share:.2g} %" for share in shares)
+        lines.append(
+            f"grid power differs from that one's by {net} in net energy, {total} in total, {summed} summed slot by slot"
+        )
+    areas = {name: one["activity_area"] for name, one in house["receivers"].items()}
+    if None not in areas.values():
+        told = ", ".join(f"{name} {area:.3f}" for name, area in areas.items())
+        windows = f"{house['active_windows']} active windows of {house['windows']}"
+        lines.append(f"who can tell the {windows} (1 is certainty, 0.5 a coin): {told}")
+    return lines
+
+
+def _loop_line(controller: News) -> str:
+    """What became of a closed loop."""
+    errors = ", ".join(
+        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller["mean_squared_errors"].items()
+    )
+    line = (
+        f"controller {controller['strategy']}, {controller['decisions']:,} decisions; the estimator's error is {errors}"
+    )
+    failed, clipped = controller["failed_fraction"], controller["clipped_fraction"]
+    if failed:
+        line += f"; {failed:.2%} of inputs were held because a decision failed"
+    if clipped:
+        line += f"; {clipped:.2%} were clipped by the plant"
+    return line
+
+
+def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
+    """A row a point and peer."""
+    shown = Table(box=SIMPLE_HEAD)
+    columns = [*keys, "peer", "mean error", "expected tr P", "believed tr P", "relative secrecy"]
+    for column in columns:
+        shown.add_column(column, justify="left" if column in {"peer", "relative secrecy"} else "right", no_wrap=True)
+    for row in table.to_pylist():
+        error = row["mean_squared_error"]
+        error = row["mean_actual_trace_covariance"] if error is None else error
+        shown.add_row(
+            *(f"{row[key]}" for key in keys),
+            row["peer"],
+            f"{error:.4g}",
+            _figure(row["expected_trace_covariance"]),
+            f"{row['mean_trace_covariance']:.4g}",
+            row["relative_secrecy"] or "–",
+        )
+    console = terminal()
+    console.print(shown)
+    console.print(f"results: {folder}/sweep.parquet, sweep.png")
+
+
+def print_design(design: Design) -> None:
+    """Bounds, intervals, optima and the price of secrecy, for people."""
+    console = terminal()
+    console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
+    if design.remark is not None:
+        console.print(design.remark)
+    else:
+        found = "error is unbounded"
+        if math.isfinite(design.trace):
+            found = (
+                f"trace is {design.trace:.4g}, {design.cost:.3g} times that of sending every state "
+                f"({design.plain_trace:.4g})"
+            )
+        console.print(
+            f"admissible: {design.bound:.6g} < μ_d ≤ 1; at this scenario's μ_d = {design.mu_d:g} the legitimate {found}"
+        )
+    if design.minimum is not None:
+        console.print(f"least μ_d for the wanted trace: {design.minimum:.6g}")
+    table = Table(box=SIMPLE_HEAD)
+    table.add_column("against", no_wrap=True)
+    for head in (
+        "bounded from",
+        "perfect secrecy",
+        "relative secrecy",
+        "best J_r",
+        "best J_r/J",
+        "its trace",
+        "holds from slot",
+    ):
+        table.add_column(head, justify="right", no_wrap=True)
+    for name, against in design.eavesdroppers.items():
+        table.add_row(
+            name,
+            _number(against.bound),
+            "none" if against.perfect is None else _half_open(against.perfect, against.bound),
+            "none"
+            if not against.relative
+            else " ∪ ".join(f"({low:.5f}, {high:.5f})" for low, high in against.relative),
+            "–" if against.best_difference is None else f"{against.best_difference:.5f}",
+            "–" if against.best_ratio is None else f"{against.best_ratio:.5f}",
+            _number(against.trace),
+            "–" if against.relative_from is None else str(against.relative_from),
+        )
+    console.print(table)
+    if design.omission is not None:
+        console.print(design.omission)
+
+
+def _half_open(interval: tuple[float, float], bound: float) -> str:
+    """Of perfect secrecy: at its upper end the error is still unbounded, unless it is bounded just there, where all is state."""
+    low, high = interval
+    return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
+
+
+def _figure(value: float | str | None, how: str = ".4g") -> str:
+    """A figure of the summary, where infinity is a string, and null means that there is none."""
+    return "–" if value is None else format(float(value), how)
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else "∞"
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Whoever reads our output may leave; that is no failure of ours, and cli.py knows what to do."""
+        raise  # noqa: PLE0704 - rich calls this where it has caught the error
+
+
+def terminal() -> Console:
+    """Standard output; wide where it is no terminal."""
+    return _Console(
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+        width=None if sys.stdout is not None and sys.stdout.isatty() else 140,
+    )

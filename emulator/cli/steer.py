@@ -1,0 +1,159 @@
+"""The commands for a run that goes on: each asks its observer, prints the answer, and ends.
+
+Every import of weight waits for the command that needs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.errors import BriefError, UsageError
+
+if TYPE_CHECKING:
+    from evedrop.live.network.control_file import Control
+    from evedrop.live.network.operator import Answer, Request
+
+_PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has started again
+_STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
+
+
+def link(options: argparse.Namespace) -> int:
+    """Change a link, cut it or heal it."""
+    event = _event(options.name, options.changes)
+    return _ask(options.run, "link", f"link {options.name}", event=event)
+
+
+def pause(options: argparse.Namespace) -> int:
+    """Hold the run."""
+    return _ask(options.run, "pause", "pause")
+
+
+def resume(options: argparse.Namespace) -> int:
+    """Let it go on."""
+    return _ask(options.run, "resume", "resume")
+
+
+def step(options: argparse.Namespace) -> int:
+    """Let some slots pass."""
+    if not 1 <= options.slots <= 100_000_000:
+        raise UsageError(f"step {options.slots}: expected 1 or more slots, and 100000000 at most")
+    return _ask(options.run, "step", f"step {options.slots}", _STEP_PATIENCE, slots=options.slots)
+
+
+def status(options: argparse.Namespace) -> int:
+    """Say how the run is doing."""
+    from evedrop.live.network.control_file import read_controls
+    from evedrop.live.network.operator import Request
+
+    answers = [
+        _answer(options.run, control, Request("status"), "status", _PATIENCE) for control in read_controls(options.run)
+    ]
+    found = _of_all([answer.status or {} for answer in answers])
+    if options.json:
+        print(json.dumps(found, ensure_ascii=False))
+    else:
+        print("\n".join(_lines(found)))
+    return 0
+
+
+def _ask(run: Path, do: str, what: str, patience: float = _PATIENCE, **fields: Any) -> int:
+    from evedrop.live.network.control_file import read_controls
+    from evedrop.live.network.operator import Request
+
+    control = read_controls(run)[0]  # of a run in shards any of them says that they are not steered
+    print(_answer(run, control, Request(do, **fields), what, patience).said)
+    return 0
+
+
+def _answer(run: Path, control: Control, request: Request, what: str, patience: float) -> Answer:
+    """What the observer of a run, or of one of its shards, answers. Raises UsageError if there is none, or it refuses."""
+    import zenoh
+
+    from evedrop.live.network.control_file import no_run
+    from evedrop.live.network.operator import ask
+
+    began = time.monotonic()
+    if control.identity is not None:
+        from evedrop.live.network.certificates import check_identity
+
+        try:
+            check_identity(control.identity, control.user)
+        except BriefError as error:
+            raise UsageError(f"{run / 'control.json'}: {error}") from error
+    try:
+        found = ask(control, request, patience)
+    except zenoh.ZError as error:
+        raise no_run(
+            run, f"nobody answers at {control.router}, or not yet again: a router that was lost is started again"
+        ) from error
+    if found is None and time.monotonic() - began >= patience:
+        raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
+    if found is None:
+        raise no_run(run, "it ended before it answered, or its router did, which is started again")
+    if found.refused:
+        count = "1 mistake" if len(found.refused) == 1 else f"{len(found.refused)} mistakes"
+        raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in found.refused)]))
+    return found
+
+
+def _event(name: str, words: list[str]) -> dict[str, Any]:
+    """What a scenario would say of the change, but when."""
+    if words in (["cut"], ["heal"]):
+        return {words[0]: name}
+    changes: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not all(key.split(".")):
+            raise UsageError(f"link {name} {word}: expected KEY=VALUE, such as quality=0.2; or cut, or heal, alone")
+        _put(changes, name, key, value)
+    return {"link": name, "set": changes}
+
+
+def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
+    """Put a value at a dotted key, of tables that are made on the way."""
+    from evedrop.scenario import value_of
+
+    *tables, last = dotted.split(".")
+    inner = changes
+    for table in tables:
+        inner = inner.setdefault(table, {})
+        if not isinstance(inner, dict):
+            raise UsageError(f"link {name} {dotted}={text}: {table} has a value already; give it once")
+    value = value_of(text)
+    try:
+        json.dumps(value)
+    except TypeError:  # a date is no value that a link could have, and no message either
+        value = text
+    inner[last] = value
+
+
+def _of_all(statuses: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """How the shards of a run are doing as one: the slowest one's, who is there in all of them, and all packets."""
+    found = dict(min(statuses, key=lambda status: int(status["slot"])))
+    found["processes"] = {name: all(one["processes"][name] for one in statuses) for name in found["processes"]}
+    for name in found["links"]:
+        offered, delivered = (sum(one["links"][name][what] for one in statuses) for what in ("offered", "delivered"))
+        fraction = delivered / offered if offered else None
+        found["links"] = {**found["links"], name: {"offered": offered, "delivered": delivered, "fraction": fraction}}
+    return found
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    """How a run is doing, for people."""
+    state = found["state"] if found["state"] == "running" else f"{found['state']} before slot {found['slot']}"
+    missing = [name for name, there in found["processes"].items() if not there]
+    there = [name for name, there in found["processes"].items() if there]
+    lines = [
+        f"slot {found['slot']} of {found['slots']}, {found['slots_per_second']:,.0f} slots/s, {state}",
+        f"processes: {', '.join(there)}" + (f"; not there: {', '.join(missing)}" if missing else ""),
+    ]
+    for name, one in found["links"].items():
+        fraction = "–" if one["fraction"] is None else f"{one['fraction']:.4f}"
+        lines.append(f"link {name}: {one['delivered']} of {one['offered']} packets delivered, {fraction}")
+    lines += [f"event at slot {one['slot']}: {one['event']} (by the {one['by']})" for one in found["events"]]
+    return lines

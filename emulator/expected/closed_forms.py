@@ -1,0 +1,123 @@
+"""Closed forms of receivers whose slots are not alike, because what is sent depends on acknowledgements.
+
+Source: docs/mathematics.md, acknowledged references and schedules by holding time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.acknowledgements import rates_of
+from evedrop.model.outcomes import closed_form
+from evedrop.model.process import Floats, Process
+from evedrop.model.reference import ReferenceCode
+from evedrop.model.slot.link_law import law_of
+from evedrop.model.theory import covariances as theory
+from evedrop.model.theory.closed_forms import SensorChain, encrypted_schedule, reference_covariances, scheduled
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.scenario import Scenario
+
+Split = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Closed:
+    """One receiver's expected error covariance over the slots of a run. Final."""
+
+    process: Process
+    slots: int
+    received: float
+    """The probability that it hears a packet that is sent."""
+    acknowledged: Split
+    """Probabilities that a packet is acknowledged and it heard it, and that it is acknowledged and it did not."""
+    chain: SensorChain | None
+    """What the sensor does; None of one that sends in every slot."""
+
+    @cached_property
+    def traces(self) -> Floats:
+        """Of all slots, (slots,)."""
+        if self.chain is not None:
+            found = self.chain.covariances(self.process, self.slots)
+        else:
+            found = reference_covariances(self.process, self.received, self.acknowledged, self.slots)
+        traces: Floats = np.trace(found, axis1=1, axis2=2)
+        return traces
+
+    @cached_property
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to work out."""
+        if self.chain is not None:
+            if len(self.chain.start) * self.process.n**2 > theory.LARGEST_OPERATOR:
+                return float("nan")
+            return float(np.trace(self.chain.limit(self.process)))
+        if self.acknowledged[1] > 0.0:
+            return float("inf")
+        return theory.limit_trace(self.process, Outcomes.plain(self.received))
+
+
+class ClosedStream:
+    """Its traces, the next slots at a time. Final."""
+
+    def __init__(self, closed: Closed) -> None:
+        self._closed, self._next = closed, 0
+
+    def next_traces(self, slots: int) -> Floats:
+        """Of the next slots, (slots,)."""
+        self._next += slots
+        return self._closed.traces[self._next - slots : self._next]
+
+
+def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
+    """Of a receiver; None where its scheme and strategy have none, or links are not as the closed forms assume them.
+
+    They assume links of independent losses without delay, and an attack that does not come and go.
+    """
+    table = scenario.acknowledgements
+    if table is None or (table.attack != "none" and scenario.timeline.jams is not None):
+        return None
+    needed = {LEGITIMATE, receiver} | ({table.jammer} if table.jammer is not None else set())
+    threshold = scenario.encoding.parameters.get("threshold", 1)
+    long = type(threshold) is int and threshold > theory.LARGEST_OPERATOR  # one state of the chain for each slot of it
+    if long or not all(_independent(scenario, name) for name in needed):
+        return None
+    process, quality = scenario.process.process, scenario.quality
+    split = _split(scenario, receiver)
+    reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
+    kind = closed_form(scenario.encoding.scheme, reader)
+    # Unless acknowledgements are forged the user never misses a reference, and what it does with a slot tells more.
+    told = receiver != LEGITIMATE or table.attack == "forge"
+    if kind == "reference" and told and not ReferenceCode(process).decorrelates:
+        return Closed(process, scenario.slots, quality[receiver], split, None)
+    if kind == "scheduled":
+        chain = scheduled(threshold, quality[receiver], split)
+        return Closed(process, scenario.slots, quality[receiver], split, chain)
+    if kind == "selective":
+        chain = encrypted_schedule(threshold, quality[receiver], split)
+        return Closed(process, scenario.slots, quality[receiver], split, chain)
+    return None
+
+
+def _split(scenario: Scenario, receiver: str) -> Split:
+    table, quality = scenario.acknowledgements, scenario.quality
+    assert table is not None  # noqa: S101 - asked by the caller
+    mu, alpha = quality[LEGITIMATE], table.link.quality
+    if receiver == LEGITIMATE:
+        mu_e = 1.0 if table.jammer is None else quality[table.jammer]
+        return rates_of(table.attack, mu, mu_e, alpha).user
+    if table.jammer in (None, receiver):
+        return rates_of(table.attack, mu, quality[receiver], alpha).eavesdropper
+    arrives = rates_of(table.attack, mu, quality[table.jammer], alpha).arrives
+    return arrives * quality[receiver], arrives * (1.0 - quality[receiver])
+
+
+def _independent(scenario: Scenario, receiver: str) -> bool:
+    """Whether a link loses packets each by itself, and neither delays nor changes; colluding links are one."""
+    course = scenario.course(receiver)
+    law = law_of(course)
+    if law is None or law.alike is None or course.correlation is not None or course.outages or course.changes:
+        return False
+    return set(course.settings) == {"loss"} and scenario.link(receiver).model.chain is not None

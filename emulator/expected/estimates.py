@@ -1,0 +1,88 @@
+"""What can be said of a run before it starts: is the estimator bounded, and how much will be written."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evedrop.expected.expectations import expectations_of
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.local_filter import settled
+from evedrop.model.theory.covariances import stability_bound
+from evedrop.plugins import sources_of
+from evedrop.scenario import Scenario
+from evedrop.scenario.filter_noise import is_singular
+
+_LARGE_BYTES = 1e9
+_SHOWN_STATES = 3  # of a matrix that is written out
+_NEAR = 0.01  # of a covariance's largest entry
+
+
+def warnings_of(scenario: Scenario) -> list[str]:
+    """What the user should know before the run; it goes on all the same.
+
+    Source: docs/mathematics.md, secrecy and design (stability bound).
+    """
+    found = []
+    process, mu_d = scenario.process.process, scenario.encoding.mu_d
+    expectation = expectations_of(scenario)[LEGITIMATE]
+    alike = None if expectation.law is None else expectation.law.alike
+    mu = 0.0 if alike is None else float(alike.quality[0])
+    bound = stability_bound(process, mu)
+    if alike is None:
+        if math.isinf(expectation.limit):
+            found.append(
+                f"the legitimate estimator's expected error grows without bound: with spectral radius "
+                f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the losses of its link last too long"
+            )
+    elif not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
+        needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
+        found.append(
+            f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "
+            f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
+            + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
+        )
+    found += _filter_warnings(scenario)
+    size = written_bytes(scenario)
+    if size > _LARGE_BYTES:
+        found.append(
+            f"this run will write about {size / 1e9:.1f} GB of results; fewer slots or record_trials write less"
+        )
+    for module, source in sources_of(scenario.model_dump(mode="json")).items():
+        if scenario.made_with.get(module, source) != source:
+            found.append(f"the {module} is not the one these results were made with; its digests may be others")
+    return found
+
+
+def _filter_warnings(scenario: Scenario) -> list[str]:
+    """What a sensor that filters does to Q, and what a singular Q does to the secret.
+
+    Source: docs/mathematics.md, a filter at the sensor.
+    """
+    found = []
+    process, driven = scenario.process.process, scenario.driven
+    if driven is not None and driven.output_matrix is not None:
+        wanted = settled(process, driven).innovation
+        if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
+            small = process.n <= _SHOWN_STATES
+            found.append(
+                f"process.Q is {process.Q.tolist() if small else 'another'}, but what the sensor's filter adds a slot has the "
+                f"covariance {wanted.tolist() if small else 'of its innovations'}: "
+                f'process.Q = "filter" takes that; inputs and disturbances come to it'
+            )
+    if process.singular_noise and is_singular(process.Q):
+        found.append(
+            "process.Q is singular: two states one after the other differ, but for A and what inputs and disturbances do, "
+            "within its range alone, and that gives the type of packets away to whoever looks"
+        )
+    return found
+
+
+def written_bytes(scenario: Scenario) -> float:
+    """Bytes the results folder will have, about, before compression."""
+    n, receivers = len(scenario.process.A), len(scenario.receivers)
+    recorded_row = 8 * (2 * n + n * n) + 40
+    journal_row = scenario.trials / 8 + 60
+    digest_rows = scenario.trials / 256 * 50
+    return scenario.slots * receivers * (recorded_row * scenario.record_trials + journal_row + digest_rows + 80)

@@ -1,0 +1,150 @@
+"""What theory expects of each receiver of a scenario, as far as theory knows its link."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from evedrop.expected.closed_forms import Closed, ClosedStream, closed_of
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model import modulated
+from evedrop.model.outcomes import GENIE_SCHEMES, eavesdropper_outcomes, legitimate_outcomes
+from evedrop.model.process import Floats, Process
+from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.link_law import LinkLaw, law_of
+from evedrop.model.theory import covariances as theory
+from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt
+from evedrop.scenario import Scenario
+
+
+class Stream(Protocol):
+    """Expected traces, the next slots at a time."""
+
+    def next_traces(self, slots: int) -> Floats:
+        """Of the next slots, (slots,)."""
+
+
+class _Unknown:
+    """Of a receiver that no theory is for. Final."""
+
+    def next_traces(self, slots: int) -> Floats:
+        """Nothing, (slots,)."""
+        return np.full(slots, np.nan)
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """One receiver's expected actual error covariance, by the chain that its link's losses follow."""
+
+    process: Process
+    law: LinkLaw | None
+    """None: theory does not know the link."""
+    outcomes_at: OutcomesAt | None
+    """From the quality of a link to what the receiver does with a slot; None: nobody knows how often it does what."""
+    bound_at: OutcomesAt | None = None
+    """Of a receiver without the secret that has no theory of its own: the genie, which nobody outdoes."""
+    closed: Closed | None = None
+    """Its own closed form, of a receiver whose slots are not alike."""
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a theory for the link and for what the receiver does."""
+        return self.closed is not None or self._known is not None
+
+    @property
+    def _known(self) -> tuple[LinkLaw, OutcomesAt] | None:
+        return None if self.law is None or self.outcomes_at is None else (self.law, self.outcomes_at)
+
+    @property
+    def _outcomes(self) -> Outcomes | None:
+        """Of a link whose losses are independent, as in the paper."""
+        if self._known is None:
+            return None
+        law, outcomes_at = self._known
+        alike = law.alike
+        return None if alike is None else outcomes_at(float(alike.quality[0]))
+
+    @property
+    def bound(self) -> Expectation | None:
+        """What the receiver's error cannot fall below, if that is all that theory knows of it."""
+        if self.known or self.law is None or self.bound_at is None:
+            return None
+        return Expectation(self.process, self.law, self.bound_at)
+
+    def stream(self) -> Stream:
+        """The expected traces from slot 0 on; NaN where there is no theory."""
+        if self.closed is not None:
+            return ClosedStream(self.closed)
+        if self._outcomes is not None:
+            return ExpectedCovariance(self.process, self._outcomes)
+        return _Unknown() if self._known is None else modulated.ModulatedCovariance(self.process, *self._known)
+
+    def traces(self, slots: int) -> Floats:
+        """The expected traces of slots 0 … slots−1, (slots,); NaN where there is no theory."""
+        return self.stream().next_traces(slots)
+
+    @property
+    def limit(self) -> float:
+        """Trace of the limit, behind the link as it is in the end; inf if unbounded, NaN where there is no theory."""
+        if self.closed is not None:
+            return self.closed.limit
+        if self._outcomes is not None:
+            return theory.limit_trace(self.process, self._outcomes)
+        return math.nan if self._known is None else modulated.limit_of(self.process, *self._known)
+
+    @property
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+        if self.bound is not None:
+            return self.bound.infinite_variance
+        if self.closed is not None:
+            return math.isinf(self.closed.limit)
+        if self._known is None:
+            return False
+        if self._outcomes is not None:
+            return theory.has_infinite_variance(self.process, self._outcomes)
+        law, outcomes_at = self._known
+        return theory.has_infinite_variance(self.process, modulated.tail_outcomes(law.last, outcomes_at))
+
+
+def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
+    """From the quality of a receiver's link to what it does with a slot; None: nobody knows how often it does what."""
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    if receiver == LEGITIMATE:
+        return legitimate_outcomes(scheme)
+    table = scenario.eavesdroppers[receiver]
+    return eavesdropper_outcomes(scheme, table.strategy, table.parameters)
+
+
+def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
+    """The same of the genie behind a receiver's link, where it bounds the receiver: against the secret, and without it."""
+    if receiver == LEGITIMATE or receiver in scenario.leaks or scenario.encoding.scheme not in GENIE_SCHEMES:
+        return None
+    return partial(_genie, scenario.encoding.mu_d)
+
+
+def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
+    """Receiver → what theory expects of it."""
+    return {
+        name: Expectation(
+            scenario.process.process,
+            law_of(scenario.course(name)),
+            outcomes_of(scenario, name),
+            bound_of(scenario, name),
+            closed_of(scenario, name),
+        )
+        for name in scenario.receivers
+    }
+
+
+def _genie(mu_d: float, quality: float) -> Outcomes:
+    return Outcomes.genie(quality, mu_d)
+
+
+def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
+    """Receiver → trace of the expected actual error covariance in every slot, (slots,); NaN where there is no theory."""
+    return {name: one.traces(scenario.slots) for name, one in expectations_of(scenario).items()}

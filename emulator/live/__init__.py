@@ -1,0 +1,1 @@
+"""One run over Zenoh: every process a program of its own."""

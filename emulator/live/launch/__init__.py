@@ -1,0 +1,1 @@
+"""The launcher: briefs, child processes, ports, certificates and shards of a live run."""

@@ -1,0 +1,106 @@
+"""The authority of one run: it makes the certificate of every process, and then its own key is forgotten.
+
+Source: docs/protocol.md, certificates.
+"""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+from collections.abc import Sequence
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from evedrop.live.protocol.brief import Identity
+
+_BEFORE = datetime.timedelta(days=1)  # a host whose clock is some hours late or in another zone can take part
+_VALID = datetime.timedelta(days=30)
+
+
+def authority_name(run: str) -> str:
+    """What the authority of a run is called: who cannot believe a certificate sees by it whose it is."""
+    return f"evedrop {run}"
+
+
+class Authority:
+    """Final. Its key is in this object alone; P-256, which every TLS library takes."""
+
+    def __init__(self, run: str, now: datetime.datetime | None = None) -> None:
+        """now: when it begins; default now."""
+        begin = now or datetime.datetime.now(datetime.UTC)
+        self._from, self._until = begin - _BEFORE, begin + _VALID
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self._name = _named(authority_name(run))
+        self._certificate = (
+            self._begun(self._name, self._key.public_key())
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_usage(signs_certificates=True), critical=True)
+            .sign(self._key, hashes.SHA256())
+        )
+
+    def identity(self, process: str, hosts: Sequence[str] = ()) -> Identity:
+        """A process's certificate and key.
+
+        hosts: names and addresses at which it is a router; nobody else's certificate is taken for a router's.
+        """
+        key = ec.generate_private_key(ec.SECP256R1())
+        uses = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * bool(hosts)
+        made = (
+            self._begun(_named(process), key.public_key())
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs_certificates=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False)
+        )
+        if hosts:
+            made = made.add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts]), critical=False)
+        return Identity(
+            authority=_pem(self._certificate),
+            certificate=_pem(made.sign(self._key, hashes.SHA256())),
+            key=key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()).decode(),
+        )
+
+    def _begun(self, subject: x509.Name, key: ec.EllipticCurvePublicKey) -> x509.CertificateBuilder:
+        return (
+            x509.CertificateBuilder()
+            .subject_name(subject)
+            .issuer_name(self._name)
+            .public_key(key)
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(self._from)
+            .not_valid_after(self._until)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        )
+
+
+def _named(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _usage(signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pem(certificate: x509.Certificate) -> str:
+    return certificate.public_bytes(Encoding.PEM).decode()

@@ -1,0 +1,324 @@
+"""From one scenario to the briefs of its processes: who is told what, and who holds which key."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import UsageError
+from evedrop.files import Unreadable, contents
+from evedrop.live.launch.closed_loop_briefs import LoopBriefs
+from evedrop.live.launch.ports import Places, places_at
+from evedrop.live.launch.routers import Routers, identities_of
+from evedrop.live.network.access import (
+    ACKNOWLEDGEMENTS,
+    CONTROLLER,
+    LEGITIMATE,
+    OBSERVER,
+    OPERATOR,
+    RELAY,
+    ROUTER,
+    SENSOR,
+)
+from evedrop.live.protocol.brief import Brief, Flow, Model
+from evedrop.live.protocol.message_limits import Sizes
+from evedrop.model.answers import NoAnswer
+from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.account import COUNTED_BURSTS
+from evedrop.model.slot.link import Course, streams_of
+from evedrop.plugins import named_in
+from evedrop.results.folder import new_folder
+from evedrop.scenario import Scenario
+from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
+from evedrop.score.acknowledging import chart_of, way_back_of
+from evedrop.streams import root_of_seed, stream_key
+
+_WINDOW_BYTES = 64 * 2**20
+_MOST_SLOTS_AHEAD = 1024
+_REPORT_SECONDS = 0.04
+_LAUNCHED_PATIENCE = 30  # seconds
+
+
+@dataclass(frozen=True)
+class StreamKeys:
+    """The keys of all streams of a scenario: those of the seed, and the two of the secret."""
+
+    seed_root: bytes
+    secret_root: bytes
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> StreamKeys:
+        """From the seed; the secret from its own file if the scenario names one. Raises UsageError if it cannot be read."""
+        root = root_of_seed(scenario.seed)
+        if scenario.secret_file is None:
+            return cls(root, stream_key(root, "secret"))
+        try:
+            secret = contents(Path(scenario.secret_file), MOST_SECRET_BYTES)
+        except Unreadable as error:
+            raise UsageError(
+                f"--secret {scenario.secret_file} cannot be read ({error}); give a file of {SECRET_BYTES} or more bytes"
+            ) from error
+        if len(secret) < SECRET_BYTES:
+            raise UsageError(
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more, random ones"
+            )
+        return cls(root, stream_key(secret, "secret"))
+
+    def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
+        """Keys of the shared secret's streams."""
+        return {name: stream_key(self.secret_root, name) for name in names}
+
+    @property
+    def process(self) -> bytes:
+        """Of the sensor's process noise."""
+        return stream_key(self.seed_root, "process")
+
+    def link(self, receiver: str, course: Course) -> dict[str, bytes]:
+        """Of all that a receiver's link draws from."""
+        return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
+
+    def links(self, courses: Mapping[str, Course]) -> dict[str, bytes]:
+        """Of all links."""
+        return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
+
+    @property
+    def measurement(self) -> bytes:
+        """Of the noise of what the sensor measures."""
+        return stream_key(self.seed_root, "measurement")
+
+    @property
+    def way_back(self) -> bytes:
+        """Of the losses of acknowledgements."""
+        return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
+
+    def eavesdropper(self, name: str, strategy: str, parameters: Mapping[str, Any]) -> dict[str, bytes]:
+        """What an eavesdropper's strategy must be given: the schedule's key, its own coin's, or nothing."""
+        keys = {}
+        for stream in STRATEGIES[strategy].streams(parameters):
+            own = stream_key(self.seed_root, f"coin/{name}")
+            keys[stream] = own if stream == "coin" else stream_key(self.secret_root, stream)
+        return keys
+
+
+def flow_of(scenario: Scenario) -> Flow:
+    """A window of some megabytes under way, and reports four times in it; in real time, some tens of milliseconds apart."""
+    receivers = len(scenario.receivers)
+    slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
+    window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
+    batch = max(1, window // 4)
+    if scenario.pace:
+        batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
+    sizes = sizes_of(scenario, batch)
+    return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
+
+
+def sizes_of(scenario: Scenario, batch: int) -> Sizes:
+    """What the sizes of messages follow from, with reports of so many slots."""
+    plant, table = scenario.driven, scenario.controller
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return Sizes(
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        batch,
+        max(scenario.window(name) for name in scenario.receivers),
+        len(scenario.receivers),
+        len(scheme.header),
+        0 if plant is None or table is None else plant.inputs,
+        1 if table is None else table.period,
+    )
+
+
+def history_of(scenario: Scenario) -> int:
+    """How many slots before those that are not done the router must hear of once more, if it was started anew.
+
+    A packet may be under way for its link's window; and bursts of losses, which a slot without a packet ends, are told
+    apart up to a length.
+    """
+    window = max(scenario.window(name) for name in scenario.receivers)
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return max(window, COUNTED_BURSTS) if scheme.may_be_silent else window
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the observer is told besides the scenario."""
+
+    results: Path
+    recording: bool
+    shard: bool = False
+    """Whether the run is a shard of a larger one: it leaves its score to be merged, and is not steered by itself."""
+
+
+def briefs_of(
+    scenario: Scenario,
+    places: Places | str,
+    observation: Observation,
+    ends_with_stdin: bool = True,
+    patience: int = _LAUNCHED_PATIENCE,
+) -> dict[str, Brief]:
+    """Process name → brief, with run name, passwords and, where the router takes them, certificates made afresh.
+
+    places: a text is an endpoint of one router, that is both listened on and connected to. Raises UsageError if they are
+    not as many as the scenario's routers.
+    """
+    run = f"r{secrets.token_hex(4)}"
+    if isinstance(places, str):
+        places = places_at(places)
+    places.check(scenario.relayed)
+    keys = StreamKeys.of(scenario)
+    steered = () if scenario.controller is None else (CONTROLLER,)
+    users = {
+        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
+    }
+    routers = Routers.of(users, places)
+    spec = scenario.encoding.spec
+    scheme = scheme_of(scenario.process.process, spec)
+    public, mu_d = scenario.process, scenario.encoding.mu_d
+    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
+    leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
+    identities = identities_of(run, places, tuple(users))
+    loop, flow = LoopBriefs(scenario), flow_of(scenario)
+    limits = sizes_of(scenario, flow.batch).of_kinds
+
+    def imports(process: str, part: Mapping[str, Any]) -> bool:
+        """Whether a process may need a class that is not built in. Of links, somebody may set another while the run goes on."""
+        own = process != OBSERVER and (process == ROUTER or any(named_in(part)))
+        return own and scenario.modules is not None
+
+    def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
+        return Brief(
+            run=run,
+            process=process,
+            role=role,
+            router=str(places.router.listen if role == "router" else routers.endpoint(process)),
+            user=process,
+            password=routers.password(process),
+            slots=scenario.slots,
+            trials=scenario.trials,
+            first_trial=scenario.first_trial,
+            recorded=scenario.record_trials,
+            flow=flow,
+            model=model,
+            keys={name: key.hex() for name, key in owned.items()},
+            part={**part, "modules": scenario.modules} if imports(process, part) else part,
+            ends_with_stdin=ends_with_stdin,
+            patience=patience,
+            identity=identities.get(process),
+        )
+
+    courses = {name: scenario.course(name) for name in scenario.receivers}
+    links = {name: course.plain() for name, course in courses.items()}
+    link_keys = keys.links(courses)
+    if back is not None:
+        link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.way_back
+    made = [
+        brief(
+            ROUTER,
+            "router",
+            link_keys,
+            {
+                "links": links,
+                "pace": scenario.pace,
+                "users": routers.at_router,
+                "leaks": leaks,
+                "acknowledgements": None if back is None else back._asdict(),
+                "controller": loop.wiring,
+                "zid": routers.zid,
+                "limits": limits,
+            },
+        ),
+        brief(
+            SENSOR,
+            "sensor",
+            {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)},
+            {
+                "scheme": spec,
+                "pace": scenario.pace,
+                "receivers": list(scenario.receivers),
+                "holds": sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
+                "history": history_of(scenario),
+                "leaks": leaks,
+                "chart": None if chart is None else asdict(chart),
+                "plant": loop.plant,
+                "controller": loop.of_sensor,
+            },
+        ),
+        brief(
+            LEGITIMATE,
+            "legitimate",
+            keys.secret(scheme.estimator_streams),
+            {"scheme": spec, **_presence(scenario, LEGITIMATE), "controller": loop.of_legitimate},
+        ),
+        brief(
+            OBSERVER,
+            "observer",
+            {},
+            {
+                "scenario": scenario.model_dump(mode="json"),
+                "results": str(observation.results),
+                "recording": observation.recording,
+                "operator": users[OPERATOR],
+                "shard": observation.shard,
+                "operator_identity": asdict(identities[OPERATOR]) if identities else None,
+                "classes": _answers(scenario),
+            },
+        ),
+    ]
+    if loop.of_controller is not None:
+        made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
+    if places.relay is not None:
+        part = routers.relay_part(scenario.receivers, places.relay)
+        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring, "limits": limits}))
+    for name, table in scenario.eavesdroppers.items():
+        part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
+        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
+    return {one.process: one for one in made}
+
+
+def _answers(scenario: Scenario) -> dict[str, Any]:
+    """What eavesdroppers' classes that are not built in say of themselves: all that the observer will ask."""
+    tables = scenario.eavesdroppers
+    names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
+    foreign = {name for name in names if STRATEGIES.foreign(name)}
+    if foreign:
+        from evedrop.expected.expectations import expectations_of  # noqa: PLC0415 - it is long to import, and seldom needed
+
+        for name, expectation in expectations_of(scenario).items():
+            if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:
+                try:
+                    expectation.traces(scenario.slots)
+                    _ = expectation.limit, expectation.infinite_variance
+                except NoAnswer as error:
+                    raise UsageError(f"eavesdroppers.{name}: its class has no theory of itself ({error})") from error
+    return ANSWERS.of(foreign)
+
+
+def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
+    """What a receiver is told of late packets, and of its own outages alone."""
+    outages = [[one.start, one.stop, one.keeps_state] for one in scenario.timeline.outages[receiver]]
+    return {"window": scenario.window(receiver), "outages": outages}
+
+
+def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path, patience: int) -> list[Path]:
+    """Write the briefs into a folder, for processes that are started by hand, on whichever hosts.
+
+    results: the observer's folder, on its host; relative to where it is started. patience: seconds that everybody waits for
+    the others. Raises UsageError if the folder has something in it or cannot be written, and for a scenario in
+    shards.
+    """
+    if scenario.shards > 1:
+        raise UsageError(
+            f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
+            "itself, with its own --first-trial and --trials"
+        )
+    made = briefs_of(scenario, places, Observation(results, True), ends_with_stdin=False, patience=patience)
+    try:
+        new_folder(folder)
+        return [brief.write(folder) for brief in made.values()]
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

@@ -1,0 +1,335 @@
+"""The processes of a run as the launcher sees them: started, listened to, ended, and asked what went wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from evedrop.environment import lock_step_environment, own_environment
+from evedrop.errors import RunError
+from evedrop.interrupts import INTERRUPTED
+from evedrop.live.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.live.protocol.brief import Brief
+from evedrop.results.folder import private_opener
+from evedrop.results.held_folder import HeldFolder
+from evedrop.signals import held_back
+
+News = Mapping[str, Any]
+GRACE_SECONDS = 3.0  # for everybody to leave
+ROUTER_RESTARTS = 3  # of a router that a signal ended: the run goes on with the new one
+SILENCE_SECONDS = 30.0  # after which an observer that says nothing is given up: its heartbeat is a second
+_BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there is
+_GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
+_LOG_LINES = 12
+_COMPLAINT = "evedrop: "
+_HUBS = frozenset({ROUTER, RELAY, OBSERVER})
+_ROUTER_LOST = "has had no connection with the router"
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_ZENOH_CLOSES = "Received Data for unknown expr_id"
+_REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
+
+
+_SENDERS: Mapping[str, str] = {
+    "uplink": SENSOR,
+    "state": SENSOR,
+    "estimate": LEGITIMATE,
+    "input": CONTROLLER,
+    "journal": ROUTER,
+    "downlink": ROUTER,
+    "control": OBSERVER,
+}
+
+
+def _sender(complaint: str) -> str | None:
+    """The process that sent what a complaint about a message is about (docs/protocol.md, keys)."""
+    found = _REFUSED.search(complaint)
+    if found is None:
+        return None
+    kind, _, name = found[1].partition("/")
+    return _SENDERS.get(kind, name)
+
+
+@dataclass(frozen=True)
+class Exit:
+    """A child ended."""
+
+    process: str
+    status: int
+
+    @property
+    def manner(self) -> str:
+        """As a sentence goes on after the process's name."""
+        if self.status < 0:
+            return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
+        return f"ended with status {self.status}" if self.status else "left before the run ended"
+
+
+class Children:
+    """The processes of a run. Final; on leaving the block all are gone."""
+
+    def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
+        """folder: of the results; lock_step: the processes wait for each other in every slot, or every few."""
+        self._folder = folder
+        self._lock_step = lock_step
+        self._private = private
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._news: SimpleQueue[News | Exit] = SimpleQueue()
+        self.silent_seconds = 0.0
+        """How long the observer has given no sign of life."""
+        self.started = False
+        """Whether the conductor has started the run."""
+        self.over = False
+        """Whether all is done, and everybody told to leave."""
+        self._finishing = False
+        self._restarts = 0
+        self._briefs: dict[str, Brief] = {}
+        self._killed: set[int] = set()
+        """Processes that were ended because the scenario says so."""
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name, process in self._processes.items():
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGCONT)  # one that is paused could not end
+            self.terminate(name, 0.0)
+        deadline = time.monotonic() + GRACE_SECONDS
+        for process in self._processes.values():
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+
+    def start(self, brief: Brief, again: bool = False) -> None:
+        """Start the process of a brief, or start it again. Its output goes to its log, an observer's news to us.
+
+        Raises RunError if the system does not let us.
+        """
+        conducts = brief.role == "observer"
+        self._briefs[brief.process] = brief
+        if brief.part.get("outages"):
+            state_file = str((self._private / f"{brief.process}.state").absolute())
+            brief = replace(brief, part={**brief.part, "state_file": state_file})
+        environment = {
+            **(lock_step_environment(brief.role) if self._lock_step else {}),
+            **own_environment(),
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONUNBUFFERED": "1",
+        }
+        if brief.role in {"router", "relay"}:
+            environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
+        try:
+            path = brief.write(self._private)
+            log_file = self._folder.now / "logs" / f"{brief.process}.log"
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
+                process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", "evedrop", brief.role, str(path)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE if conducts else log,
+                    stderr=log,
+                    start_new_session=True,
+                    env=environment,
+                    umask=0o077,
+                )
+        except OSError as error:
+            raise RunError(
+                f"{brief.process} cannot be started ({error}); free what the system lacks and run again"
+            ) from error
+        self._processes[brief.process] = process
+        threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
+
+    def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
+        if process.stdout is not None:
+            with process.stdout as lines:
+                for line in lines:
+                    with contextlib.suppress(ValueError):
+                        self._news.put(json.loads(line))
+        status = process.wait()
+        if process.pid not in self._killed:
+            self._news.put(Exit(name, status))
+
+    def restart_router(self, ended: Exit) -> bool:
+        """Start a router again if a signal ended it, a few times at most; whether it was started."""
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
+            return False
+        self._restarts += 1
+        self._killed.add(self._processes[ended.process].pid)
+        self.start(self._briefs[ended.process], again=True)
+        return True
+
+    def act(self, request: News) -> None:
+        """Do to a process what the observer asks for, and tell it so.
+
+        Raises RunError if a process cannot be started again.
+        """
+        name, do = str(request["process"]), request["do"]
+        process = self._processes[name]
+        if do == "kill":
+            self._killed.add(process.pid)
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+        elif do == "restart":
+            self.start(replace(self._briefs[name], first=int(request["first"])), again=True)
+        else:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal({"pause": signal.SIGSTOP, "resume": signal.SIGCONT}[str(do)])
+        observer = self._processes[OBSERVER].stdin
+        if observer is not None:
+            with contextlib.suppress(OSError):
+                observer.write(b"%d\n" % request["number"])
+                observer.flush()
+
+    def news(self, seconds: float) -> News | Exit | None:
+        """The next news, or None if there are none for so long."""
+        try:
+            news = self._news.get(timeout=seconds)
+        except Empty:
+            self.silent_seconds += seconds
+            return None
+        if isinstance(news, Exit):
+            return news
+        self.silent_seconds = 0.0
+        if news["event"] in {"started", "back", "reconnected"}:
+            self.started = True
+            self._forget_briefs()
+        if news["event"] == "act":
+            self.act(news)
+            return None
+        self.over = self.over or news["event"] == "over"
+        self._finishing = self._finishing or news["event"] == "finishing"
+        return None if news["event"] in {"alive", "over", "finishing", "back"} else news
+
+    def _forget_briefs(self) -> None:
+        """Everybody has read its own: the keys need not lie on a disk any longer."""
+        for path in self._private.glob("*.json"):
+            path.unlink(missing_ok=True)
+
+    def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
+        """Have the observer end, at once or after so many seconds; its last news if it came to it.
+
+        Once it has begun to finish it may take its time, as long as it says that it lives.
+        """
+        self.terminate(OBSERVER, patience)
+        begun = time.monotonic()
+        ending: News | None = None
+        while self.silent_seconds < SILENCE_SECONDS and (self._finishing or time.monotonic() - begun < _BEGIN_SECONDS):
+            news = self.news(0.05)
+            if isinstance(news, Exit):
+                if news.process == OBSERVER:
+                    break
+            elif news is not None:
+                tell(news)
+                ending = news if news["event"] == "ended" else ending
+        return ending
+
+    def terminate(self, name: str, after: float = 0.0) -> None:
+        """Ask a child to end, unless it ends by itself within so many seconds."""
+        process = self._processes.get(name)
+        if process is None:
+            return
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(after)
+        if process.poll() is None:
+            process.terminate()
+
+    def wait_all(self) -> None:
+        """Let everybody leave in peace, within the grace."""
+        deadline = time.monotonic() + GRACE_SECONDS
+        for process in self._processes.values():
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline - time.monotonic()))
+
+    def story(self, first: Exit | None, ending: News | None) -> str:
+        """What happened: the process at fault, and the last lines of its log and of who complained."""
+        suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
+        why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
+        lost = None if first is None else self._lost_by_all(first.process, suspects)
+        if lost is not None:
+            first, suspects = None, [lost]  # it is at fault, and not the process that gave up first
+        if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
+            first = self._first_failure(suspects) or first
+        if accused and why:
+            named, head = [name for name in accused if name in self._processes], why
+        elif first is not None:
+            named, head = [first.process], f"{first.process} {first.manner}"
+            words = reversed(self._log(first.process))
+            why = next((line for line in words if line.startswith(_COMPLAINT)), "")
+        elif suspects:
+            named, head = suspects, f"{', '.join(suspects)} gave no sign of life any more: hung, stopped or cut off"
+        else:
+            named, head = [], f"the run failed: {why}"
+        at_fault = _sender(why)
+        if at_fault is not None and at_fault in self._processes and (at_fault not in named or accused):
+            named = list(dict.fromkeys([at_fault, *named]))
+            head = f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
+
+    def _first_failure(self, suspects: list[str]) -> Exit | None:
+        """A child that failed, or left too early; never the observer. Who is missed is given a moment to be gone."""
+        deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
+        while True:
+            ended = {
+                name: process.poll()
+                for name, process in self._processes.items()
+                if name != OBSERVER and process.pid not in self._killed
+            }
+            for name, status in ended.items():
+                if status and not ({ROUTER, RELAY} & set(suspects) and self._lost_router(name)):
+                    return Exit(name, status)
+            if suspects and all(ended.get(name) == 0 for name in suspects):
+                return Exit(suspects[0], 0)
+            if time.monotonic() > deadline:
+                return None
+            time.sleep(0.01)
+
+    def _lost_router(self, name: str) -> bool:
+        """Whether a process ended because it could not reach its router any more."""
+        return any(_ROUTER_LOST in line for line in self._log(name))
+
+    def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
+        """The router that a process gave up, if the observer misses it too, or all others that are connected to it; else None."""
+        if not self._lost_router(name):
+            return None
+        if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
+            return missed
+        place = self._briefs[name].router
+        others = [one for one, brief in self._briefs.items() if brief.router == place and one not in _HUBS]
+        deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
+        while time.monotonic() < deadline:
+            if all(self._lost_router(one) for one in others):
+                return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+            time.sleep(0.05)
+        return None
+
+    def _log(self, name: str) -> list[str]:
+        """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""
+        try:
+            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text(errors="replace"))
+        except OSError as error:
+            return [f"(cannot be read: {error.strerror})"]
+        return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]
+
+    def _log_lines(self, name: str) -> list[str]:
+        lines = self._log(name)[-_LOG_LINES:] or ["(it wrote nothing)"]
+        return [f"the last lines of logs/{name}.log:", *(f"    {line}" for line in lines)]

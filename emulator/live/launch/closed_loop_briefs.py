@@ -1,0 +1,76 @@
+"""What a closed loop puts into the briefs: who is told what of plant, inputs and disturbances.
+
+Source: docs/protocol.md, the brief.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from evedrop.live.network.access import Wiring
+from evedrop.scenario import Scenario
+from evedrop.scenario.disturbances import disturbances_of
+
+if TYPE_CHECKING:
+    from evedrop.live.launch.briefs import StreamKeys
+
+
+class LoopBriefs:
+    """The parts of a scenario's briefs; None wherever there is no plant, or no controller. Final."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._plant = None if scenario.driven is None else scenario.driven.spec
+        self._disturbances = b64encode(disturbances_of(scenario).astype("<f8").tobytes()).decode()
+        table = scenario.controller
+        self._wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
+        self._period = 1 if table is None else table.period
+
+    @property
+    def wiring(self) -> dict[str, Any] | None:
+        """How the controller is connected: for the router."""
+        return None if self._wiring is None else asdict(self._wiring)
+
+    @property
+    def plant(self) -> dict[str, Any] | None:
+        """What moves the states: for the sensor."""
+        return None if self._plant is None else {**self._plant, "disturbances": self._disturbances}
+
+    def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
+        """The streams that the sensor owns, those of the secret aside."""
+        driven = self._scenario.driven
+        measures = driven is not None and driven.output_matrix is not None
+        return {"process": keys.process, **({"measurement": keys.measurement} if measures else {})}
+
+    @property
+    def of_sensor(self) -> dict[str, Any] | None:
+        """When it waits for inputs, and whether it says the state."""
+        return None if self._wiring is None else {"period": self._period, "acts_on": self._wiring.acts_on}
+
+    @property
+    def of_legitimate(self) -> dict[str, Any] | None:
+        """When it says its estimate, if it does, and the plant, if it is told the inputs; nothing if neither."""
+        wiring = self._wiring
+        if wiring is None or (wiring.on_truth and not wiring.knows_input):
+            return None
+        return {
+            "period": self._period,
+            "acts_on": wiring.acts_on,
+            "plant": self._plant if wiring.knows_input else None,
+        }
+
+    @property
+    def of_controller(self) -> dict[str, Any] | None:
+        """What it is to do."""
+        assignment, table = self._scenario.assignment, self._scenario.controller
+        if assignment is None or table is None:
+            return None
+        return {
+            "strategy": table.strategy,
+            "assignment": assignment.spec,
+            "acts_on": table.acts_on,
+            "plant": self._plant,
+            "disturbances": self._disturbances,
+        }

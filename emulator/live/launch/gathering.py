@@ -1,0 +1,144 @@
+"""The results folders of a run's shards made one: what the run would have left without shards.
+
+Trials are put side by side and counts added up. Means over all trials are made of the shards' means, so they agree with an
+unsharded run's within rounding; digests, fates, recorded trials and all that is kept by trial are the same to the bit.
+
+Source: docs/results.md, shards.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from evedrop.errors import UsageError
+from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
+from evedrop.live.launch.shard_score import left
+from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
+from evedrop.results.folder import make_private
+from evedrop.results.growing_tables import parquet_or_stream
+from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_summary
+from evedrop.scenario import Scenario
+from evedrop.score.expectations_held import replay_of
+from evedrop.score.scorekeeper import Ending, summary_of, write_resolved
+from evedrop.score.totals import Totals
+
+if TYPE_CHECKING:
+    from evedrop.live.launch.shards import Shard
+
+_RECORDING = "recording.rrd"
+
+
+def gather(
+    scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str
+) -> Mapping[str, Any]:
+    """Fill a run's folder from those of its shards, which are removed then; the run's summary.
+
+    started: when the first shard began, by the monotonic clock, if one did; how: as in `Ending`. Raises OSError if the folder
+    cannot be written, with the shards' own as they are.
+    """
+    write_resolved(folder, scenario)
+    with ResultsWriter.of(folder, scenario) as writer:
+        digests = {name: _digest(scenario, name, shards, writer) for name in scenario.digested}
+    for name, gathered in _tables(scenario, shards).items():
+        gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
+    wall = 0.0 if started is None else time.monotonic() - started
+    totals = Totals.merged([left(shard.folder, shard.scenario) for shard in shards])
+    replay = replay_of(folder, scenario)
+    ending = Ending(
+        wall, how, replay, events=_events(shards), outages=_outages(shards), misdelivered=_misdelivered(shards)
+    )
+    summary = summary_of(scenario, totals, digests, ending)
+    write_summary(folder, summary)
+    _tidy(folder, shards)
+    return summary
+
+
+def _tables(scenario: Scenario, shards: Sequence[Shard]) -> dict[str, Gathered]:
+    """How the tables are made one, by name."""
+    n, receivers, first = len(scenario.process.A), scenario.receivers, scenario.first_trial
+    recorded = range(first, first + scenario.record_trials)
+    tables: dict[str, Gathered] = {
+        "slots": Statistics(receivers),
+        "trials": Recorded(receivers, recorded, 6 + 2 * n + n * n),
+        "journal": Journals(receivers, [shard.scenario.trials for shard in shards]),
+    }
+    if scenario.controller is not None and scenario.plant is not None:
+        plant = scenario.plant
+        tables["inputs"] = Recorded((), recorded, 4 + len(plant.inputs) + len(plant.disturbances))
+    return tables
+
+
+def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: ResultsWriter) -> str | None:
+    """Write the digests of one who makes them, and make that of the run of them; None if some blocks are missing."""
+    blocks = [_blocks(shard, name) for shard in shards]
+    for block in sorted(set(chain.from_iterable(blocks))):
+        for shard, own in zip(shards, blocks, strict=True):
+            if block in own:
+                writer.digest_rows(shard.trials.start, {name: {block: own[block]}})
+    digest = RunDigest()
+    for own in blocks:
+        if sorted(own) != block_starts(scenario.slots, scenario.cuts(name)):
+            return None
+        digest.add(own)
+    return digest.hexadecimal
+
+
+def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
+    """Block → digests of the shard's trials, (R, 32), of one peer."""
+    batches = parquet_or_stream(shard.folder, "digests")
+    table = pa.Table.from_batches(batches, DIGESTS).filter(pc.field("peer") == name)
+    starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())
+    digests = np.frombuffer(values, np.uint8).reshape(-1, DIGEST_BYTES)
+    return {int(start): digests[starts == start] for start in np.unique(starts)}
+
+
+def _events(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
+    """All that happened in any shard: each once, in order of slots."""
+    found: list[Mapping[str, Any]] = []
+    for _, summary in _summaries(shards):
+        found += [one for one in summary["events"] if one not in found]
+    return sorted(found, key=lambda one: int(one["slot"]))
+
+
+def _outages(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
+    """Who was cut off in any shard, and in which, in order of slots."""
+    found = [{"shard": shard.number, **one} for shard, summary in _summaries(shards) for one in summary["outages"]]
+    return sorted(found, key=lambda one: int(one["slot"]))
+
+
+def _misdelivered(shards: Sequence[Shard]) -> dict[str, int]:
+    """Process → messages that it dropped, in all shards together."""
+    found: dict[str, int] = {}
+    for _, summary in _summaries(shards):
+        for name, count in summary["misdelivered"].items():
+            found[name] = found.get(name, 0) + int(count)
+    return found
+
+
+def _summaries(shards: Sequence[Shard]) -> Iterator[tuple[Shard, Mapping[str, Any]]]:
+    """Of those that have left one."""
+    for shard in shards:
+        with suppress(UsageError):
+            yield shard, load_results(shard.folder).summary
+
+
+def _tidy(folder: Path, shards: Sequence[Shard]) -> None:
+    """Keep the logs of the shards, and the recording of the first; the rest is in the run's own tables."""
+    for shard in shards:
+        make_private(folder / "logs")
+        with suppress(FileNotFoundError):
+            os.replace(shard.folder / "logs", folder / "logs" / shard.name)
+    with suppress(FileNotFoundError):
+        os.replace(shards[0].folder / _RECORDING, folder / _RECORDING)
+    shutil.rmtree(shards[0].folder.parent)

@@ -1,0 +1,48 @@
+"""The launcher: runs a scenario in one set of processes, or in one for each of its shards.
+
+It imports neither zenoh nor rerun, and it alone decides how the run ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.live.launch.children import News
+from evedrop.live.launch.ports import loopback_places
+from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.scenario import Scenario
+from evedrop.signals import stop_on_signals
+from evedrop.view.viewer import choose
+
+
+def launch(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Callable[[News], None],
+    relay: str | None = None,
+) -> Ended:
+    """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
+
+    listen, relay: the endpoints of router and, if there is one, relay; free ports by default.
+
+    Raises UsageError before anything is started, RunError when the run failed, Interrupted on Ctrl-C or SIGTERM; in the
+    last two cases what was measured is in the folder and no process is left.
+    """
+    view = choose(view)
+    with stop_on_signals() as stop:
+        if scenario.shards == 1:
+            return launch_one(scenario, folder, view, loopback_places(listen, relay, scenario.relayed), tell, stop)
+        from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - a run in one set of processes does without
+
+        given = {"--listen": listen, "--relay": relay}
+        for option, endpoint in given.items():
+            if endpoint is not None:
+                raise UsageError(
+                    f"{option} {endpoint} is one router's endpoint, and each of the {scenario.shards} shards has its own; "
+                    "leave it out, or give --set shards=1"
+                )
+        return launch_shards(scenario, folder, view, tell, stop)

@@ -1,0 +1,164 @@
+"""Where the routers of a run may listen: a free port on loopback, or what was asked for, if that is safe and can be had."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from dataclasses import dataclass
+
+from evedrop.errors import UsageError
+from evedrop.live.network.endpoint import Endpoint
+
+_EXAMPLE = "give one such as tls/router.lan:7447"
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Where the router listens, and what the others connect to."""
+
+    listen: Endpoint
+    connect: Endpoint
+
+    @property
+    def secure(self) -> bool:
+        """Whether it takes certificates."""
+        return self.listen.secure
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The hosts that the router is known by."""
+        found = (self.connect.host, *(() if self.listen.everywhere else (self.listen.host,)))
+        return tuple(dict.fromkeys(found))
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where everybody meets."""
+
+    router: Meeting
+    relay: Meeting | None = None
+    """Of a run with two routers: where all but the sensor are."""
+
+    @property
+    def far(self) -> Meeting:
+        """Where all but the sensor connect to."""
+        return self.relay or self.router
+
+    def check(self, relayed: bool) -> None:
+        """Raise UsageError unless there is a place for as many routers as a scenario has."""
+        if relayed and self.relay is None:
+            raise UsageError(
+                "the scenario has two routers; add --relay ENDPOINT with the place where the second one listens"
+            )
+        if self.relay is not None and not relayed:
+            raise UsageError("--relay: the scenario has one router; leave it out, or add --set network.routers=2")
+        if self.relay is not None and self.relay.secure != self.router.secure:
+            raise UsageError("--relay: both routers take certificates or none does; give both as tls/HOST:PORT")
+        if self.relay is not None and str(self.relay.connect) == str(self.router.connect):
+            raise UsageError(f"--relay {self.relay.connect} is where the first router is; give another port")
+
+
+def free_port() -> int:
+    """A free TCP port on loopback, below those that the system hands out for outgoing connections."""
+    for _ in range(200):
+        port = 10_000 + secrets.randbelow(22_000)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise UsageError("no free port between 10000 and 32000 on loopback; end some programs, or give --listen")
+
+
+def places_at(
+    listen: str,
+    connect: str | None = None,
+    relay: str | None = None,
+    relay_connect: str | None = None,
+    insecure: bool = False,
+) -> Places:
+    """The places that the options of `evedrop brief` name, on whichever hosts. Raises UsageError if they are none."""
+    second = None
+    if relay is not None:
+        second = meeting_at(relay, relay_connect, insecure, ("--relay", "--relay-connect"))
+    elif relay_connect is not None:
+        raise UsageError("--relay-connect is of a second router; add --relay ENDPOINT with the place where it listens")
+    return Places(meeting_at(listen, connect, insecure), second)
+
+
+def meeting_at(
+    listen: str,
+    connect: str | None = None,
+    insecure: bool = False,
+    options: tuple[str, str] = ("--listen", "--connect"),
+) -> Meeting:
+    """The meeting that two options name, on whichever host.
+
+    insecure: whether the user said that it may be in clear although others can get at it. Raises UsageError if it is no
+    place to meet at.
+    """
+    listening, connecting = options
+    here = _endpoint(listening, listen)
+    there = here if connect is None else _endpoint(connecting, connect)
+    if there.everywhere:
+        asked = listening if connect is None else connecting
+        raise UsageError(
+            f"{asked} {there} is every address of a host, and none to connect to; add {connecting} {there.protocol}/HOST:"
+            f"{there.port} with the name or address that the others reach it by"
+        )
+    if here.protocol != there.protocol:
+        raise UsageError(f"{connecting} {there} is not what {listening} {here} speaks; give both as tls/HOST:PORT")
+    if there.secure and there.address is not None and there.address.version == 6:
+        raise UsageError(
+            f"{connecting} {there}: no certificate can be checked against an address of IPv6; give the host's name"
+        )
+    if not here.secure and not insecure and not here.loopback:
+        raise UsageError(
+            f"{listening} {here} is in clear, and others than this machine can get at it: they would read everything, and "
+            f"could pose as the router; give tls/{str(here).partition('/')[2]}, or add --insecure"
+        )
+    return Meeting(here, there)
+
+
+def _endpoint(option: str, text: str) -> Endpoint:
+    try:
+        return Endpoint.of(text)
+    except ValueError as error:
+        raise UsageError(f"{option} {error}; {_EXAMPLE}") from error
+
+
+def loopback_places(listen: str | None, relay: str | None = None, relayed: bool = False) -> Places:
+    """The places of a run whose processes are all here: what was asked for, or free ports.
+
+    Two routers take certificates unless they are asked not to: without, a router is told from others by what is no secret.
+    Raises UsageError unless they can be listened on, on loopback.
+    """
+    asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls" if relayed else "tcp")
+    router = _loopback_meeting(listen, "--listen", asked)
+    second = _loopback_meeting(relay, "--relay", asked) if relayed or relay is not None else None
+    while relay is None and second is not None and second.listen.port == router.listen.port:
+        second = _loopback_meeting(None, "--relay", asked)
+    places = Places(router, second)
+    places.check(relayed)
+    return places
+
+
+def _loopback_meeting(listen: str | None, option: str, protocol: str) -> Meeting:
+    if listen is None:
+        return meeting_at(f"{protocol}/127.0.0.1:{free_port()}")
+    try:
+        endpoint = Endpoint.of(listen)
+    except ValueError as error:
+        raise UsageError(f"{option} {error}; give one such as tcp/127.0.0.1:17460") from error
+    if not endpoint.loopback:
+        raise UsageError(
+            f"{option} {listen} is no loopback endpoint; give one such as tcp/127.0.0.1:17460, or start the processes by "
+            "hand: evedrop brief"
+        )
+    meeting = meeting_at(listen)
+    try:
+        endpoint.try_to_listen()
+    except OSError as error:
+        raise UsageError(f"{option} {listen}: {error.strerror}; leave it out, and a free port is found") from error
+    return meeting

@@ -1,0 +1,188 @@
+"""One set of processes launched, watched to its end, and ended whatever happens.
+
+Children have sessions of their own, so a Ctrl-C reaches the launcher only; each holds the other end of a pipe, so none outlives
+even a killed launcher.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
+from evedrop.interrupts import INTERRUPTED
+from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit, News
+from evedrop.live.launch.ports import Places
+from evedrop.live.launch.private_folder import private_folder
+from evedrop.live.network.access import OBSERVER
+from evedrop.live.network.control_file import remove_control
+from evedrop.results.folder import make_private, new_folder
+from evedrop.results.held_folder import HeldFolder
+from evedrop.scenario import Scenario
+from evedrop.view.viewer import Viewer
+
+_LOOK_SECONDS = 0.1  # how soon a signal is noticed
+_EARLY_SECONDS = 1.0
+_AFTERTHOUGHT_SECONDS = (
+    0.5  # a signal that ended a child may be about to reach us: a terminal that closes hangs up on all
+)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended."""
+
+    status: int
+    """Its exit status."""
+    viewer: Viewer | None
+    """The viewer, if one is still open."""
+    folder: Path
+    """Where its results are: the folder may have been renamed."""
+
+
+def launch_one(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    places: Places,
+    tell: Callable[[News], None],
+    stop: threading.Event,
+    shard: bool = False,
+) -> Ended:
+    """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
+
+    shard: whether others carry further trials.
+    """
+    with private_folder() as private, contextlib.closing(HeldFolder(new_folder(folder))) as held:
+        make_private(folder / "logs")
+        viewer = None
+        try:
+            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", shard))
+            observer = briefs.pop(OBSERVER)
+            with Children(held, private, scenario.controller is not None) as children:
+                for brief in briefs.values():
+                    children.start(brief)
+                # The others find their feet while the viewer does.
+                viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
+                if viewer is not None:
+                    tell({"event": "view", "address": viewer.address, "warning": viewer.warning})
+                children.start(observer)
+                status = _supervise(children, stop, tell)
+                if viewer is not None:
+                    viewer.complete()
+        except BaseException as error:
+            if viewer is not None:
+                viewer.stop()
+            if isinstance(error, UsageError):
+                _forget(folder)
+            elif isinstance(error, EvedropError):
+                with contextlib.suppress(OSError):
+                    _note(held.now, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
+            raise
+        finally:
+            now = _now(held, tell)
+    return Ended(status, viewer, now)
+
+
+def _now(held: HeldFolder, tell: Callable[[News], None]) -> Path:
+    """Where the results folder is when the run is over; a folder that was renamed or removed is told of."""
+    try:
+        now = held.now
+    except FileNotFoundError:
+        return held.first
+    remove_control(now)
+    if now != held.first:
+        tell({"event": "moved", "folder": str(now)})
+    return now
+
+
+def _forget(folder: Path) -> None:
+    """Leave no folder of a run that was not started, so that the next one can have it."""
+    with contextlib.suppress(OSError):
+        for log in (folder / "logs").iterdir():
+            log.unlink()
+        (folder / "logs").rmdir()
+        folder.rmdir()
+
+
+def _note(folder: Path, scenario: Scenario, how: str) -> None:
+    """Write how the run ended into its summary, and finish the tables that the observer could not finish itself.
+
+    Raises OSError if the folder cannot be written.
+    """
+    # Tables and theory take longer to import than all else here, and a run that ends well needs neither.
+    from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished  # noqa: PLC0415
+    from evedrop.results.writer import ResultsWriter, load_results, write_summary  # noqa: PLC0415
+    from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
+    from evedrop.score.totals import Totals  # noqa: PLC0415
+
+    left_behind = is_unfinished(folder)
+    try:
+        summary = {**load_results(folder).summary, "ended": how}
+    except UsageError:
+        totals = Totals.nothing(scenario, scenario.trials)
+        summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        if not any(folder.glob("*.parquet")):
+            with ResultsWriter.of(folder, scenario):
+                pass
+    else:
+        if left_behind:
+            # Its end is missing, and `evedrop view` makes another one from the tables.
+            (folder / "recording.rrd").unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # of a full disk: the streams stay, and can be read
+                finish(folder)
+    write_summary(folder, summary)
+
+
+def _supervise(children: Children, stop: threading.Event, tell: Callable[[News], None]) -> int:
+    """Follow the run to its end; the exit status that the observer gives it."""
+    early: tuple[Exit, float] | None = None
+    while True:
+        if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
+            raise RunError(children.story(early[0], children.conclude(tell)))
+        if stop.is_set():
+            children.conclude(tell)
+            raise Interrupted("interrupted; what was measured is in the results folder")
+        if children.silent_seconds > SILENCE_SECONDS:
+            raise RunError(children.story(None, {"suspects": [OBSERVER]}))
+        news = children.news(_LOOK_SECONDS)
+        ending: News | None = None
+        if isinstance(news, Exit):
+            if _meant_us_too(news, stop) or (
+                news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
+            ):
+                # Who leaves at the end may be faster than the word that it is the end.
+                early = early or ((news, time.monotonic()) if news.status == 0 else None)
+                continue
+            if news.process != OBSERVER:
+                # An observer that has just ended may still say so; one that goes on would wait for who will not come back.
+                ending = children.conclude(tell)
+            if ending is None or not _ended_well(ending):
+                raise RunError(children.story(news, ending))
+        elif news is not None:
+            tell(news)
+            ending = news if news["event"] == "ended" else None
+        if ending is not None:
+            break
+    if ending["status"] == Interrupted.exit_status:
+        raise Interrupted("interrupted; what was measured is in the results folder")
+    if not _ended_well(ending):
+        raise RunError(children.story(None, ending))
+    children.wait_all()
+    return int(ending["status"])
+
+
+def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
+    """Whether the signal that ended a child reaches us within a moment: a terminal that closes hangs up on everybody."""
+    return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)
+
+
+def _ended_well(ending: News) -> bool:
+    return ending["status"] in {0, 1}

@@ -1,0 +1,232 @@
+"""A live run in shards: its trials in contiguous ranges, each carried by a run of its own, all under one launcher.
+
+Trials have nothing in common but the scenario, and every random number is addressed by its trial. So a shard is a whole run,
+with router, sensor, receivers and observer, that knows of no other. What they leave is made one in `gathering`.
+
+Source: docs/scale.md.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.children import News
+from evedrop.live.launch.ports import Places, loopback_places
+from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.results.folder import new_folder
+from evedrop.results.held_folder import HeldFolder
+from evedrop.scenario import Scenario
+from evedrop.view.viewer import Viewer
+
+_FOLDER = "shards"  # in the results folder, until they are made one
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A range of the trials of a run."""
+
+    number: int
+    """From 1 on, in the order of trials."""
+    scenario: Scenario
+    """That of the run, of these trials alone."""
+    folder: Path
+    """Its own results."""
+
+    @property
+    def name(self) -> str:
+        """Where its logs are, among those of the run."""
+        return f"shard-{self.number}"
+
+    @property
+    def trials(self) -> range:
+        """By their numbers in the scenario."""
+        first = self.scenario.first_trial
+        return range(first, first + self.scenario.trials)
+
+    def of_run(self, said: object) -> str:
+        """What it says of itself, as it is for the run: who, and where the logs will be."""
+        trials = self.trials
+        which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
+        return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(said))
+
+
+def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:
+    """The shards of a run into a results folder, as equal as can be; who has no recorded trial records its first all the same."""
+    trials, recorded, count = scenario.trials, scenario.record_trials, scenario.shards
+    bounds = [trials * i // count for i in range(count + 1)]
+    tables = scenario.model_dump(mode="json")
+    made = []
+    for number, start in enumerate(bounds[:-1], 1):
+        own = {
+            "trials": bounds[number] - start,
+            "first_trial": scenario.first_trial + start,
+            "record_trials": max(1, min(recorded - start, bounds[number] - start)),
+            "shards": 1,
+        }
+        made.append(Shard(number, Scenario.model_validate({**tables, **own}), folder / _FOLDER / str(number)))
+    return made
+
+
+class OneProgress:
+    """The news of all shards as those of one run: as far as the slowest. Final; may be told from any thread."""
+
+    def __init__(self, shards: Sequence[Shard], tell: Callable[[News], None]) -> None:
+        self._trials = {shard.number: shard.scenario.trials for shard in shards}
+        self._slots = shards[0].scenario.slots
+        self._tell = tell
+        self._lock = threading.Lock()
+        self._latest: dict[int, News] = {}
+        self._waited_for = set(self._trials)
+        self.started: float | None = None
+        """When the first of them began, by the monotonic clock."""
+
+    def of(self, shard: Shard) -> Callable[[News], None]:
+        """What is to be told of one shard."""
+
+        def tell(news: News) -> None:
+            with self._lock:
+                self._take(shard.number, news)
+
+        return tell
+
+    def _take(self, number: int, news: News) -> None:
+        kind = news["event"]
+        if kind == "started":
+            self.started = time.monotonic() if self.started is None else self.started
+            self._waited_for.discard(number)
+            if not self._waited_for:
+                self._tell(news)
+        elif kind == "progress":
+            self._latest[number] = news
+            if len(self._latest) == len(self._trials):
+                self._tell(self._all())
+        elif kind != "moved":  # with the folder of all, which is told of itself
+            if kind == "ended" and number in self._latest:  # its last slots were too few to be told of
+                self._latest[number] = {**self._latest[number], "done": self._slots}
+            self._tell({**news, "shard": number} if kind == "reconnected" else news)
+
+    def _all(self) -> dict[str, Any]:
+        """The slowest one's place and rate, and errors over all trials."""
+        slowest = min(self._latest.values(), key=lambda news: int(news["done"]))
+        total = sum(self._trials.values())
+        errors = {
+            name: sum(self._trials[number] * one["squared_errors"][name] for number, one in self._latest.items())
+            / total
+            for name in slowest["squared_errors"]
+        }
+        return {**slowest, "squared_errors": errors}
+
+
+@dataclass
+class _Course:
+    """What has become of the shards so far. Final."""
+
+    failures: list[tuple[Shard, BaseException]] = field(default_factory=list)
+    """In the order of time."""
+    viewer: Viewer | None = None
+
+    def launched(
+        self, shard: Shard, at: Places, tell: Callable[[News], None], view: str, stop: threading.Event
+    ) -> None:
+        """Launch one, its routers at places, to its end; whatever ends it early ends all."""
+        try:
+            ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, shard=True)
+        except BaseException as error:
+            self.failures.append((shard, error))
+            stop.set()
+        else:
+            self.viewer = self.viewer or ended.viewer
+
+    @property
+    def fault(self) -> tuple[Shard, BaseException] | None:
+        """The first that failed; the others were interrupted because of it. None if all ended well, or by the user."""
+        found = (one for one in self.failures if not isinstance(one[1], Interrupted))
+        return next(found, None)
+
+
+def launch_shards(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    tell: Callable[[News], None],
+    stop: threading.Event,
+) -> Ended:
+    """Run a scenario in its shards, all at once, into one results folder; raises as `launch` does.
+
+    The view is of the first shard, which has the recorded trials.
+    """
+    places = _places(scenario)
+    held = HeldFolder(new_folder(folder))
+    shards = shards_of(scenario, folder)
+    progress, course = OneProgress(shards, tell), _Course()
+    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, places, strict=True)]
+    threads = [threading.Thread(target=course.launched, args=(*one, "off", stop)) for one in others]
+    for thread in threads:
+        thread.start()
+    # Here, not on a thread: a viewer ends with the thread that has started it.
+    course.launched(*first, view, stop)
+    for thread in threads:
+        thread.join()
+    try:
+        now = held.now
+        if now != folder:
+            tell({"event": "moved", "folder": str(now)})
+            shards = [replace(shard, folder=now / _FOLDER / str(shard.number)) for shard in shards]
+        return Ended(_made_one(scenario, now, shards, course, progress.started), course.viewer, now)
+    except BaseException as error:
+        if course.viewer is not None:
+            course.viewer.stop()
+        if isinstance(error, FileNotFoundError):
+            raise RunError(
+                f"{folder} was removed while the run went on; run again, and leave it where it is"
+            ) from error
+        raise
+    finally:
+        held.close()
+
+
+def _places(scenario: Scenario) -> list[Places]:
+    """Places for all shards; of ports that are found one by one, two might be the same while nobody listens yet."""
+    found: list[Places] = []
+    taken = set[int]()
+    while len(found) < scenario.shards:
+        places = loopback_places(None, None, scenario.relayed)
+        ports = {meeting.listen.port for meeting in (places.router, places.relay) if meeting is not None}
+        if not ports & taken:
+            found.append(places)
+            taken |= ports
+    return found
+
+
+def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course: _Course, started: float | None) -> int:
+    """Make the shards' results those of the run; its exit status. Raises what ended it, if anything did."""
+    from evedrop.live.launch.gathering import gather  # noqa: PLC0415 - tables take long to import, and the run can start before
+
+    fault, how = course.fault, "interrupted" if course.failures else "complete"
+    if fault is not None:
+        shard, error = fault
+        if isinstance(error, UsageError):
+            shutil.rmtree(folder)  # nothing that could be used was started
+        if not isinstance(error, RunError):
+            raise error
+        how = shard.of_run(error)
+    try:
+        summary = gather(scenario, folder, shards, started, how)
+    except OSError as error:
+        raise RunError(
+            f"the results of the shards cannot be made one ({error}); those of each are in {folder / _FOLDER}; free some "
+            "room, and run again"
+        ) from error
+    if fault is not None:
+        raise RunError(how)
+    if course.failures:
+        raise course.failures[0][1]
+    return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0

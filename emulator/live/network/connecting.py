@@ -1,0 +1,219 @@
+"""How a process gets to the router: it waits for one that is not there yet, and says at once what no waiting mends.
+
+Zenoh alone cannot tell these apart: whatever is wrong, it says after its time limit that it could not connect.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import ssl
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, final
+
+import zenoh
+
+from evedrop.errors import BriefError, RunError
+from evedrop.live.network.endpoint import Endpoint
+from evedrop.live.protocol.brief import Identity
+
+WAITING_SECONDS = 3.0
+"""After which a process says that it still waits for its router, and again after each so many."""
+_AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
+_ATTEMPT_SECONDS = 3.0
+_UNKNOWN_HOST_SECONDS = 2.5  # a host that is just coming up may not be named yet
+_REFUSALS, _REFUSED_SECONDS = 4, 1.5  # a router that is just coming up may hang up once
+_QUICK_SECONDS = 2.0  # a refusal comes at once; what takes longer is a machine that is busy
+
+_NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of OpenSSL's X509_V_ERR
+
+
+@dataclass(frozen=True)
+class Door:
+    """Where to, with what, and whose."""
+
+    router: str
+    """Zenoh endpoint."""
+    run: str
+    config: dict[str, Any]
+    """Zenoh's; one attempt."""
+    identity: Identity | None = None
+    process: str = "operator"
+    """Who asks to be let in."""
+
+
+@final
+class Waiting:
+    """Says every few seconds on standard error that a process waits for its router."""
+
+    def __init__(self, process: str, router: str) -> None:
+        self._process, self._router = process, router
+        self.begin()
+
+    def begin(self, again: bool = False) -> None:
+        """The waiting begins now. again: because a connection was lost."""
+        self._began = self._said = time.monotonic()
+        self._what = "lost the connection; waiting again" if again else "waiting"
+
+    def look(self, why: object) -> None:
+        """Say that it goes on, if it is time to; why: what came of the last attempt."""
+        now = time.monotonic()
+        if now - self._said >= WAITING_SECONDS:
+            self._said = now
+            sys.stderr.write(
+                f"evedrop: {self._process}: {self._what} for the router at {self._router}: no answer yet "
+                f"({now - self._began:.0f} s; {why})\n"
+            )
+            sys.stderr.flush()
+
+    def attempt(self, connect: Callable[[], zenoh.Session]) -> zenoh.Session:
+        """What `connect` returns; where that raises, the waiting goes on."""
+        try:
+            return connect()
+        except (OSError, zenoh.ZError) as error:
+            self.look(_reason(error) if isinstance(error, OSError) else "Zenoh could not connect")
+            raise
+
+
+def _reason(error: OSError | zenoh.ZError) -> object:
+    return (error.strerror or error) if isinstance(error, OSError) else "it did not answer as one"
+
+
+def connected(door: Door, patience: float, meanwhile: Callable[[], None] = lambda: None) -> zenoh.Session:
+    """A session with the router; `meanwhile` is called again and again until there is one.
+
+    Raises BriefError for what no waiting mends, RunError if no router has answered after so many seconds.
+    """
+    endpoint = endpoint_of(door.router, door.identity)
+    began = time.monotonic()
+    failures, waiting = Failures(), Waiting(door.process, door.router)
+    pause, longest = _AGAIN_SECONDS
+    while True:
+        meanwhile()
+        tried = time.monotonic()
+        try:
+            _knock(endpoint, door)
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(door.config)))
+        except (OSError, zenoh.ZError) as error:
+            failures.add(error, time.monotonic() - tried)
+            why = _reason(error)
+            if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS:
+                raise BriefError(
+                    f"the router's host {endpoint.host} is not known here ({why}); write it into /etc/hosts, or write the "
+                    "briefs again with --connect and a name or address that this host knows"
+                ) from error
+            if failures.refused:
+                raise BriefError(
+                    f"{door.router} does not let this brief in, which is of run {door.run}: the router there is of another run, "
+                    "or something else listens there; start the router of this run, or give the brief of that one"
+                ) from error
+            if time.monotonic() - began > patience:
+                raise RunError(
+                    f"no router answered at {door.router} within {patience:.0f} s ({why}); start it there, and see that no "
+                    "firewall is between"
+                ) from error
+            waiting.look(why)
+        time.sleep(pause)
+        pause = min(longest, pause * 1.5)
+
+
+class Failures:
+    """What came of the attempts so far. Final."""
+
+    def __init__(self) -> None:
+        self._unknown: float | None = None
+        self._refused: float | None = None
+        self._refusals = 0
+
+    def add(self, error: Exception, seconds: float) -> None:
+        """Take an attempt that failed after so many seconds."""
+        now = time.monotonic()
+        unknown = isinstance(error, socket.gaierror)
+        self._unknown = (self._unknown or now) if unknown else None
+        # Whoever listens and hangs up does not want us; one that is slow, or not there, may still come.
+        hung_up = isinstance(error, zenoh.ZError | ssl.SSLError | ConnectionResetError | BrokenPipeError)
+        if hung_up and seconds < _QUICK_SECONDS:
+            self._refused, self._refusals = self._refused or now, self._refusals + 1
+        elif not hung_up:
+            self._refused, self._refusals = None, 0
+
+    @property
+    def unknown_seconds(self) -> float:
+        """For how long the host has not been known."""
+        return 0.0 if self._unknown is None else time.monotonic() - self._unknown
+
+    @property
+    def refused(self) -> bool:
+        """Whether it is certain that we are not wanted."""
+        return (
+            self._refused is not None
+            and self._refusals >= _REFUSALS
+            and time.monotonic() - self._refused > _REFUSED_SECONDS
+        )
+
+
+def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
+    """Where a brief says the router is. Raises BriefError if that is nowhere, or needs what the brief does not have."""
+    try:
+        endpoint = Endpoint.of(router)
+    except ValueError as error:
+        raise BriefError(f"router: {error}; write the briefs again with `evedrop brief`") from error
+    if endpoint.secure != (identity is not None):
+        lack = "and there is no identity" if endpoint.secure else "which takes no identity"
+        raise BriefError(f"router: is {router}, {lack}; write the briefs again with `evedrop brief`")
+    return endpoint
+
+
+def _knock(endpoint: Endpoint, door: Door) -> None:
+    """See whether something listens there and, by its certificate, is the router of this run.
+
+    Raises OSError if nothing does, BriefError if the certificate is not to be believed.
+    """
+    try:
+        with socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS) as link:
+            if door.identity is not None:
+                trust = ssl.create_default_context(cadata=door.identity.authority)
+                # The router shows its certificate first, and nothing more is asked of it here.
+                trust.wrap_socket(link, server_hostname=endpoint.host).close()
+    except ssl.SSLCertVerificationError as error:
+        raise _mistrusted(endpoint, door, error) from error
+
+
+def _mistrusted(endpoint: Endpoint, door: Door, error: ssl.SSLCertVerificationError) -> BriefError:
+    """Why the certificate that is shown at an endpoint cannot be believed."""
+    if error.verify_code in {_NOT_YET_VALID, _EXPIRED}:
+        return BriefError(
+            f"{door.router}: the router's certificate is not valid now by this host's clock ({error.verify_message}); set the "
+            "clock, or write the briefs again with `evedrop brief`, all of them"
+        )
+    maker = _maker_at(endpoint)
+    if error.verify_code == _WRONG_HOST:
+        return BriefError(
+            f"{door.router}: the router's certificate does not name {endpoint.host}; write the briefs again with "
+            f"--connect tls/{endpoint.host}:{endpoint.port}, all of them"
+        )
+    whose = f"has a certificate of {maker}, and this brief is of run {door.run}"
+    if error.verify_code == _WRONG_PURPOSE:
+        whose = f"has the certificate of another process of {maker}, and is no router"
+    return BriefError(
+        f"{door.router}: what listens there {whose}; start the router of this run there, or give the brief of that one"
+    )
+
+
+def _maker_at(endpoint: Endpoint) -> str:
+    """Who is said to have made the certificate that is shown at an endpoint."""
+    from evedrop.live.network.certificates import maker_of  # noqa: PLC0415 - 50 ms that only a failure needs
+
+    anybody = ssl.create_default_context()
+    anybody.check_hostname, anybody.verify_mode = False, ssl.CERT_NONE
+    try:
+        with (
+            socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS) as link,
+            anybody.wrap_socket(link, server_hostname=endpoint.host) as shown,
+        ):
+            return maker_of(shown.getpeercert(binary_form=True) or b"")
+    except (OSError, ValueError):
+        return "somebody else"

@@ -1,0 +1,80 @@
+"""How the user who started a run gets at it while it goes on: `control.json` in its results folder, mode 0600.
+
+It is written when the run starts and removed when it ends, whatever ends it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.files import Unreadable, is_folder, is_there, text_of
+from evedrop.live.protocol.brief import Identity
+
+_NAME = "control.json"
+_MOST_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class Control:
+    """Where the router of a run is, and the operator's credentials, made for this run alone."""
+
+    run: str
+    router: str
+    """Zenoh endpoint."""
+    user: str
+    password: str
+    identity: Identity | None = None
+    """The operator's, of a run whose router takes certificates."""
+
+    def write(self, folder: Path) -> None:
+        """Write it into a results folder, readable by nobody else."""
+        unfinished = folder / f"{_NAME}.new"
+        with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump(asdict(self), file, indent=1)
+        os.replace(unfinished, folder / _NAME)
+
+
+def remove_control(folder: Path) -> None:
+    """The run is over: nobody can get at it any more."""
+    with suppress(OSError):  # of a disk that cannot be written any more: the password is of no run then
+        (folder / _NAME).unlink()
+
+
+def no_run(folder: Path, why: str) -> UsageError:
+    """The error of who would steer a run that does not go on."""
+    return UsageError(
+        f"no run is going on in {folder}; {why}; give the results folder of a run between its start and its end"
+    )
+
+
+def read_controls(folder: Path) -> list[Control]:
+    """The control file of a run that goes on, or those of its shards. Raises UsageError as `read_control` does."""
+    shards = sorted(path.parent for path in folder.glob(f"shards/*/{_NAME}"))
+    return [read_control(shard) for shard in shards] or [read_control(folder)]
+
+
+def read_control(folder: Path) -> Control:
+    """The control file of a run that goes on. Raises UsageError if there is none, or it is none."""
+    path = folder / _NAME
+    try:
+        found = json.loads(text_of(path, _MOST_BYTES))
+        identity = found.get("identity")
+        control = Control(**{**found, "identity": None if identity is None else Identity(**identity)})
+    except Unreadable as error:
+        if is_there(path):
+            raise no_run(folder, f"{path.name} cannot be read ({error})") from error
+        over = is_there(folder / "summary.json")
+        why = "it is over" if over else f"it has no {_NAME} (yet)" if is_folder(folder) else "there is no such folder"
+        raise no_run(folder, why) from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise no_run(folder, f"{path.name} is not one ({error})") from error
+    entries = asdict(control)
+    texts = [*(entries.pop("identity") or {}).values(), *entries.values()]
+    if not all(isinstance(value, str) for value in texts):
+        raise no_run(folder, f"{path.name} is not one (an entry is no string)")
+    return control

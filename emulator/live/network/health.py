@@ -1,0 +1,36 @@
+"""Whether a process is on the network now: asked of the router, for only what it says holds for everybody else."""
+
+from __future__ import annotations
+
+import json
+
+import zenoh
+
+from evedrop.live.network.access import Keys
+from evedrop.live.network.endpoint import Endpoint
+from evedrop.live.network.session import client_config
+from evedrop.live.protocol.brief import Brief
+
+_CONNECT_SECONDS = 3.0
+_ANSWER_SECONDS = 3.0
+
+
+def is_there(brief: Brief) -> bool:
+    """Whether the router knows the process of a brief to be there: connected, ready, and not lost since.
+
+    It is asked with the credentials of the process itself, which may ask for nobody else.
+    """
+    zenoh.init_log_from_env_or("off")
+    config = client_config(brief)
+    config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
+    if brief.role in {"router", "relay"}:
+        # Asked of itself; where it listens may be everywhere: by that name it has no certificate.
+        listens = brief.part["listen"] if brief.role == "relay" else brief.router
+        config["connect"]["endpoints"] = [str(Endpoint.of(listens).nearby)]
+        config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
+    try:
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+            answers = session.liveliness().get(Keys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
+            return any(answer.ok is not None for answer in answers)
+    except zenoh.ZError:
+        return False

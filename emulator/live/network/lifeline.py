@@ -1,0 +1,49 @@
+"""A process that has had no connection with its router for too long ends itself: nobody can tell it that the run is over."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from typing import final
+
+from evedrop.errors import RunError
+from evedrop.live.protocol.brief import Brief
+
+
+@final
+class Lifeline:
+    """Ends its process after `flow.longest_outage` without a connection."""
+
+    def __init__(self, brief: Brief) -> None:
+        self._brief = brief
+        self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
+        self._released = False
+
+    def changed(self, connected: bool) -> None:
+        """The connection was lost or is back."""
+        self._set(lost=not connected)
+
+    def release(self) -> None:
+        """The process closes its connection itself."""
+        self._released = True
+        self._set(lost=False)
+
+    def _set(self, lost: bool) -> None:
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = None
+            if lost and not self._released:
+                self._timer = threading.Timer(self._brief.flow.longest_outage, self._give_up)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def _give_up(self) -> None:
+        sys.stderr.write(
+            f"evedrop: {self._brief.process} has had no connection with the router at {self._brief.router} for "
+            f"{self._brief.flow.longest_outage:g} s; look whether the router runs and can be reached\n"
+        )
+        sys.stderr.flush()
+        os._exit(RunError.exit_status)

@@ -1,0 +1,57 @@
+"""Two routers that are linked: who is at which, and the keys that cross between them. What need not cross is denied.
+
+    sensor ── router ═════ relay ── receivers, observer, operator
+
+The first is the router, which decides every fate, at the sensor's site; the relay only passes on, at the receivers'.
+
+Source: docs/protocol.md, two routers.
+"""
+
+from __future__ import annotations
+
+from evedrop.live.network.access import RELAY, ROUTER, SENSOR, Grant, Keys
+
+_NEAR = frozenset({SENSOR, ROUTER})
+
+
+def at_router(run: str, table: list[Grant]) -> list[Grant]:
+    """Who is let in at the router, when there is a relay: those at its own site, and the relay for all others."""
+    to_router, from_router = _crossing(table)
+    near, far = _sites(table)
+    relay = Grant(
+        RELAY, to_router, from_router, None, (Keys(run).alive(ROUTER), *_tokens(near)), further_tokens=_tokens(far)
+    )
+    return [*near, relay]
+
+
+def at_relay(run: str, table: list[Grant], zid: str) -> list[Grant]:
+    """Who is let in at the relay: those of its site, and the router, by its Zenoh id, for all others."""
+    to_router, from_router = _crossing(table)
+    near, far = _sites(table)
+    token = Keys(run).alive(ROUTER)
+    router = Grant(ROUTER, from_router, to_router, token, _tokens(far), further_tokens=_tokens(near), zid=zid)
+    return [*far, router]
+
+
+def _sites(table: list[Grant]) -> tuple[list[Grant], list[Grant]]:
+    return [one for one in table if one.process in _NEAR], [one for one in table if one.process not in _NEAR]
+
+
+def _tokens(site: list[Grant]) -> tuple[str, ...]:
+    return tuple(grant.token for grant in site if grant.token is not None)
+
+
+def _crossing(table: list[Grant]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The keys that go to the router's site, and those that come from it."""
+    keys = dict.fromkeys(key for grant in table for key in (*grant.writes, *grant.reads))
+    to_router, from_router = [], []
+    for key in keys:
+        # What nobody else writes is the router's, and so is what nobody else reads, but for what the relay is told.
+        writers = {one.process for one in table if key in one.writes} or {ROUTER}
+        other = RELAY if key.endswith(f"/control/{RELAY}") else ROUTER
+        readers = {one.process for one in table if key in one.reads} or {other}
+        if writers - _NEAR and readers & _NEAR:
+            to_router.append(key)
+        if writers & _NEAR and readers - _NEAR:
+            from_router.append(key)
+    return tuple(to_router), tuple(from_router)

@@ -1,0 +1,61 @@
+"""Messages that wait for a process to read them: as many bytes of each sender as a run can have under way, and no more."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from queue import SimpleQueue
+from typing import final
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.network.access import writer_of
+
+_OVERHEAD_BYTES = 200  # of a message in memory, besides its own
+_ROUNDS = 4  # in which all that is kept is sent again, before what came first is read
+
+
+def allowance(largest: int, window: int, batch: int) -> int:
+    """Bytes that one sender may have waiting: reports of a window and two batches, in some rounds, and small change."""
+    return _ROUNDS * (window // batch + 3) * (largest + _OVERHEAD_BYTES) + 2**20
+
+
+@final
+class Mailbox:
+    """A queue of messages by sender; filled by threads of Zenoh's, read by one."""
+
+    def __init__(self, keys: Mapping[str, str], most: int) -> None:
+        """keys: sender → the key on which it sends; most: bytes of one sender's that may wait."""
+        self._keys, self._most = keys, most
+        self._queue: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
+        self._waiting = dict.fromkeys(keys, 0)
+        self._lock = threading.Lock()
+        self._flooded: tuple[str, bytes] | None = None
+
+    def put(self, sender: str, news: bytes | bool) -> None:
+        """Take a message, or whether the sender is there. Of a sender that sends too much the rest is dropped."""
+        if isinstance(news, bytes):
+            with self._lock:
+                waiting = self._waiting[sender] + len(news) + _OVERHEAD_BYTES
+                if waiting > self._most:
+                    self._flooded = self._flooded or (sender, news)
+                    return
+                self._waiting[sender] = waiting
+        self._queue.put((sender, news))
+
+    def get(self, timeout: float | None = None) -> tuple[str, bytes | bool]:
+        """The next one. Raises Empty after so many seconds, MalformedMessage if a sender has sent too much."""
+        if self._flooded is not None:
+            flooding, last = self._flooded
+            key = self._keys[flooding]
+            raise MalformedMessage(
+                key,
+                f"more than {self._most} bytes that nobody has read yet",
+                "no more than the window of the run",
+                last,
+                writer_of(key),
+            )
+        sender, news = self._queue.get(timeout=timeout)
+        if isinstance(news, bytes):
+            with self._lock:
+                self._waiting[sender] -= len(news) + _OVERHEAD_BYTES
+        return sender, news

@@ -1,0 +1,99 @@
+"""What the operator asks of a run that goes on, and what it is answered: a query of Zenoh's to the observer.
+
+Source: docs/protocol.md, request and answer.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from evedrop.live.network.access import OBSERVER, Keys
+from evedrop.live.network.control_file import Control
+from evedrop.live.network.session import client_config
+from evedrop.live.protocol.codec import Reader, pack
+from evedrop.live.protocol.envelope import enclosed, payload_of
+
+DOES = ("link", "pause", "resume", "step", "status")
+"""What can be asked for."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """One thing the operator asks for."""
+
+    do: str
+    """One of `DOES`."""
+    event: Mapping[str, Any] | None = None
+    """Of `link`: what an [[event]] of a scenario says, but when."""
+    slots: int | None = None
+    """Of `step`."""
+
+    def pack(self) -> bytes:
+        """As a message."""
+        optional = {"event": self.event, "slots": self.slots}
+        return pack({"do": self.do, **{name: value for name, value in optional.items() if value is not None}})
+
+
+def read_request(key: str, payload: bytes) -> Request:
+    """The request in a message. Raises MalformedMessage if it is none."""
+    message = Reader(key, payload)
+    do = message.text("do")
+    if do not in DOES:
+        raise message.malformed(f"do = {do!r}", f"one of {', '.join(DOES)}")
+    event = message.map("event") if do == "link" else None
+    if event is not None and not all(isinstance(name, str) for name in event):
+        raise message.malformed(f"event = {event!r:.60}", "a map event with strings as keys")
+    return Request(do, event, message.integer("slots", 1) if do == "step" else None)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of a request."""
+
+    slot: int | None = None
+    """The slot from which on it holds."""
+    said: str = ""
+    """As a sentence."""
+    refused: tuple[str, ...] = ()
+    """What is wrong with it, a line each; nothing has changed then."""
+    status: Mapping[str, Any] | None = None
+    """How the run is doing, for who asked for that."""
+
+    def pack(self) -> bytes:
+        """As a message."""
+        if self.refused:
+            return pack({"refused": list(self.refused)})
+        if self.status is not None:
+            return pack({"status": self.status})
+        return pack({"k": self.slot, "said": self.said})
+
+
+def read_answer(key: str, payload: bytes) -> Answer:
+    """The answer in a message. Raises MalformedMessage if it is none."""
+    message = Reader(key, payload)
+    if message.has("refused"):
+        return Answer(refused=message.names("refused"))
+    if message.has("status"):
+        return Answer(status=message.map("status"))
+    return Answer(message.integer("k"), message.text("said"))
+
+
+def ask(control: Control, request: Request, patience: float) -> Answer | None:
+    """Ask the observer of a run; None if nobody answers within so many seconds, because the run is over or ends.
+
+    Raises zenoh.ZError if the router is not there or does not let us in.
+    """
+    zenoh.init_log_from_env_or("off")
+    key = Keys(control.run).control(OBSERVER)
+    # A run that goes on has a router: one attempt will do.
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
+        for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
+            answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())
+            if answer is not None:
+                return read_answer(key, answer)
+    return None

@@ -1,0 +1,52 @@
+"""The relay: the second of two routers, at the receivers' site. It decides nothing, and passes on what is granted.
+
+Source: docs/protocol.md, two routers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evedrop.live.network.access import Wiring, access_control, grants
+from evedrop.live.network.connecting import connected
+from evedrop.live.network.linked_routers import at_relay
+from evedrop.live.network.router_users import until_all_left, users_file
+from evedrop.live.network.session import Session, client_config, door_of, router_config
+from evedrop.live.protocol.brief import Brief
+
+
+def relay(brief: Brief) -> None:
+    """Run the relay of a brief until the conductor ends it and everybody at it has left.
+
+    Raises BriefError if it does not fit, RunError if there is no router within the brief's patience.
+    """
+    part = brief.part
+    table = at_relay(
+        brief.run, grants(brief.run, tuple(part["receivers"]), Wiring.of(part["controller"]), relayed=True), part["zid"]
+    )
+    # As a client first, which says what is wrong; Zenoh links routers in the background and says nothing.
+    with connected(door_of(brief), float(brief.patience)):
+        pass
+    with _opened(brief, access_control(table, brief.identity is not None)) as session:
+        present = session.attendance(grant.process for grant in table if grant.token is not None and grant.zid is None)
+        session.wait_for_link()
+        session.ready()
+        session.wait_for("end")
+        until_all_left(present)
+
+
+def _opened(brief: Brief, access: dict[str, Any]) -> Session:
+    with users_file(brief.part["users"]) as users:
+        return Session(brief, _config(brief, str(users), access), brief.part["listen"])
+
+
+def _config(brief: Brief, users: str, access: dict[str, Any]) -> dict[str, Any]:
+    """A router's, which besides connects to the router as a client does, and again whenever the link is lost."""
+    listening = router_config(brief, users, access, brief.part["listen"])
+    connecting = client_config(brief)
+    auth = {"usrpwd": {**listening["transport"]["auth"]["usrpwd"], **connecting["transport"]["auth"]["usrpwd"]}}
+    return {
+        **listening,
+        "connect": {**connecting["connect"], "timeout_ms": -1, "exit_on_failure": False},
+        "transport": {**listening["transport"], "auth": auth},
+    }

@@ -1,0 +1,403 @@
+"""The router: takes each packet of the uplink, lets every link decide its fate, delivers, and keeps the journal.
+
+    uplink ── k, z ──┬── link of receiver 1 ── fate, γ ── downlink/1
+                     ├── link of receiver 2 ── fate, γ ── downlink/2      fates of all ── journal
+                     └── …
+
+A receiver that is there gets one delivery in every slot, with all that arrives in it. At a mark on the uplink it journals
+all slots before, and waits until the conductor lets it go on; links change nowhere else. When packets are sent once more it
+routes them once more, to the same fates, as a router does that was started anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from evedrop.live.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
+from evedrop.live.network.delayed_sender import Postman
+from evedrop.live.network.linked_routers import at_router
+from evedrop.live.network.resending import Due
+from evedrop.live.network.router_commands import Anew, Commands
+from evedrop.live.network.router_users import until_all_left, users_file
+from evedrop.live.network.session import Session, router_config
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.codec import Reader, packed_flags, shown
+from evedrop.live.protocol.packets import (
+    Beside,
+    acknowledgement,
+    delivery,
+    hold,
+    is_hold,
+    is_once_more,
+    packed_header,
+    read_acknowledgement,
+    read_beside,
+    read_once_more,
+    read_uplink,
+)
+from evedrop.live.protocol.telemetry import Journal
+from evedrop.model.acknowledgements import WayBack
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags
+from evedrop.model.registry import NotRegistered
+from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
+from evedrop.model.slot.link import Change, Course, Fates, Link, streams_of
+from evedrop.model.slot.transit import Late, Transit
+
+
+class Downlink:
+    """One receiver's link, decided a batch of slots ahead, and its outlet. Final."""
+
+    def __init__(self, name: str, course: Course, brief: Brief, put: Callable[[bytes, float], None]) -> None:
+        self._course = course
+        keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, self._course)}
+        self._link = Link(self._course, name, keys, brief.batch)
+        self._accountant = Accountant(self._course.window, brief.trials)
+        self._transit = Transit()
+        self._put = put
+        self._pace = float(brief.part["pace"])
+        self._rests: dict[int, float] = {}
+        """Slot → the part of a slot that the first trial's packet takes besides, of packets that may still arrive."""
+        self._leak: int | None = brief.part["leaks"].get(name)
+        self._slots = range(0)
+        self._fates: Fates
+        self._own = False
+        self._masks: list[bytes]
+        self._received: list[int]
+
+    def plan(self, slots: range) -> None:
+        """Decide the next batch of slots."""
+        self._take(slots, self._link.planned(slots))
+
+    def amend(self, at: int, changes: Iterable[Change]) -> None:
+        """Decide the slots of the batch from `at` on once more, by what changes from then on; none may have been journaled."""
+        self._take(range(at, self._slots.stop), self._link.amended(at, changes))
+
+    def _take(self, slots: range, fates: Fates) -> None:
+        self._slots, self._fates, self._in_time, self._own = slots, fates, fates.in_time, False
+        self._masks = [mask.tobytes() for mask in packed_flags(self._in_time)]
+        self._received = np.count_nonzero(self._in_time, axis=1).tolist()
+
+    def account(self, slots: range) -> Account:
+        """What became of the packets of the next slots, which are of the batch at hand."""
+        rows = slice(slots.start - self._slots.start, slots.stop - self._slots.start)
+        return self._accountant.account(slots, self._fates.part(rows))
+
+    def present(self, k: int) -> bool:
+        """Whether the receiver is there in slot k."""
+        return not any(away.start <= k < away.stop for away in self._course.outages)
+
+    def gamma(self, k: int) -> Flags:
+        """γ of slot k, which is of the batch at hand and was delivered, (R,)."""
+        in_time: Flags = self._in_time[k - self._slots.start]
+        return in_time
+
+    def _silence(self, row: int, sent: Flags) -> None:
+        """Take the packets that are not sent out of the account."""
+        if not self._own:
+            self._fates, self._own = self._fates.copied(), True
+        self._fates.silence(row, sent)
+        self._in_time[row] &= sent
+        self._masks[row] = packed_flags(self._in_time[row]).tobytes()
+        self._received[row] = int(np.count_nonzero(self._in_time[row]))
+
+    def deliver(self, k: int, z: Floats, whole: bytes, beside: Beside, known: bool = False) -> None:
+        """Send slot k's delivery: of the packets z (n, R), or as bytes the whole of them, those that arrive in it.
+
+        known: the receiver has it, and only what arrives later is of interest.
+        """
+        row = k - self._slots.start
+        if beside.sent is not None:
+            self._silence(row, beside.sent)
+        late: tuple[Late, ...] = ()
+        if self._fates.delays is not None or self._fates.again is not None or self._transit.busy:
+            late = self._transit.arrival(k, self._fates, row, z, beside.header).late
+        if known or not self.present(k):
+            return
+        received = self._received[row]
+        payload = (
+            whole
+            if received == z.shape[1]
+            else np.compress(self._in_time[row], z, axis=1).tobytes()
+            if received
+            else b""
+        )
+        header = packed_header(beside.header, self._in_time[row]) if beside.header is not None else b""
+        truth = beside.truth.tobytes() if beside.truth is not None and k == self._leak else b""
+        self._put(delivery(k, self._masks[row], payload, late, header, truth), self._rest(k, row, late) * self._pace)
+
+    def _rest(self, k: int, row: int, late: tuple[Late, ...]) -> float:
+        """The part of a slot by which slot k's delivery is to be later than the slot: of what the first trial receives in it."""
+        if self._fates.rests is not None:
+            self._rests[k] = float(self._fates.rests[row])
+        if not self._rests:
+            return 0.0
+        arrived = [one.k for one in late if one.heard.gamma[0]] + [k] * bool(self._in_time[row, 0])
+        rest = max((self._rests.get(slot, 0.0) for slot in arrived), default=0.0)
+        self._rests.pop(k - self._course.window, None)
+        return rest
+
+    def mark(self, k: int) -> None:
+        """Pass a mark on, if the receiver is there."""
+        if not any(away.start < k <= away.stop for away in self._course.outages):
+            self._put(hold(k), 0.0)
+
+
+class Burst:
+    """Deliveries to who keeps nobody waiting, passed on many at a time. Final.
+
+    Where the sensor waits for somebody in every slot, a message by itself costs a receiver's waking up, and most of the time.
+    """
+
+    def __init__(self, put: Callable[[bytes], None]) -> None:
+        self._put = put
+        self._held: list[bytes] = []
+
+    def hold(self, payload: bytes, _: float) -> None:
+        """Take one."""
+        self._held.append(payload)
+
+    def flush(self) -> None:
+        """Pass on all that are held."""
+        for payload in self._held:
+            self._put(payload)
+        self._held.clear()
+
+
+class WayBackLink:
+    """The link of the acknowledgements, from the legitimate estimator to the sensor, and who attacks it. Final."""
+
+    def __init__(self, brief: Brief, session: Session, spec: Mapping[str, Any]) -> None:
+        key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
+        self._way = WayBack(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
+        self._jammer: str | None = spec["jammer"]
+        self._trials, self._place = brief.trials, session.place
+        self._key = session.keys.acknowledged
+        self._due = Due(self._key, brief.flow.longest_outage)
+        self.sent: SimpleQueue[bytes | None] = SimpleQueue()
+        """What the legitimate estimator acknowledges; None: the conductor has said something that may end the waiting."""
+        session.funnel(self._key, self.sent.put)
+        self._put = session.outlet(session.keys.acknowledgements)
+
+    def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink], commands: Commands) -> None:
+        """Wait for the acknowledgements of slot k, and pass on what reaches the sensor; sent (R,): as in `Beside`.
+
+        A receiver that is not there acknowledges nothing. Raises what `Commands.check` does.
+        """
+        gamma = np.zeros(self._trials, np.bool_)
+        if downlinks[LEGITIMATE].present(k):
+            gamma = self._acknowledged(k, commands)
+        gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
+        self._put(acknowledgement(k, self._way.arrived(k, sent, gamma, gamma_e)))
+
+    def _acknowledged(self, k: int, commands: Commands) -> Flags:
+        while True:
+            with self._place.waiting(self._key):
+                payload = self.sent.get()
+            if payload is None:
+                commands.check()
+                continue
+            message = Reader(self._key, payload)
+            if (found := message.integer("k")) == k:
+                return read_acknowledgement(message, k, self._trials)
+            self._due.missed(k, found)
+
+
+def route(brief: Brief) -> None:
+    """Run the router of a brief until the conductor ends it and everybody has left."""
+    table = grants(brief.run, tuple(brief.part["links"]), Wiring.of(brief.part["controller"]))
+    let_in = table if brief.part["zid"] is None else at_router(brief.run, table)
+    with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
+        present = session.attendance(grant.process for grant in table if grant.token is not None)
+        Routing(brief, session).carry_on()
+        session.conclude()
+        until_all_left(present, session.linked)
+
+
+class Routing:
+    """The router's work on an open session. Final."""
+
+    def __init__(self, brief: Brief, session: Session) -> None:
+        self._brief, self._session = brief, session
+        self._shape = (len(brief.model.A), brief.trials)
+        self._uplink = session.inbox(session.keys.uplink)
+        self._due = Due(session.keys.uplink, brief.flow.longest_outage)
+        self._put_journal = session.outlet(session.keys.journal)
+        postman = Postman() if brief.part["pace"] else None
+        self._bursts: list[Burst] = []
+
+        def outlet(name: str, course: Course) -> Callable[[bytes, float], None]:
+            put = session.outlet(session.keys.downlink(name))
+            if postman is None and brief.part["controller"] is not None and not self._is_waited_for(name):
+                self._bursts.append(Burst(put))
+                return self._bursts[-1].hold
+            delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
+            return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
+
+        self._courses = {name: Course.of(spec) for name, spec in brief.part["links"].items()}
+        self._outlets = {name: outlet(name, course) for name, course in self._courses.items()}
+        acknowledgements = brief.part["acknowledgements"]
+        self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
+        # To its own uplink, so that whoever waits there wakes: only the conductor ends a router.
+        knock = session.outlet(session.keys.uplink)
+        waiting = [] if self._way_back is None else [self._way_back.sent]
+        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting, brief.flow.longest_outage)
+        self._stale = False
+        """Whether what comes is of no interest until it is said to come once more."""
+        self._begin(0, 0)
+
+    def _is_waited_for(self, receiver: str) -> bool:
+        """Whether the sensor waits in some slots for what a receiver makes of them."""
+        part = self._brief.part
+        wiring = Wiring(**part["controller"])
+        return receiver == LEGITIMATE and (
+            not wiring.on_truth or wiring.knows_input or part["acknowledgements"] is not None
+        )
+
+    def carry_on(self) -> None:
+        """Route all slots, once more as often as it is asked for, until the conductor's end."""
+        # Nobody to wait for: who is alive has subscribed before it said so, and it said so to this very session.
+        self._session.appear()
+        while not self._commands.over():
+            try:
+                self._take(Reader(self._session.keys.uplink, self._uplink.recv()))
+            except Anew:
+                self._stale = True
+
+    def _begin(self, start: int, done: int) -> None:
+        """Be as a router is before slot `start` to which nothing has happened but what is known of all slots before.
+
+        done: all slots below have been delivered, acknowledged and journaled.
+        """
+        self._stale = False
+        self._flush()  # of no use to anybody, but in no way of what comes now
+        self._k, self._done, self._journaled = start, done, start
+        self._downlinks = {
+            name: Downlink(name, course, self._brief, self._outlets[name]) for name, course in self._courses.items()
+        }
+        for first in range(0, start + 1, self._brief.flow.batch):
+            slots = self._plan(first)
+            before = range(first, min(slots.stop, start))
+            if before and before.stop > start - COUNTED_BURSTS:  # what bursts go on, and which packets are under way
+                for downlink in self._downlinks.values():
+                    downlink.account(before)
+
+    def _plan(self, first: int) -> range:
+        """Decide the batch that begins with a slot."""
+        self._slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
+        if self._slots:
+            for downlink in self._downlinks.values():
+                downlink.plan(self._slots)
+        return self._slots
+
+    def _take(self, message: Reader) -> None:
+        """Take what the sensor sends: a packet, a mark, or the word that packets come once more."""
+        if is_once_more(message):
+            self._once_more(message)
+            return
+        k = message.integer("k")
+        if self._stale or k == self._brief.slots:
+            return
+        if k != self._k:
+            self._due.missed(self._k, k)
+            return
+        if k == self._done:
+            self._journal(k)
+        if is_hold(message):
+            if k >= self._done:
+                self._journal(k)
+                self._hold(k)
+            return
+        self._route(k, message)
+        if k + 1 == self._slots.stop:
+            self._flush()
+            self._journal(k + 1)
+            self._plan(k + 1)
+
+    def _route(self, k: int, message: Reader) -> None:
+        """Deliver the packet of slot k, unless it is known that this is done."""
+        z = read_uplink(message, k, self._shape)
+        beside = read_beside(message, self._shape, self._brief.model.header)
+        whole, known = z.tobytes(), k < self._done
+        for downlink in self._downlinks.values():
+            downlink.deliver(k, z, whole, beside, known)
+        if self._way_back is not None and not known:
+            self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
+        self._k = self._session.place.slot = k + 1
+
+    def _flush(self) -> None:
+        for burst in self._bursts:
+            burst.flush()
+
+    def _once_more(self, message: Reader) -> None:
+        """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
+        number, done, start = read_once_more(message, self._brief.slots)
+        anew = self._commands.anew(number)
+        if anew is None:  # it has asked once more since
+            self._stale = True
+            return
+        for name, changes in read_links(anew, self._courses, self._brief.slots).items():
+            self._courses[name] = replace(self._courses[name], changes=changes)
+        self._begin(start, done)
+
+    def _journal(self, end: int) -> None:
+        """Journal all slots below `end`; of those that are journaled already, only remember what goes on after them."""
+        slots = range(self._journaled, end)
+        self._journaled = end
+        if slots:
+            accounts = {name: downlink.account(slots) for name, downlink in self._downlinks.items()}
+            if slots.start >= self._done:
+                self._put_journal(Journal(slots.start, len(slots), accounts).pack())
+
+    def _hold(self, k: int) -> None:
+        """Pass a mark on, and do what the conductor says until it lets us go on."""
+        for downlink in self._downlinks.values():
+            downlink.mark(k)
+        self._flush()
+        while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
+            if command.text("do") == "change":
+                self._amend(command, k)
+
+    def _amend(self, command: Reader, k: int) -> None:
+        """Change a link from slot k on, as the conductor says."""
+        name = command.choice("link", self._courses)
+        changes = read_changes(command, "changes", self._brief.slots)
+        try:
+            self._downlinks[name].amend(k, changes)
+        except (KeyError, TypeError, ValueError, NotRegistered) as error:
+            raise command.malformed(
+                f"settings that are none ({error!r:.80})", f"settings of the link of {name}"
+            ) from error
+        course = self._courses[name]
+        self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
+
+
+def read_changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
+    """The changes of a link in a run of so many slots, in a field of a command."""
+    return tuple(
+        Change(
+            one.integer("at", 0, slots),
+            one.map("settings") if one.has("settings") else None,
+            one.flag("cut") if one.has("cut") else None,
+        )
+        for one in found.maps(name)
+    )
+
+
+def read_links(command: Reader, names: Collection[str], slots: int) -> dict[str, tuple[Change, ...]]:
+    """Receiver → all changes of its link, of those that an `again` names."""
+    links = command.nested("links")
+    for name in command.map("links"):
+        if name not in names:
+            raise command.malformed(f"the link {shown(name)}", f"one of {', '.join(names)}")
+    return {name: read_changes(links, name, slots) for name in command.map("links")}
+
+
+def _opened(brief: Brief, access: dict[str, Any]) -> Session:
+    with users_file(brief.part["users"]) as users:
+        return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

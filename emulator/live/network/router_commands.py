@@ -1,0 +1,109 @@
+"""What the conductor tells the router, sorted: what is to be done at a hold, and what ends whatever it waits for.
+
+Source: docs/protocol.md, control and lost connections.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from queue import SimpleQueue
+
+from evedrop.errors import EvedropError
+from evedrop.live.network.access import ROUTER
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.codec import Reader
+
+
+class Anew(Exception):
+    """The conductor asks for packets once more: whatever is waited for may have been lost."""
+
+
+class Commands:
+    """Final. Reads the session's commands on a thread of its own.
+
+    knock: wakes who waits for packets, when the run has ended. waiting: get None when a waiting may be in vain.
+    """
+
+    def __init__(
+        self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]], patience: float
+    ) -> None:
+        """patience: seconds that a round which the sensor tells of is waited for."""
+        self._session, self._knock, self._waiting = session, knock, tuple(waiting)
+        self._patience = patience
+        self._orders: SimpleQueue[tuple[int, Reader] | None] = SimpleQueue()
+        self._news = threading.Condition()
+        self._asked = Round()
+        self._heeded = 0
+        self._ended = False
+        self._failure: EvedropError | None = None
+        threading.Thread(target=self._listen, name="commands", daemon=True).start()
+
+    def _listen(self) -> None:
+        try:
+            while not self._ended:
+                self._sort(self._session.command())
+        except EvedropError as error:  # for whoever works, who says so
+            self._failure = error
+        with self._news:
+            self._news.notify()
+        self._wake()
+        self._knock()
+
+    def _sort(self, command: Reader) -> None:
+        match command.text("do"):
+            case "again":
+                with self._news:
+                    self._asked = Round(command.integer("n"), command)
+                    self._news.notify()
+                self._wake()
+            case "end":
+                self._ended = True
+            case _:
+                self._orders.put((self._asked.number, command))
+
+    def _wake(self) -> None:
+        self._orders.put(None)
+        for queue in self._waiting:
+            queue.put(None)
+
+    def over(self) -> bool:
+        """Whether the conductor has ended the run. Raises MalformedMessage if it has said what nobody understands."""
+        if self._failure is not None:
+            raise self._failure
+        return self._ended
+
+    def check(self) -> None:
+        """Raise Anew if the conductor has ended the run, or asked for packets once more since it was heeded last."""
+        if self.over() or self._asked.number != self._heeded:
+            raise Anew
+
+    def next(self) -> Reader:
+        """The next command of the round at hand, not one of before. Raises Anew as `check` does."""
+        while True:
+            with self._session.place.waiting(self._session.keys.control(ROUTER)):
+                order = self._orders.get()
+            self.check()
+            if order is not None and order[0] == self._heeded:
+                return order[1]
+
+    def anew(self, number: int) -> Reader | None:
+        """What the conductor said when it asked for that round, as soon as it has; None if that is not its last.
+
+        Nor if it has ended the run meanwhile.
+        """
+        with self._news:
+            # Sensor and router are told at the same time; a round of which we hear nothing for so long there is not.
+            if not self._news.wait_for(lambda: self.over() or self._asked.number >= number, self._patience):
+                return None
+            if self._ended or self._asked.number > number:
+                return None
+            self._heeded = number
+            return self._asked.command
+
+
+class Round:
+    """Packets are sent once more: how often they were, and the command. Final."""
+
+    def __init__(self, number: int = 0, command: Reader | None = None) -> None:
+        self.number, self.command = number, command

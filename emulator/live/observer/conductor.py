@@ -1,0 +1,231 @@
+"""The conductor, inside the observer: waits until everybody is there, starts, reports how far the run is, ends it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Collection
+from queue import Empty, SimpleQueue
+from typing import Any, NoReturn
+
+from evedrop.errors import Interrupted, RunError
+from evedrop.live.network.access import OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.live.network.declared import Question
+from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.codec import Reader, control, is_over, progress, read_over
+
+_AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
+_ABANDON_SECONDS = 2.0  # for who is told to go
+_LOOK_SECONDS = 0.05  # how soon a signal is noticed
+_END_SECONDS = 0.5  # after which a process that is still there is told again that the run is over
+_RETURN_SECONDS = 3.0  # for a process to come back that vanished when it was told so, and did not confirm it
+_ROUTERS_SECONDS = 5.0  # for a router to confirm
+
+
+class Stop:
+    """Set by a signal: the run must end now. Final."""
+
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
+        """orphaned: whether the launcher is gone, which asks for the end too."""
+        self._orphaned = orphaned
+        self.wanted = False
+
+    def check(self, patience: float = 0.0) -> None:
+        """Raise Interrupted if the end was asked for, or is within so many seconds."""
+        deadline = time.monotonic() + patience
+        while not (asked := self.wanted or self._orphaned()) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        if asked:
+            raise Interrupted("interrupted; what was measured is in the results folder")
+
+
+class Conductor:
+    """Final. Its news are (source, payload): telemetry and journal as they come; everything else it keeps to itself."""
+
+    def __init__(
+        self,
+        session: Session,
+        reporters: tuple[str, ...],
+        stop: Stop,
+        relayed: bool = False,
+    ) -> None:
+        """reporters: who reports besides router and sensor: the receivers, and a controller."""
+        self._session = session
+        self._stop = stop
+        self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
+        self.relayed = relayed
+        """Whether we are connected to a relay, and not to the router itself."""
+        self._router: str | None = None
+        self.lost: dict[str, float] = {}
+        """Process → when it vanished from the network, of those that have, on the clock of `time.monotonic`."""
+        keys = session.keys
+        self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
+        self.keys.update({name: keys.telemetry(name) for name in reporters})
+        self._news = Mailbox(self.keys, session.allowance)
+        for source, key in self.keys.items():
+            session.funnel(key, lambda payload, source=source: self._news.put(source, payload))  # type: ignore[misc]
+        for name in self._present:
+            session.watch(name, lambda there, name=name: self._news.put(name, there))  # type: ignore[misc]
+        self.misdelivered: dict[str, int] = {}
+        """Process → how many messages it dropped because they name another key, of those that have confirmed their end."""
+        self.absent: set[str] = set()
+        """Who is away by intent, and not missed."""
+        self.questions: SimpleQueue[Question] = SimpleQueue()
+        """What the operator asks."""
+        session.asked(keys.control(OBSERVER), self.questions.put)
+        self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
+        self._progress = session.outlet(keys.progress(OBSERVER))
+
+    @property
+    def missing(self) -> list[str]:
+        """The processes that are not on the network."""
+        return [name for name, there in self._present.items() if not there and name not in self.absent]
+
+    def router_changed(self) -> bool:
+        """Whether we are connected to another router than that which the run began with, or than when this was asked last."""
+        before, self._router = self._router, self._session.router_id
+        return before != self._router
+
+    def there(self, name: str) -> bool:
+        """Whether a process is on the network."""
+        return self._present[name]
+
+    @property
+    def processes(self) -> dict[str, bool]:
+        """Process → whether it is on the network."""
+        return dict(self._present)
+
+    def assemble(self) -> None:
+        """Wait for every process. Raises RunError naming those that are missing after the brief's patience."""
+        deadline = time.monotonic() + self._session.patience
+        while self.missing:
+            self._stop.check()
+            if time.monotonic() > deadline:
+                # Who waits for somebody else is not the one to be named.
+                names = [name for name in self.missing if not self._reaches(name)]
+                names = names or self.missing
+                do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
+                raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
+            self._note(self._next())
+        self._session.ready()
+        self._router = self._session.router_id
+
+    def start(self) -> None:
+        """Let the sensor begin."""
+        self._commands[SENSOR](control("start"))
+
+    def news(self) -> tuple[str, bytes] | None:
+        """The next message and who sent it, or None if there was none for a moment.
+
+        Raises Interrupted when the end was asked for.
+        """
+        self._stop.check()
+        news = self._next()
+        if news is None or not isinstance(news[1], bytes):
+            self._note(news)
+            return None
+        return news[0], news[1]
+
+    def despair(self, names: Collection[str], patience: float) -> NoReturn:
+        """Raise RunError since these have been missing for so many seconds, unless the end is asked for just now."""
+        self._stop.check(_AFTERTHOUGHT_SECONDS)
+        raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
+
+    def command(self, name: str, do: str, **fields: Any) -> None:
+        """Tell one process what to do."""
+        self._commands[name](control(do, **fields))
+
+    def ask(self, what: str) -> None:
+        """Ask everybody who is there and reports for something."""
+        for name in self.keys:
+            if self._present[name]:
+                self.command(name, what)
+
+    def report(self, done: int) -> None:
+        """Tell the sensor that all slots below `done` are scored."""
+        self._progress(progress(done))
+
+    def end(self, patience: float) -> None:
+        """Tell everybody that the run is over, and again those who were cut off meanwhile; the routers when all others have left.
+
+        patience: how many seconds a process is waited for that is missing just now.
+        """
+        others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
+        told: set[str] = set()
+        deadline = time.monotonic() + patience
+        said = 0.0
+        while time.monotonic() < deadline:
+            left = [name for name in others if not self._has_ended(name, told)]
+            if not left and self._present[ROUTER]:
+                break
+            if time.monotonic() - said > _END_SECONDS:
+                said = time.monotonic()
+                for name in left:
+                    if self._present[name]:
+                        self.command(name, "end")
+                        told.add(name)
+            self._hear_out(self._next())
+        # The relay after the router: what the router has to say comes over it.
+        for name in (ROUTER, RELAY):
+            if name in self._present:
+                self._end_router(name)
+
+    def _has_ended(self, name: str, told: Collection[str]) -> bool:
+        """Whether a process has left for good: it said so, or it vanished when it was told to end and does not come back."""
+        if self._present[name]:
+            return False
+        gone = time.monotonic() - self.lost.get(name, -math.inf)
+        return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
+
+    def _end_router(self, name: str) -> None:
+        """Tell a router that the run is over until it confirms that: the router by a message, the relay by its token."""
+        deadline = time.monotonic() + _ROUTERS_SECONDS
+        said = 0.0
+        while time.monotonic() < deadline and name not in self.misdelivered:
+            if name == RELAY and not self._present[name] and self._session.linked():
+                return
+            if time.monotonic() - said > _END_SECONDS:
+                said = time.monotonic()
+                self.command(name, "end")
+            self._hear_out(self._next())
+
+    def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
+        """Note who is there, and who confirms that the run is over; everything else has come before."""
+        if news is not None and isinstance(news[1], bytes):
+            message = Reader(self.keys[news[0]], news[1])
+            if is_over(message):
+                self.misdelivered[news[0]] = read_over(message)
+        self._note(news)
+
+    def abandon(self, why: str) -> None:
+        """Tell everybody who is there that the run will not go on."""
+        others = [name for name in self._commands if name not in {ROUTER, RELAY}]
+        # The routers last, and the relay after the router: what they still have to pass on would go with them.
+        for names in (others, [ROUTER], [RELAY]):
+            told = [name for name in names if name in self._commands]
+            for name in told:
+                self.command(name, "abandon", why=why)
+            deadline = time.monotonic() + _ABANDON_SECONDS
+            while any(self._reaches(name) for name in told) and time.monotonic() < deadline:
+                time.sleep(0.01)
+
+    def _reaches(self, name: str) -> bool:
+        """Whether a process has opened its session, whatever it waits for."""
+        return self._session.reaches(self._session.keys.control(name))
+
+    def _next(self) -> tuple[str, bytes | bool] | None:
+        try:
+            return self._news.get(timeout=_LOOK_SECONDS)
+        except Empty:
+            return None
+
+    def _note(self, news: tuple[str, bytes | bool] | None) -> None:
+        if news is None or not isinstance(news[1], bool):
+            return
+        name, there = news[0], news[1]
+        self._present[name] = there
+        if there:
+            self.lost.pop(name, None)
+        else:
+            self.lost.setdefault(name, time.monotonic())

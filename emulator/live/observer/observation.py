@@ -1,0 +1,372 @@
+"""One run as the observer sees it: conducted, scored, recorded, steered, and written to the results folder."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any
+
+from evedrop.errors import EvedropError, Interrupted, MalformedMessage, RunError
+from evedrop.live.launch.shard_score import leave
+from evedrop.live.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
+from evedrop.live.network.control_file import Control, remove_control
+from evedrop.live.network.declared import Question
+from evedrop.live.network.operator import Answer, read_request
+from evedrop.live.network.resending import Due
+from evedrop.live.network.session import Session
+from evedrop.live.observer.conductor import Conductor, Stop
+from evedrop.live.observer.news import tell
+from evedrop.live.observer.operator_orders import Order
+from evedrop.live.observer.recovery import Recovery
+from evedrop.live.observer.stall import Stall, patience_of
+from evedrop.live.observer.stand_in import StandIn
+from evedrop.live.observer.status import status_of
+from evedrop.live.observer.steering import Steering
+from evedrop.live.observer.verification import Verifier, extent_of
+from evedrop.live.protocol.brief import Brief, Identity
+from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
+from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
+from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
+from evedrop.model.answers import NoAnswer
+from evedrop.model.digest import Blocks
+from evedrop.results.held_folder import HeldFolder
+from evedrop.results.rows import DigestRows, write_rows
+from evedrop.results.summary_file import unwritten
+from evedrop.results.writer import ResultsWriter, write_summary
+from evedrop.scenario import Scenario
+from evedrop.score.expectations_held import replay_of
+from evedrop.score.joined import Joiner
+from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
+from evedrop.view.scored_slots import open_recording, showing_of, shown
+from evedrop.view.viewer import Stand, Viewer
+
+if TYPE_CHECKING:
+    from evedrop.view.plant_slots import Showing
+    from evedrop.view.recording import Recording
+
+Report = Callable[[Path, int, str], None]
+"""Prints how a run ended: its results folder, its exit status, and why it failed."""
+_PROGRESS_SECONDS = 0.25
+
+
+class Observation:
+    """One run as the observer sees it. Final."""
+
+    def __init__(
+        self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
+    ) -> None:
+        """by_hand: whether nobody has launched the others who would end them."""
+        self._place = Path(brief.part["results"])
+        self._held: HeldFolder | None = None
+        self._final: dict[str, Any] | None = None
+        self._brief = brief
+        self._by_hand = by_hand
+        self._scenario = scenario
+        windows = {name: scenario.window(name) for name in scenario.receivers}
+        blocks = {name: Blocks(scenario.slots, scenario.cuts(name)) for name in scenario.digested}
+        table = scenario.controller
+        self._extent = extent_of(scenario, brief.flow.batch)
+        self._verifier = Verifier(blocks, scenario.record_trials, scenario.first_trial)
+        period = None if table is None else table.period
+        self._joiner = Joiner(self._extent, windows, blocks, period, self._verifier.report)
+        self._digest_rows = DigestRows(self._joiner.digests, scenario.first_trial)
+        self._confirmations = confirmations
+        self._steering: Steering
+        self._events: list[dict[str, Any]] = []
+        self._stand_ins: dict[str, StandIn] = {}
+        self._keeper = Scorekeeper(scenario, scenario.trials)
+        self._recording: Recording | None = None
+        self._showing: Showing | None = None
+        self._writer: ResultsWriter
+        self._started = self._ended = self._told = time.monotonic()
+        self._suspects: list[str] = []
+        self._accused: tuple[str, ...] = ()
+        """Processes that the run ends with because of what they did."""
+        self._recovery: Recovery
+        self._stall: Stall
+        self._outages: list[Mapping[str, Any]] = []
+        self._misdelivered: dict[str, int] = {}
+        self._due: dict[str, Due] = {}
+        self._recent: tuple[float, int] = (self._started, 0)
+
+    @property
+    def folder(self) -> Path:
+        """The results folder, also if it was renamed. Raises FileNotFoundError if it was removed."""
+        return self._place if self._held is None else self._held.now
+
+    def hold(self) -> None:
+        """Keep hold of the results folder from now on. Raises OSError if there is none."""
+        self._held = HeldFolder(self._place)
+
+    def show(self, stand: Stand) -> Viewer:
+        """A viewer for browsers, which the run will be streamed to."""
+        viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
+        tell("view", address=viewer.address)
+        return viewer
+
+    def writer(self) -> ResultsWriter:
+        """The writer of the results folder, to be entered around `conduct`."""
+        self._writer = ResultsWriter.of(self.folder, self._scenario)
+        return self._writer
+
+    def conduct(self, stop: Stop) -> None:
+        """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
+        with Session(self._brief, meanwhile=stop.check) as session:
+            conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
+            if self._brief.part["recording"]:
+                self._showing = showing_of(self._scenario)
+                path = self.folder / "recording.rrd"
+                self._recording = open_recording(self._scenario, self._brief.run, path)
+            self._steering = Steering(self._scenario, conductor, tell, self._keep)
+            patience = self._brief.flow.longest_outage
+            self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
+            self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
+            batch = self._brief.flow.batch
+            limit = patience_of(patience, self._scenario.pace, batch)
+            self._stall = Stall(limit, batch, lambda: conductor.ask("where"))
+            try:
+                conductor.assemble()
+                self._started = self._ended = time.monotonic()
+                self._recent = (self._started, 0)
+                self._control.write(self.folder)
+                conductor.start()
+                tell("started")
+                while not self._joiner.complete(self._scenario.slots):
+                    news = conductor.news()
+                    if news is not None:
+                        self._take(conductor, *news)
+                    self._steer(conductor)
+                    self._recovery.look(self._joiner.done)
+                    self._save()
+                    self._look(conductor)
+            except EvedropError as error:
+                self._suspects = conductor.missing
+                self._accused = error.at_fault if isinstance(error, RunError) else ()
+                if self._by_hand:  # a launcher ends them itself
+                    conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
+                raise
+            finally:
+                self._dismiss(conductor)
+                self._recovery.give_up(self._joiner.done)
+                self._outages = self._recovery.account()
+                self._ended = time.monotonic()
+            tell("over")
+            try:
+                conductor.end(patience)
+            finally:
+                self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
+                if session.dropped:
+                    self._misdelivered[OBSERVER] = session.dropped
+
+    def _look(self, conductor: Conductor) -> None:
+        """See whether a process that is there keeps the run waiting."""
+        done, at = self._joiner.done, self._steering.at
+        held = at is not None and done >= at
+        present = set(self._scenario.digested) - conductor.absent
+        beside = (CONTROLLER,) if done < self._scenario.slots else ()
+        missing = bool(conductor.missing)
+        self._stall.look(done, lambda: self._joiner.places(present), beside, held=held, missing=missing)
+
+    @property
+    def _control(self) -> Control:
+        part = self._brief.part
+        identity = None if part["operator_identity"] is None else Identity(**part["operator_identity"])
+        return Control(self._brief.run, self._brief.router, OPERATOR, part["operator"], identity)
+
+    def _keep(self, scenario: Scenario) -> None:
+        """The run is of another scenario from now on, of which all slots so far are too."""
+        self._scenario = scenario
+        write_resolved(self.folder, scenario)
+
+    def _steer(self, conductor: Conductor) -> None:
+        """Do what is due, what the operator asks for, and what the launcher has done."""
+        while not self._confirmations.empty():
+            self._steering.done(int(self._confirmations.get()))
+        while not conductor.questions.empty():
+            self._answer(conductor, conductor.questions.get())
+        self._steering.carry_on(self._joiner.done)
+        for event in self._steering.events[len(self._events) :]:
+            self._events.append(event)
+            if self._recording is not None:
+                self._recording.note(event["slot"], "INFO", event_line(event))
+
+    def _answer(self, conductor: Conductor, question: Question) -> None:
+        """Take what the operator asks; what breaks the protocol is refused and does the run no harm."""
+        try:
+            order = Order(read_request(OPERATOR, question.payload), question)
+        except MalformedMessage as error:
+            question.answer(Answer(refused=(str(error),)).pack())
+            return
+        if order.request.do == "status":
+            order.tell(self._status(conductor))
+        elif self._brief.part["shard"]:
+            order.refuse("this run is in shards, which are not steered; run it with --set shards=1 for that")
+        else:
+            self._steering.take(order, self._joiner.done)
+
+    def _dismiss(self, conductor: Conductor) -> None:
+        """The run is over: nobody can get at it, and whoever waits is told."""
+        with suppress(FileNotFoundError):
+            remove_control(self.folder)
+        self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
+        while not conductor.questions.empty():
+            conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
+
+    def _status(self, conductor: Conductor) -> dict[str, Any]:
+        """How the run is doing."""
+        before, done = self._recent
+        rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)
+        return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.totals)
+
+    def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
+        message = Reader(conductor.keys[source], payload)
+        if is_refusal(message):
+            raise read_refusal(message, source)
+        if is_whereabouts(message):
+            self._stall.take(source, read_whereabouts(message, self._scenario.slots))
+            return
+        if not self._news(source, message):
+            return
+        if source == ROUTER:
+            for name, account in self._joiner.journal(message).items():
+                self._keeper.totals.tallies[name].count(account)
+        elif source == CONTROLLER:
+            self._keeper.totals.solve_times.add(self._joiner.decisions(message).tolist())
+        elif source != SENSOR and is_leaving(message):
+            self._leave(source, message)
+        elif source != SENSOR:
+            self._joiner.report(source, message)
+        elif is_held(message):
+            self._steering.held(message.slot(self._joiner.sent))
+        else:
+            self._joiner.truth(message)
+        self._stand_in()
+        slots = self._joiner.take()
+        if slots is None:
+            return
+        self._verifier.joined(slots)
+        scored = self._keeper.add(slots)
+        write_rows(self._writer, slots, scored, self._scenario.first_trial)
+        self._digest_rows.write(self._writer)
+        if self._recording is not None:
+            self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
+        conductor.report(self._joiner.done)
+        self._progress(scored)
+
+    def _stand_in(self) -> None:
+        """Report for receivers that are away."""
+        for name, stand_in in list(self._stand_ins.items()):
+            if self._joiner.reported(name) == stand_in.next:
+                stand_in.follow(self._joiner.sent)
+            if stand_in.over:
+                del self._stand_ins[name]
+
+    def _news(self, source: str, message: Reader) -> bool:
+        """Whether a message is the one that is due, and no other one that came because some were lost."""
+        found = message.integer("k")
+        if source not in (ROUTER, SENSOR) and is_leaving(message):  # comes before the reports of the slots before it
+            return not self._steering.has_left(source, found)
+        joiner = self._joiner
+        due = {ROUTER: joiner.journaled, SENSOR: joiner.sent}.get(source)
+        due = joiner.reported(source) if due is None else due
+        if found != due:
+            self._due[source].missed(due, found)
+        return found == due
+
+    def _leave(self, name: str, message: Reader) -> None:
+        """Report for a receiver from now on, until it is back."""
+        k, left = read_leaving(message, self._extent)
+        away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
+        if away is None:
+            raise message.malformed(f"a leave before slot {k}", "one where an event makes the receiver leave")
+        key = message.key
+
+        def put(payload: bytes) -> None:
+            self._joiner.report(name, Reader(key, payload))
+
+        self._verifier.left(name, k, left)
+        self._steering.left(name, k)
+        self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
+
+    def _progress(self, scored: Mapping[str, Scored]) -> None:
+        now = time.monotonic()
+        if now - self._told < _PROGRESS_SECONDS:
+            return
+        before, done = self._recent
+        rate = (self._joiner.done - done) / (now - before)
+        self._told, self._recent = now, (now, self._joiner.done)
+        errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
+        tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
+
+    @property
+    def _at(self) -> str:
+        """How far the run came."""
+        return f"slot {self._joiner.done}"
+
+    def _save(self) -> None:
+        """Have on disk what was measured, from time to time. Raises RunError if it cannot be written."""
+        try:
+            with suppress(NoAnswer):  # which is told at the end; rows are written before figures are asked for
+                self._writer.checkpoint(self._at, self._so_far)
+        except OSError as error:
+            raise RunError(unwritten(error)) from error
+
+    def _so_far(self) -> dict[str, Any]:
+        """The summary of a run that goes on."""
+        self._ended = time.monotonic()
+        return self._summary("")
+
+    def _summary(self, how: str) -> dict[str, Any]:
+        """The summary by now; a shard leaves its score for the run's."""
+        folder = self.folder
+        if self._brief.part["shard"]:
+            leave(self._keeper.totals, folder)
+        digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
+        replay, wall = replay_of(folder, self._scenario), self._ended - self._started
+        ending = Ending(
+            wall,
+            how,
+            replay,
+            events=self._events,
+            outages=self._outages,
+            accused=self._accused,
+            misdelivered=self._misdelivered,
+        )
+        return summary_of(self._scenario, self._keeper.totals, digests, ending)
+
+    def settle(self, how: str) -> None:
+        """Have all that was measured on disk, its summary too. Raises OSError if it cannot be written."""
+        self._digest_rows.write(self._writer)
+        self._final = self._summary(how)
+        self._writer.settle(self._at, self._final)
+
+    def finish(self, status: int, how: str, report: Report) -> int:
+        """Close the view, write the summary, and tell the launcher; the exit status of the run.
+
+        report: prints how the run ended, if it was started by hand.
+        """
+        safe = self._recording.close() if self._recording is not None else True
+        try:
+            summary = {**(self._final or self._summary(how)), "ended": how}
+            if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
+                status = RunError.exit_status
+                summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+            if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
+                status = 1
+            how = str(summary["ended"])
+            write_summary(self.folder, summary)
+        except OSError as error:
+            status, how = RunError.exit_status, unwritten(error)
+        view = self._recording.failure if self._recording is not None else None
+        accused = list(self._accused)
+        tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
+        if self._by_hand:
+            with suppress(FileNotFoundError):
+                report(self.folder, status, how)
+        if not safe:
+            os._exit(status)
+        return status

@@ -1,0 +1,158 @@
+"""Lost connections: who was cut off, from when to when, and what is said so that all is sent once more that was lost.
+
+A process that vanishes from the network is waited for. When all are back the conductor begins a round: the sensor sends its
+packets once more from the first slot that is not joined, the router routes them once more, and everybody sends its reports
+once more; whoever has something already ignores it. Rounds go on until slots are joined again.
+
+Source: docs/protocol.md, lost connections.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from evedrop.live.network.access import OBSERVER, RELAY, ROUTER
+from evedrop.live.observer.conductor import Conductor
+from evedrop.live.observer.steering import Steering
+from evedrop.live.protocol.brief import Flow
+
+_SOON_SECONDS = 0.5  # after which a round is repeated that had no effect, and twice as long each time
+_IDLE_SECONDS = 10.0  # for which a run may come to a stand without a reason before a round is tried
+_LONGEST_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A process that was cut off."""
+
+    process: str
+    """Whose connection it was; the router, if it was started anew; all connections are with it."""
+    slot: int
+    """The first slot that was not joined when it was noticed."""
+    until: int | None
+    """The same when the run went on; None if it did not."""
+    seconds: float
+    """From the last slot that was joined before to when the run went on: it may be noticed late."""
+
+
+class Recovery:
+    """Final. say: news to the launcher."""
+
+    def __init__(
+        self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: Callable[..., None]
+    ) -> None:
+        self._conductor, self._steering, self._flow, self._say = conductor, steering, flow, say
+        self._batch_seconds = pace * flow.batch
+        self._missing: dict[str, tuple[int, float]] = {}
+        self._back: dict[str, tuple[int, float]] = {}
+        self._done = 0
+        self._target = 0
+        """Slots below were on the way when a connection was lost."""
+        self._moved = self._joined = time.monotonic()
+        self._longest = 0.0
+        self._wait = 0.0
+        self._number = 0
+        self.outages: list[Outage] = []
+        """All so far."""
+
+    def look(self, done: int) -> None:
+        """See whether something is to be done now that all slots below `done` are joined.
+
+        Raises RunError when somebody has been missing for too long.
+        """
+        now = time.monotonic()
+        if done > self._done:
+            self._go_on(done, now)
+        if self._conductor.missing:
+            self._miss(done, now)
+        elif self._missing:
+            self._all_back(now)
+        elif self._steering.at is not None and done >= self._steering.at:
+            self._moved = self._joined = now  # held, and nothing is expected
+            self._close(done, now)
+        elif now - self._moved > self._limit:
+            self._round(now)
+
+    @property
+    def _limit(self) -> float:
+        """Seconds that may pass without a slot before a round begins."""
+        if self._wait:
+            return self._wait
+        usual = 3.0 * max(self._batch_seconds, self._longest)
+        if self._done < self._target:
+            return max(_SOON_SECONDS, usual)
+        return max(min(_IDLE_SECONDS, max(1.0, self._flow.longest_outage / 3.0)), usual)
+
+    def _go_on(self, done: int, now: float) -> None:
+        if not self._missing and not self._wait:
+            self._longest = max(self._longest, now - self._moved)
+        self._done, self._moved, self._joined, self._wait = done, now, now, 0.0
+        self._close(done, now)
+
+    def _close(self, done: int, now: float) -> None:
+        """The run goes on: whoever was cut off is so no longer."""
+        for name, (slot, since) in self._back.items():
+            outage = Outage(name, slot, done, now - since)
+            self.outages.append(outage)
+            self._say("reconnected", **asdict(outage))
+        self._back = {}
+
+    def _miss(self, done: int, now: float) -> None:
+        for name in self._conductor.missing:
+            self._missing.setdefault(name, (done, min(self._joined, self._conductor.lost.get(name, now))))
+        gone = [
+            name
+            for name in self._conductor.missing
+            if now - self._conductor.lost.get(name, now) > self._flow.longest_outage
+        ]
+        if gone:
+            # Without the router nobody else can be seen either.
+            gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
+            self.give_up(done)
+            self._conductor.despair(gone, self._flow.longest_outage)
+
+    def _all_back(self, now: float) -> None:
+        found = self._missing
+        # All vanish with the router that we are connected to, and with our own connection to it. Behind a relay, the sensor
+        # vanishes with the router, and both with the link between them.
+        own = RELAY if self._conductor.relayed else ROUTER
+        if own in found:
+            found = {own if self._conductor.router_changed() else OBSERVER: found[own]}
+        elif ROUTER in found:
+            found = {ROUTER: found[ROUTER]}
+        for name, beginning in found.items():
+            self._back.setdefault(name, beginning)
+        self._missing = {}
+        self._target = self._done + self._flow.window + self._flow.batch
+        self._wait = 0.0
+        self._round(now)
+
+    def _round(self, now: float) -> None:
+        """Ask for all once more that may have been lost."""
+        self._wait = min(2.0 * self._limit, max(_LONGEST_SECONDS, self._limit))
+        self._moved = now
+        self._number += 1
+        for name, there in self._conductor.processes.items():
+            if there:
+                links = {"links": self._steering.changes} if name == ROUTER else {}
+                self._conductor.command(name, "again", n=self._number, k=self._done, **links)
+        if self._done == 0:
+            self._conductor.start()
+        self._steering.remind()
+        self._conductor.report(self._done)
+
+    def give_up(self, done: int) -> None:
+        """The run has come to its end with slot `done`: whoever is cut off stays so."""
+        now = time.monotonic()
+        self._close(done, now)
+        found = self._missing
+        found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
+        self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
+        self._missing = {}
+
+    def account(self) -> list[Mapping[str, Any]]:
+        """The outages as the summary has them."""
+        return [asdict(outage) for outage in self.outages]

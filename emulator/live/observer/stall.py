@@ -1,0 +1,146 @@
+"""A run that stands still although everybody is on the network: who is silent, found out by asking all on whom they wait.
+
+    observer ── waits for the reports of whoever is furthest behind ── who waits for a message of … ── who waits for nobody
+
+The process at the end of such a chain is the one that the run waits for. What somebody does that nobody waits for is no excuse.
+
+Source: docs/protocol.md, silence.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import final
+
+from evedrop.errors import Silence
+from evedrop.live.network.access import OBSERVER, writer_of
+from evedrop.live.protocol.whereabouts import Whereabouts
+
+_LEAST_SECONDS = 5.0  # a busy machine may not let a process work for some seconds
+_LOOK_SECONDS = 0.25
+_STEP_SECONDS = 1.0  # time in which we did not look ourselves does not count
+
+
+def patience_of(longest_outage: float, pace: float, batch: int) -> float:
+    """Seconds for which a process may do nothing while the run waits for it: in real time it may have nothing to do."""
+    return max(_LEAST_SECONDS, longest_outage) + 2.0 * pace * batch
+
+
+@final
+class Stall:
+    """Notices that a run stands still, and ends it when the process that it waits for has done nothing for too long."""
+
+    def __init__(self, patience: float, batch: int, ask: Callable[[], None]) -> None:
+        """patience: as in `patience_of`; batch: slots of a report; ask: asks everybody where they are."""
+        self._patience, self._batch, self._ask = patience, batch, ask
+        self._looked = time.monotonic()
+        self._done = 0
+        self._stalled = self._asked = 0.0
+        """Seconds for which nothing was joined, and of them those after which everybody was asked last."""
+        self._answers: dict[str, Whereabouts] = {}
+        self._moved: dict[str, tuple[tuple[int, int], float]] = {}
+        """Process → where it is, as it says and as it has reported, and when in this stall that changed."""
+
+    def take(self, process: str, where: Whereabouts) -> None:
+        """A process says where it is."""
+        self._answers[process] = where
+
+    def look(
+        self,
+        done: int,
+        reported: Callable[[], Mapping[str, int]],
+        beside: Collection[str] = (),
+        *,
+        held: bool,
+        missing: bool,
+    ) -> None:
+        """See whether the run goes on; all slots below `done` are joined.
+
+        reported: process → the first slot that it has not reported; beside: those whose reports slots are joined without.
+        held: nothing is expected of anybody; missing: somebody is not on the network, which is another matter. Raises Silence.
+        """
+        now = time.monotonic()
+        if done > self._done or held:
+            self._done, self._looked, self._stalled, self._asked = done, now, 0.0, 0.0
+            self._answers, self._moved = {}, {}
+            return
+        if now - self._looked < _LOOK_SECONDS:
+            return
+        step, self._looked = min(now - self._looked, _STEP_SECONDS), now
+        if missing:
+            return
+        self._stalled += step
+        if self._stalled < self._patience / 2.0:
+            return
+        places = reported()
+        for process, k in places.items():
+            # It reports at least every batch of slots: further than that, nobody believes it without a report.
+            said = min(self._answers[process].slot, k + self._batch) if process in self._answers else -1
+            place = (said, k)
+            if process not in self._moved or self._moved[process][0] < place:
+                # The first answer is no move: since when it is there nobody knows.
+                known = self._moved.get(process)
+                first = known is None or (known[0][0] == -1 and known[0][1] == k)
+                self._moved[process] = (place, 0.0 if first else self._stalled)
+        if self._stalled - self._asked > self._patience / 10.0:
+            self._asked = self._stalled
+            self._ask()
+        if self._stalled > self._patience + 2.0 * self._patience / 10.0:
+            self._judge(places, beside)
+
+    def _judge(self, places: Mapping[str, int], beside: Collection[str]) -> None:
+        silent = tuple(silent_of(places, self._answers, beside))
+        still = self._stalled - max(self._moved[name][1] for name in silent)
+        if still > self._patience:
+            what = " and ".join(_described(name, self._answers.get(name)) for name in silent)
+            raise Silence(
+                silent,
+                f"alive, and silent for {still:.0f} s while the run waits for slot {self._done} ({what}); look at "
+                f"{' and '.join(f'logs/{name}.log' for name in silent)}, or allow more by longest_outage",
+            )
+
+
+def _described(name: str, where: Whereabouts | None) -> str:
+    if where is None:
+        return f"{name} does not say where it is"
+    if not where.waits:
+        return f"{name} is at slot {where.slot} and waits for nobody"
+    return f"{name} says that it is at slot {where.slot} and waits on {', '.join(where.waits[:3])}"
+
+
+def silent_of(places: Mapping[str, int], answers: Mapping[str, Whereabouts], beside: Collection[str] = ()) -> list[str]:
+    """The processes that a run which stands still waits for.
+
+    places: process → the first slot that it has not reported; answers: where those are who have said so; beside: processes
+    whose reports slots are joined without.
+    """
+    joined = {name: k for name, k in places.items() if name not in beside}
+    behind = [name for name, k in joined.items() if k == min(joined.values())]
+    seen, chain = set(behind), list(behind)
+    idle, mute = [], []
+    for name in chain:  # grows
+        where = answers.get(name)
+        if where is None:
+            mute.append(name)
+        elif not where.waits:
+            idle.append(name)
+        for key in () if where is None else where.waits:
+            writer = writer_of(key)
+            if writer in places and writer not in seen:
+                seen.add(writer)
+                chain.append(writer)
+    if idle or mute:
+        return idle or mute
+    if len(behind) < len(joined):
+        return behind
+    # Everybody says to wait for another one: somebody has not sent what it says to have sent.
+    owing = {
+        writer
+        for name in chain
+        for key in answers[name].waits
+        if (writer := writer_of(key)) in answers
+        and writer != OBSERVER
+        and ("/progress/" in key or answers[writer].slot > answers[name].slot)
+    }
+    return [name for name in places if name in owing] or behind

@@ -1,0 +1,46 @@
+"""Who reports for a receiver while it is not there, so that every slot of every receiver is accounted for.
+
+Source: docs/results.md, summary.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from evedrop.live.network.reporting import BeliefReporter
+from evedrop.live.protocol.brief import Brief
+from evedrop.model.receiver import Belief, prior
+from evedrop.model.slot.intermittent_receiver import Absence
+from evedrop.scenario import Scenario
+from evedrop.scenario.timeline import Away
+
+
+class StandIn:
+    """Reports what a receiver that is away will believe, from what it believed when it left. Final.
+
+    brief: of the observer; put: takes the reports as if they were the receiver's own.
+    """
+
+    def __init__(
+        self, brief: Brief, scenario: Scenario, receiver: str, away: Away, left: Belief, put: Callable[[bytes], None]
+    ) -> None:
+        process = scenario.process.process
+        fresh = prior(process, scenario.trials, away.start)
+        self._absence = Absence(process, left if away.keeps_state else fresh)
+        cuts, late = scenario.cuts(receiver), scenario.window(receiver) > 0
+        self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts, away.start, late)
+        self.next = away.start
+        """The first slot that is not reported."""
+        self._stop = min(away.stop, scenario.slots)
+
+    @property
+    def over(self) -> bool:
+        """Whether all slots of the outage are reported."""
+        return self.next == self._stop
+
+    def follow(self, end: int) -> None:
+        """Report the slots of the outage below `end`."""
+        for k in range(self.next, min(end, self._stop)):
+            self._reporter.add(k, self._absence.next(k))
+            self.next = k + 1
+        self._reporter.flush(self.next)

@@ -1,0 +1,33 @@
+"""How a run that goes on is doing, for its operator.
+
+Source: docs/protocol.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evedrop.live.observer.conductor import Conductor
+from evedrop.live.observer.steering import Steering
+from evedrop.scenario import Scenario
+from evedrop.score.totals import Totals
+
+
+def status_of(
+    scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, totals: Totals
+) -> dict[str, Any]:
+    """The status of a run that has done so many slots, so many a second."""
+    links = {}
+    for name, tally in totals.tallies.items():
+        account = tally.link
+        fraction = account["delivered"] / account["offered"] if account["offered"] else None
+        links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
+    return {
+        "slot": done,
+        "slots": scenario.slots,
+        "slots_per_second": 0.0 if steering.paused else rate,
+        "state": "paused" if steering.paused else "running" if steering.at is None else "held",
+        "processes": conductor.processes,
+        "links": links,
+        "events": steering.events,
+    }

@@ -1,0 +1,254 @@
+"""Holding the run at a slot: everybody has reported all slots before it, what is due is done, and the run goes on.
+
+So an event takes effect exactly between two slots, one of the scenario's and one of the operator's alike. While the sensor
+holds, nothing is under way but what links delay.
+
+Source: docs/control.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from evedrop.errors import RunError, ScenarioError
+from evedrop.live.network.access import ROUTER, SENSOR
+from evedrop.live.network.session import READY_SECONDS
+from evedrop.live.observer.conductor import Conductor
+from evedrop.live.observer.operator_orders import Order, Step
+from evedrop.loading.amended import with_event
+from evedrop.model.slot.link import Change
+from evedrop.scenario import Scenario
+from evedrop.scenario.timeline import Act, acts_of
+
+_PROCESS_ACTS = ("kill", "restart", "pause", "resume")
+
+
+class Steering:
+    """The holds of a run. Final.
+
+    tell: news to the launcher, such as that it must do something to a process; it confirms with `done`.
+    keep: is given the scenario that the run is of, each time that the operator has changed it.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        conductor: Conductor,
+        tell: Callable[..., None],
+        keep: Callable[[Scenario], None],
+    ) -> None:
+        self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep
+        self._due = scenario.timeline.holds
+        self.at: int | None = None
+        """The slot before which the sensor holds; None while it does not."""
+        self._pending: list[Act] = []
+        self._left: dict[str, int] = {}
+        self._waiting: Act | None = None
+        self._confirmed = True
+        self._since = 0.0
+        self._orders: deque[Order] = deque()
+        self._asked = False
+        self._step: Step | None = None
+        self._last = -1
+        self._changed: set[str] = set()
+        self.paused = False
+        """Whether the run stays held until the operator says otherwise."""
+        self.events: list[dict[str, Any]] = []
+        """What was done, from which slot on, and by whom."""
+
+    def held(self, k: int) -> None:
+        """The sensor holds before slot k. It may say so once more."""
+        if k <= self._last:
+            return
+        self.at, self._last, self._asked = k, k, False
+        self._pending = list(self._due.pop(k, []))
+        self._since = time.monotonic()
+
+    def left(self, name: str, k: int) -> None:
+        """A receiver has said its last word before slot k, with which its absence begins."""
+        self._left[name] = k
+
+    def has_left(self, name: str, k: int) -> bool:
+        """Whether it has said so."""
+        return self._left.get(name) == k
+
+    def done(self, number: int) -> None:
+        """The launcher has done what it was asked for last."""
+        self._confirmed = self._confirmed or number == len(self.events)
+
+    def take(self, order: Order, reported: int) -> None:
+        """The operator asks for something: it is done at the next hold, for which the sensor is asked; reported as below."""
+        if order.request.do == "resume" and self.at is None and not self._orders:
+            self._forget_step(reported, "the run was resumed")
+            order.done(reported, "the run goes on already")
+            return
+        self._orders.append(order)
+        if self.at is None and not self._asked:
+            self._asked = True
+            self._conductor.command(SENSOR, "hold")
+
+    def carry_on(self, reported: int) -> None:
+        """Go as far as can be gone now that all slots below `reported` are joined.
+
+        Raises RunError for a process that does not come back in time.
+        """
+        if self.at is None:
+            return
+        if reported < self.at:
+            self._despair(f"not everybody has reported all slots below {self.at}")
+            return
+        while self._settled():
+            if self._pending and not self._may(self._pending[0]):
+                self._despair(f"{self._pending[0].names[0]} has not said what it believes")
+                return
+            if self._pending:
+                self._do(self.at, self._pending.pop(0))
+            elif self._step is not None and self.at >= self._step.until:
+                self._step_is_over(self._step, self.at)
+            elif self._orders:
+                self._obey(self.at, self._orders.popleft())
+            else:
+                if not self.paused:
+                    self._release()
+                return
+
+    def over(self, reported: int, *, complete: bool) -> None:
+        """The run has ended, and nothing can be asked of it any more."""
+        if self._step is not None:
+            said = self._step.passed(reported)
+            if complete:
+                self._step.order.done(reported, f"{said}; the run is over")
+            else:
+                self._step.order.refuse(f"{said}; the run was ended before the step was over")
+        self._step = None
+        while self._orders:
+            self._orders.popleft().refuse("the run came to its end before; nothing was done")
+
+    def _settled(self) -> bool:
+        """Whether what was done last has taken effect."""
+        act = self._waiting
+        if act is None:
+            return True
+        # Who is paused for long loses its connection, and must have it back.
+        there = {"kill": False, "restart": True, "resume": True}.get(act.kind)
+        if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
+            if act.kind in ("restart", "resume"):
+                self._conductor.absent -= set(act.names)
+                self._tell("back")
+            self._waiting = None
+            return True
+        self._despair(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
+        return False
+
+    def _despair(self, what: str) -> None:
+        """Raise RunError if what is waited for has been missing for too long."""
+        if time.monotonic() - self._since > READY_SECONDS:
+            raise RunError(
+                f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {what}; look at the logs"
+            )
+
+    def _may(self, act: Act) -> bool:
+        """Whether who is to go has left: its reports may all have been due before the hold, which it has not seen then."""
+        return act.kind not in ("kill", "pause") or all(self._left.get(name) == act.at for name in act.names)
+
+    def _do(self, k: int, act: Act) -> None:
+        self._note(k, act.said, "scenario")
+        if act.kind in _PROCESS_ACTS:
+            if act.kind in ("kill", "pause"):
+                self._conductor.absent |= set(act.names)
+            self._waiting, self._confirmed, self._since = act, False, time.monotonic()
+            self._tell("act", do=act.kind, process=act.names[0], first=k, number=len(self.events))
+
+    def _obey(self, k: int, order: Order) -> None:
+        """Do what the operator asks for, before slot k."""
+        match order.request.do:
+            case "link":
+                self._change(k, order)
+            case "pause":
+                said = f"held already, before slot {k}" if self.paused else f"held before slot {k}"
+                if not self.paused:
+                    self._pause(k, "pause the run")
+                self._forget_step(k, "the run was paused")
+                order.done(k, said)
+            case "resume":
+                if self.paused:
+                    self._note(k, "resume the run", "operator")
+                self.paused = False
+                self._forget_step(k, "the run was resumed")
+                order.done(k, f"the run goes on with slot {k}")
+            case "step" if self._step is not None:
+                order.refuse(f"another step goes on, to slot {self._step.until - 1}; wait for its end, or pause before")
+            case "step":
+                slots = order.request.slots or 1
+                self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
+                self._step, self.paused = Step(order, k, k + slots), False
+
+    def _change(self, k: int, order: Order) -> None:
+        """Let the scenario have one more event, at slot k, and tell the router what its links do from then on."""
+        try:
+            changed = with_event(self._scenario, order.request.event or {}, k)
+        except ScenarioError as error:
+            order.refuse(*error.mistakes)
+            return
+        act = next(acts_of(changed.event[-1]))
+        self._scenario = changed
+        self._note(k, act.said, "operator")
+        self._keep(changed)
+        for name in act.names:
+            self._changed.add(name)
+            changes = [_plain(one) for one in changed.timeline.changes[name] if one.at >= k]
+            self._conductor.command(ROUTER, "change", link=name, changes=changes)
+        order.done(k, f"from slot {k} on: {act.said}")
+
+    def _pause(self, k: int, said: str | None = None) -> None:
+        self.paused = True
+        self._tell("held", before=k)
+        if said is not None:
+            self._note(k, said, "operator")
+
+    def _step_is_over(self, step: Step, k: int) -> None:
+        self._step = None
+        self._pause(k)
+        step.order.done(k, f"{step.passed(k)}; held before slot {k}")
+
+    def _forget_step(self, k: int, why: str) -> None:
+        """Tell who waits for a step's end that there will be none."""
+        if self._step is not None:
+            self._step.order.done(k, f"{self._step.passed(k)}; {why} before the step was over")
+        self._step = None
+
+    def _note(self, k: int, said: str, by: str) -> None:
+        self.events.append({"slot": k, "event": said, "by": by})
+
+    def _release(self) -> None:
+        self.at = None
+        until = {} if self._step is None else {"until": self._step.until}
+        self._gone = {"k": self._last, "absent": sorted(self._conductor.absent), **until}
+        self._go()
+
+    def _go(self) -> None:
+        self._conductor.command(ROUTER, "go", k=self._last)
+        self._conductor.command(SENSOR, "go", **self._gone)
+
+    @property
+    def changes(self) -> dict[str, list[dict[str, Any]]]:
+        """Link → all its changes, of the links that an operator has changed."""
+        timeline = self._scenario.timeline.changes
+        return {name: [_plain(one) for one in timeline[name]] for name in sorted(self._changed)}
+
+    def remind(self) -> None:
+        """Say once more what was said last: it may have been lost with a connection. A hold may take as long as ever."""
+        self._since = time.monotonic()
+        if self.at is None and self._last >= 0:
+            self._go()
+        if self._asked:
+            self._conductor.command(SENSOR, "hold")
+
+
+def _plain(change: Change) -> dict[str, Any]:
+    """A change as the command to the router has it."""
+    optional = {"settings": change.settings, "cut": change.cut}
+    return {"at": change.at, **{name: value for name, value in optional.items() if value is not None}}

@@ -1,0 +1,244 @@
+"""Messages: msgpack maps whose arrays are little-endian bytes. What does not fit is refused with its sender named.
+
+Source: docs/protocol.md, messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from reprlib import Repr
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.errors import Gap, MalformedMessage, Refusal
+from evedrop.live.network.access import reader_of, writer_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags
+
+_LARGEST = 2**62  # of an integer that nothing else bounds: slots can be added to it without leaving 64 bits
+_SMALL_BYTES = 1 << 16  # whatever msgpack makes of so few bytes takes some megabytes at most
+_WHY_CHARACTERS = 1000
+_PARTS = 4096  # lists and maps in a message, of more than a handful of processes
+
+
+def pack(fields: Mapping[str, Any]) -> bytes:
+    """A message of these fields."""
+    message: bytes = msgpack.packb(fields, use_bin_type=True)
+    return message
+
+
+def packed_flags(flags: Flags) -> NDArray[np.uint8]:
+    """Flags (…, R) as bit masks (…, ⌈R/8⌉), trial 0 in the lowest bit of the first byte."""
+    return np.packbits(flags, axis=-1, bitorder="little")
+
+
+def flags_of(masks: NDArray[np.uint8], trials: int) -> Flags:
+    """The flags (…, R) of bit masks (…, ⌈R/8⌉)."""
+    return np.unpackbits(masks, axis=-1, count=trials, bitorder="little").view(np.bool_)
+
+
+class Reader:
+    """Reads one message's fields with their types, sizes and ranges checked. Final."""
+
+    def __init__(self, key: str, payload: bytes, fields: Mapping[Any, Any] | None = None, parts: int = _PARTS) -> None:
+        """parts: how many lists and maps a large message may have."""
+        self.key = key
+        self._parts = parts
+        self._payload = payload
+        self._fields = self._unpacked() if fields is None else fields
+
+    def _unpacked(self) -> Mapping[Any, Any]:
+        count = None if len(self._payload) <= _SMALL_BYTES else _counter(self._parts)
+        try:
+            found = msgpack.unpackb(
+                self._payload, raw=False, strict_map_key=False, list_hook=count, object_hook=count, max_ext_len=0
+            )
+        except Exception as error:
+            raise self.malformed(f"not msgpack ({type(error).__name__})", "a msgpack map") from error
+        if not isinstance(found, dict):
+            raise self.malformed(f"a {type(found).__name__}", "a msgpack map")
+        return found
+
+    def malformed(self, found: str, expected: str) -> MalformedMessage:
+        """The error that says what was found in this message and what was expected."""
+        return MalformedMessage(self.key, found, expected, self._payload, writer_of(self.key))
+
+    def has(self, name: str) -> bool:
+        """Whether an optional field is there."""
+        return name in self._fields
+
+    def integer(self, name: str, least: int = 0, most: int | None = None) -> int:
+        """An integer field, from `least` to `most`."""
+        value = self._fields.get(name)
+        if type(value) is not int or not least <= value <= (_LARGEST if most is None else most):
+            bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
+            raise self.malformed(f"{name} = {shown(value)}", f"an integer {name} {bounds}")
+        return value
+
+    def text(self, name: str) -> str:
+        """A string field."""
+        value = self._fields.get(name)
+        if not isinstance(value, str):
+            raise self.malformed(f"{name} = {shown(value)}", f"a string {name}")
+        return value
+
+    def choice(self, name: str, choices: Collection[str]) -> str:
+        """A string field that is one of these."""
+        value = self.text(name)
+        if value not in choices:
+            raise self.malformed(f"{name} = {shown(value)}", f"one of {', '.join(choices)}")
+        return value
+
+    def flag(self, name: str) -> bool:
+        """A boolean field."""
+        value = self._fields.get(name)
+        if type(value) is not bool:
+            raise self.malformed(f"{name} = {shown(value)}", f"a boolean {name}")
+        return value
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """A list of strings."""
+        value = self._fields.get(name)
+        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+            raise self.malformed(f"{name} = {shown(value)}", f"a list {name} of strings")
+        return tuple(value)
+
+    def array(self, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """A binary field as an array of the shape (read-only)."""
+        value = self._fields.get(name)
+        kind = np.dtype(dtype)
+        expected = kind.itemsize
+        for length in shape:
+            expected *= length
+        if not isinstance(value, bytes) or len(value) != expected:
+            size = f"{len(value)} bytes" if isinstance(value, bytes) else shown(value)
+            raise self.malformed(f"{name} of {size}", f"{expected} bytes, {dtype} of shape {shape}")
+        return np.frombuffer(value, kind).reshape(shape)
+
+    def flags(self, name: str, shape: tuple[int, ...]) -> Flags:
+        """A binary field of bit masks, a bit a trial: flags of the shape (…, R)."""
+        trials = shape[-1]
+        masks = self.array(name, "u1", (*shape[:-1], (trials + 7) // 8))
+        if trials % 8 and (masks[..., -1] >> trials % 8).any():
+            raise self.malformed(f"{name} with a bit beyond trial {trials - 1}", "unused bits that are 0")
+        return flags_of(masks, trials)
+
+    def counts(self, name: str, dtype: str, shape: tuple[int, ...], most: int) -> NDArray[Any]:
+        """A binary field of unsigned integers, none above `most`."""
+        array = self.array(name, dtype, shape)
+        if array.size and int(array.max()) > most:
+            raise self.malformed(f"{name} of {int(array.max())}", f"numbers from 0 to {most}")
+        return array
+
+    def span(self, first: int, slots: int, most: int) -> int:
+        """Field c of a message that must begin at slot `first`: how many slots it covers, all of a run of so many.
+
+        most: slots that one message may cover. Raises Gap if it begins at another slot.
+        """
+        self.slot(first)
+        return self.integer("c", 1, max(1, min(most, slots - first)))
+
+    def map(self, name: str) -> Mapping[Any, Any]:
+        """A map field."""
+        value = self._fields.get(name)
+        if not isinstance(value, dict):
+            raise self.malformed(f"{name} = {shown(value)}", f"a map {name}")
+        return value
+
+    def maps(self, name: str) -> list[Reader]:
+        """A list of maps, each as a reader of its own."""
+        value = self._fields.get(name)
+        if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+            raise self.malformed(f"{name} = {shown(value)}", f"a list {name} of maps")
+        return [Reader(self.key, self._payload, one) for one in value]
+
+    def nested(self, name: str) -> Reader:
+        """A map field, as a reader of its own."""
+        return Reader(self.key, self._payload, self.map(name))
+
+    def slot(self, expected: int) -> int:
+        """Field k, which must be the slot that is due. Raises Gap otherwise."""
+        k = self.integer("k")
+        if k != expected:
+            raise Gap(self.key, expected, k, writer_of(self.key))
+        return k
+
+    def finite(self, name: str, shape: tuple[int, ...]) -> Floats:
+        """A float64 array without NaN or infinity."""
+        array = self.array(name, "<f8", shape)
+        if not np.isfinite(array).all():
+            raise self.malformed(f"{name} with a NaN or infinity", "finite numbers")
+        return array
+
+
+def shown(value: object) -> str:
+    """A field's value as an error shows it: short, however large it is."""
+    short = Repr()
+    short.maxlevel, short.maxdict, short.maxlist, short.maxstring = 2, 4, 4, 40
+    return f"{len(value)} bytes" if isinstance(value, bytes) else short.repr(value)
+
+
+def _counter(most: int) -> Callable[[Any], Any]:
+    """Called with each list and map of a message as it is unpacked: ends that when there are too many."""
+    left = most
+
+    def count(part: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError("more lists and maps than any message has")
+        return part
+
+    return count
+
+
+def progress(k: int) -> bytes:
+    """All slots below k are done."""
+    return pack({"k": k})
+
+
+def read_progress(key: str, payload: bytes, sent: int) -> int:
+    """The first slot that is not done; all slots below `sent` were sent."""
+    return Reader(key, payload).integer("k", 0, sent)
+
+
+def control(command: str, **fields: Any) -> bytes:
+    """A command of the conductor: `start`, `end`, `hold`, `change`, `go` or `again`, and what goes with it."""
+    return pack({"do": command, **fields})
+
+
+def over(dropped: int) -> bytes:
+    """A process's last message: it ends because it was told to. dropped: messages that it dropped, which named another key."""
+    return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
+
+
+def refusal(key: str, why: str) -> bytes:
+    """A process ends because it cannot read a message on a key, and why."""
+    return pack({"refuses": key, "why": why[:_WHY_CHARACTERS]})
+
+
+def is_refusal(message: Reader) -> bool:
+    """Whether a process says that it refuses a message."""
+    return message.has("refuses")
+
+
+def read_refusal(message: Reader, process: str) -> Refusal:
+    """The error of a process that refuses a message on a key, which must be one that it reads."""
+    key, why = message.text("refuses"), message.text("why")
+    if key.split("/")[:2] != message.key.split("/")[:2] or not writer_of(key) or reader_of(key) != process:
+        raise message.malformed(f"refuses = {shown(key)}", f"a key that {process} reads")
+    plain = "".join(character if character.isprintable() else "?" for character in why[:_WHY_CHARACTERS])
+    return Refusal(process, key, writer_of(key), plain)
+
+
+def is_over(message: Reader) -> bool:
+    """Whether a message is a process's last."""
+    return message.has("over")
+
+
+def read_over(message: Reader) -> int:
+    """How many messages the process dropped."""
+    return message.integer("misdelivered", 1) if message.has("misdelivered") else 0

@@ -1,0 +1,81 @@
+"""How large the messages of a run can be, by kind: a router drops larger ones, and nobody takes in more at a time.
+
+Source: docs/protocol.md, limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from evedrop.live.protocol.brief_entries import KINDS
+from evedrop.model.digest import DIGEST_BYTES
+from evedrop.model.links.link import REASONS
+from evedrop.model.slot.account import COUNTED_BURSTS
+
+_FRAME_BYTES = 4096
+"""What a message has besides its arrays: its key, field names, and what a later version may add."""
+_COMMAND_BYTES = 32 * 2**20  # changes of links bring their settings: recorded losses among them
+_QUESTION_BYTES = 2**20
+_NAME_BYTES = 128  # of a key in a list
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What the sizes of a run's messages follow from."""
+
+    n: int
+    trials: int
+    recorded: int
+    batch: int
+    """Slots of a report at most."""
+    window: int
+    """The longest of the receivers', in slots."""
+    receivers: int
+    header: int = 0
+    inputs: int = 0
+    period: int = 1
+    """Slots between decisions."""
+
+    @property
+    def of_kinds(self) -> dict[str, int]:
+        """Kind of key, as it comes after the run's name → bytes of its largest message."""
+        n, R, c = self.n, self.trials, self.batch
+        mask, state = (R + 7) // 8, 8 * n * R
+        packet = state + 8 * self.header * R + mask + _NAME_BYTES
+        # Digests of two blocks: one may be of a single slot, before an outage.
+        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + 2 * DIGEST_BYTES * R
+        truth = c * (2 * state + 8 * self.inputs * R + 4 * mask)
+        leaving = state + 8 * n * n * R
+        decisions = 8 * (c + self.period) + 2 * DIGEST_BYTES * R
+        waits = _NAME_BYTES * (self.receivers + 1)
+        link = c * (mask + 4 * (len(REASONS) + 1) + 2 * R) + 4 * (COUNTED_BURSTS + self.window + 2) + _FRAME_BYTES
+        kinds = {
+            "uplink": packet + state,
+            "downlink": packet * (1 + 2 * (self.window + 1)) + state,
+            "ack": mask,
+            "estimate": state,
+            "state": state,
+            "input": 8 * self.inputs * R + mask,
+            "telemetry": max(report, truth, leaving, decisions, waits),
+            "journal": max(self.receivers * link, waits),
+            "progress": 0,
+            "control": _COMMAND_BYTES,
+        }
+        return {kind: kinds[kind] + _FRAME_BYTES for kind in KINDS}
+
+
+def low_pass(run: str, kinds: Mapping[str, int]) -> list[dict[str, Any]]:
+    """The `low_pass_filter` section of a router's Zenoh configuration: whatever a process puts that is larger is dropped."""
+
+    def rule(name: str, keys: list[str], size: int, messages: list[str]) -> dict[str, Any]:
+        return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": keys, "size_limit": size}
+
+    under = {kind: [f"evedrop/{run}/{kind}", f"evedrop/{run}/{kind}/**"] for kind in kinds}
+    asked = [f"evedrop/{run}/control/observer"]
+    return [
+        *(rule(kind, under[kind], size, ["put", "delete"]) for kind, size in kinds.items()),
+        rule("question", asked, _QUESTION_BYTES, ["query"]),
+        rule("answer", asked, _COMMAND_BYTES, ["reply"]),
+    ]

@@ -1,0 +1,279 @@
+"""Messages to the observer: the true state, what a receiver believes, and the journal of every packet's fate.
+
+Source: docs/protocol.md, messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.live.protocol.codec import Reader, pack, packed_flags, shown
+from evedrop.model.digest import DIGEST_BYTES, Blocks, Digests
+from evedrop.model.links.link import REASONS
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Codes, Flags
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What a run has, to which the numbers in messages are held."""
+
+    slots: int
+    batch: int
+    """Slots that one report may cover."""
+    n: int
+    trials: int
+    recorded: int = 1
+    """Trials whose covariances are reported."""
+    inputs: int = 0
+    """Inputs that a controller decides; 0 without one."""
+    measures: bool = False
+    """Whether the sensor filters what it measures."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the states of a slot, (n, R)."""
+        return self.n, self.trials
+
+
+def held(k: int) -> bytes:
+    """The sensor's telemetry when it holds before slot k."""
+    return pack({"k": k, "held": True})
+
+
+def is_held(message: Reader) -> bool:
+    """Whether the sensor's telemetry says that it holds."""
+    return message.has("held")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The sensor's telemetry over c slots."""
+
+    first: int
+    x: Floats
+    """(c, n, R)."""
+    nu: Flags
+    """(c, R)."""
+    sent: Flags | None = None
+    """Whether there was a packet, (c, R); None of a scheme that sends in every slot."""
+    alarms: Flags | None = None
+    """Whether the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch them."""
+    u: Floats | None = None
+    """The inputs as they were decided, (c, m, R); None without a controller."""
+    failed: Flags | None = None
+    """Where their decision failed, (c, R)."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters: x is what it makes of them; None where they are x."""
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return len(self.x)
+
+    def pack(self) -> bytes:
+        """As a message."""
+        fields = {"k": self.first, "c": self.count, "x": self.x.tobytes(), "nu": packed_flags(self.nu).tobytes()}
+        if self.sent is not None:
+            fields["sent"] = packed_flags(self.sent).tobytes()
+        if self.alarms is not None:
+            fields["alarms"] = packed_flags(self.alarms).tobytes()
+        if self.u is not None:
+            fields["u"] = self.u.tobytes()
+        if self.failed is not None and self.failed.any():
+            fields["failed"] = packed_flags(self.failed).tobytes()
+        if self.true is not None:
+            fields["true"] = self.true.tobytes()
+        return pack(fields)
+
+
+def read_truth(message: Reader, first: int, extent: Extent) -> Truth:
+    """The sensor's telemetry that must begin at slot `first`."""
+    c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
+    return Truth(
+        first,
+        message.finite("x", (c, n, trials)),
+        message.flags("nu", (c, trials)),
+        message.flags("sent", (c, trials)) if message.has("sent") else None,
+        message.flags("alarms", (c, trials)) if message.has("alarms") else None,
+        message.finite("u", (c, extent.inputs, trials)) if extent.inputs else None,
+        read_failed(message, (c, trials)) if extent.inputs else None,
+        message.finite("true", (c, n, trials)) if extent.measures else None,
+    )
+
+
+def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
+    """Where decisions failed, (…, R): nowhere, unless it is said."""
+    if not message.has("failed"):
+        return np.zeros(shape, np.bool_)
+    return message.flags("failed", shape)
+
+
+def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, Digests]:
+    """Block, by its first slot → digests, (R, 32); blocks: those that end in the slots of the message."""
+    digests: dict[int, Digests] = {}
+    found = message.map("digests")
+    for block, value in found.items():
+        if type(block) is not int or block not in blocks:
+            expected = (
+                f"of the blocks that end in these slots, {blocks}" if blocks else "none: no block ends in these slots"
+            )
+            raise message.malformed(f"digests of block {shown(block)}", expected)
+        if not isinstance(value, bytes) or len(value) != trials * DIGEST_BYTES:
+            raise message.malformed(f"digests of block {block}", f"{trials * DIGEST_BYTES} bytes a block")
+        digests[block] = np.frombuffer(value, np.uint8).reshape(trials, DIGEST_BYTES)
+    if len(digests) < len(blocks):
+        raise message.malformed(f"digests of blocks {sorted(digests)}", f"those of {blocks}, which end in these slots")
+    return digests
+
+
+@dataclass(frozen=True)
+class Report:
+    """A receiver's telemetry over c slots."""
+
+    first: int
+    x_hat: Floats
+    """(c, n, R)."""
+    action: Codes
+    """(c, R)."""
+    P: Floats
+    """Believed covariance of the recorded trials, (c, n, n, recorded)."""
+    trace: Floats
+    """Sum over all trials of tr P and of its square, (c, 2)."""
+    late: NDArray[np.uint16] | None
+    """Packets of earlier slots that arrived within the window, (c, R); None of who has none."""
+    digests: Mapping[int, Digests]
+    """Block, by its first slot → digests, (R, 32), of the blocks that ended in these slots."""
+    late_used: NDArray[np.uint16] | None = None
+    """Those of `late` that were used, and not discarded, (c, R)."""
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return len(self.x_hat)
+
+    def pack(self) -> bytes:
+        """As a message."""
+        return pack(
+            {
+                "k": self.first,
+                "c": self.count,
+                "x_hat": self.x_hat.tobytes(),
+                "action": self.action.tobytes(),
+                "P": self.P.tobytes(),
+                "trace": self.trace.tobytes(),
+                **({} if self.late is None else {"late": self.late.astype("<u2").tobytes()}),
+                **({} if self.late_used is None else {"late_used": self.late_used.astype("<u2").tobytes()}),
+                "digests": {block: digests.tobytes() for block, digests in self.digests.items()},
+            }
+        )
+
+
+def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, window: int = 0) -> Report:
+    """A receiver's telemetry that must begin at slot `first`; blocks: its digests'; window: how late its packets may be."""
+    c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
+    action = message.array("action", "u1", (c, trials))
+    if action.size and int(action.max()) > max(Action):
+        raise message.malformed(f"action {int(action.max())}", f"actions from 0 to {int(max(Action))}")
+    late, used = (
+        message.counts(name, "<u2", (c, trials), window) if message.has(name) else None
+        for name in ("late", "late_used")
+    )
+    if used is not None and (late is None or (used > late).any()):
+        raise message.malformed("more in late_used than in late", "late packets that were used among those that came")
+    return Report(
+        first,
+        message.finite("x_hat", (c, n, trials)),
+        action,
+        message.finite("P", (c, n, n, extent.recorded)),
+        message.finite("trace", (c, 2)),
+        late,
+        read_digests(message, trials, blocks.ended(first, first + c)),
+        used,
+    )
+
+
+def leaving(k: int, belief: Belief) -> bytes:
+    """A receiver's last word before an outage that begins with slot k: what it believes."""
+    return pack({"k": k, "leaves": True, "x_hat": belief.x_hat.tobytes(), "P": belief.P.tobytes()})
+
+
+def is_leaving(message: Reader) -> bool:
+    """Whether a receiver's telemetry is such a word."""
+    return message.has("leaves")
+
+
+def read_leaving(message: Reader, extent: Extent) -> tuple[int, Belief]:
+    """The slot before which a receiver leaves, and what it believes."""
+    n, trials = extent.shape
+    x_hat, P = message.finite("x_hat", extent.shape), message.finite("P", (n, n, trials))
+    return message.integer("k", 0, extent.slots), Belief(x_hat, P, np.zeros(trials, np.uint8))
+
+
+@dataclass(frozen=True)
+class Journal:
+    """The router's journal over c slots."""
+
+    first: int
+    count: int
+    links: Mapping[str, Account]
+
+    def pack(self) -> bytes:
+        """As a message."""
+        links = {name: _account(link) for name, link in self.links.items()}
+        return pack({"k": self.first, "c": self.count, "links": links})
+
+
+def _account(link: Account) -> dict[str, Any]:
+    return {
+        "delivered": packed_flags(link.delivered).tobytes(),
+        "lost": {reason: counts.astype("<u4").tobytes() for reason, counts in link.lost.items()},
+        **({} if link.late is None else {"late": link.late.astype("<u2").tobytes()}),
+        "bursts": link.bursts.astype("<u4").tobytes(),
+        "delays": link.delays.astype("<u4").tobytes(),
+        **({} if link.unsent is None else {"unsent": link.unsent.astype("<u4").tobytes()}),
+    }
+
+
+def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent: Extent) -> Journal:
+    """The journal that must begin at slot `first`, with every receiver in it; windows: receiver → its window."""
+    c, trials = message.span(first, extent.slots, extent.batch), extent.trials
+    links: dict[str, Account] = {}
+    for name, window in windows.items():
+        link = message.nested("links").nested(name)
+        reasons = link.nested("lost")
+        if set(link.map("lost")) != set(REASONS):
+            raise message.malformed(
+                f"{name} lost for {shown(list(link.map('lost')))}", f"the reasons {sorted(REASONS)}"
+            )
+        links[name] = Account(
+            link.flags("delivered", (c, trials)),
+            {reason: reasons.counts(reason, "<u4", (c,), trials) for reason in REASONS},
+            link.counts("late", "<u2", (c, trials), window) if link.has("late") else None,
+            link.counts("bursts", "<u4", (COUNTED_BURSTS,), c * trials),
+            link.counts("delays", "<u4", (window + 2,), c * trials),
+            link.counts("unsent", "<u4", (c,), trials) if link.has("unsent") else None,
+        )
+        _check_account(message, name, links[name], window)
+    return Journal(first, c, links)
+
+
+def _check_account(message: Reader, name: str, link: Account, window: int) -> None:
+    """Every packet of a slot has one fate: delivered in the slot, lost, not sent, or, where it may be late, under way."""
+    trials = link.delivered.shape[1]
+    fates = np.count_nonzero(link.delivered, axis=1) + sum(counts.astype(np.int64) for counts in link.lost.values())
+    fates += 0 if link.unsent is None else link.unsent.astype(np.int64)
+    wrong = (fates > trials) if window else (fates != trials)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise message.malformed(
+            f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} of them"
+        )
+    if int(link.delays.sum(dtype=np.int64)) > link.delivered.size:
+        raise message.malformed(f"more delays than packets of {name}", f"at most {link.delivered.size}")

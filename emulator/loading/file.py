@@ -1,0 +1,218 @@
+"""Scenario files: found by name or path, read, changed by dotted keys, checked.
+
+Source: docs/scenario.md.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from pydantic import (
+    ValidationError,
+)
+
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.files import Unreadable, is_folder, is_there, shown, text_of
+from evedrop.loading.mistakes import across_tables, sentences
+from evedrop.model.registry import place_of
+from evedrop.plugins import named_in
+from evedrop.scenario.disturbances import disturbances_beside, disturbances_read
+from evedrop.scenario.drawn import with_faults
+from evedrop.scenario.dry_run import dry_run, foreign
+from evedrop.scenario.filter_noise import filter_noise_read
+from evedrop.scenario.recordings import beside, read_recordings
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.values import unusable
+
+MOST_BYTES = 2**28
+"""Of a scenario file: room for the outcomes of millions of packets inside it."""
+MOST_VALUES = 1_000_000
+"""In lists of a scenario file: more would take longer to read than anybody waits."""
+_MOST_DOTS = 32
+# Python's reader of TOML takes a time that grows with the square of a key's parts.
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
+_DOTTED = re.compile(rf"""(?<![A-Za-z0-9_"'.-])(?:{_PART}){{{_MOST_DOTS}}}""")
+
+
+def shipped() -> dict[str, Path]:
+    """The scenarios inside the package: name → file."""
+    folder = Path(str(resources.files("evedrop.scenarios")))
+    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"), key=lambda path: path.stem)}
+
+
+def write_new(path: Path) -> None:
+    """Write the commented scenario to start from. Raises UsageError if the file is there or cannot be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(
+                Path(str(resources.files("evedrop.scenarios"))).joinpath("_new.toml").read_text(encoding="utf-8")
+            )
+    except FileExistsError as error:
+        raise UsageError(f"{path} is there already; give another name") from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror}); give another place") from error
+
+
+def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False) -> Scenario:
+    """The scenario of a shipped name or a file, with changes by dotted key.
+
+    beyond_horizon: allow more slots than float64 can follow exactly, for what does not follow states.
+
+    Raises ScenarioError with every mistake, UsageError if there is no such scenario.
+    """
+    path = shipped().get(str(source), Path(source))
+    # A shipped scenario names nothing in its folder: what a change names is in the current one.
+    folder = Path() if str(source) in shipped() else path if is_folder(path) else path.parent
+    return parse(read(source), shown(source), changes, beyond_horizon=beyond_horizon, folder=folder)
+
+
+def read(source: str | Path) -> str:
+    """The text of a shipped scenario or a file."""
+    path = shipped().get(str(source), Path(source))
+    if is_folder(path):
+        path = path / "scenario.toml"
+        if not is_there(path):
+            raise UsageError(f"{shown(source)} is a folder without a scenario.toml; give a scenario's name or file")
+    try:
+        return text_of(path, MOST_BYTES)
+    except Unreadable as error:
+        if is_there(path):
+            raise UsageError(f"{shown(path)} cannot be read ({error}); a scenario is a TOML file") from error
+        near = difflib.get_close_matches(str(source), shipped(), 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise UsageError(
+            f"no scenario {shown(source)} ({error}); {hint}`evedrop list` shows the shipped ones"
+        ) from error
+
+
+def parse(
+    text: str,
+    source: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    beyond_horizon: bool = False,
+    folder: Path = Path(),
+) -> Scenario:
+    """The scenario in a TOML text. Raises ScenarioError with every mistake.
+
+    folder: where the files are that it names; those that a change names are in the current one.
+    """
+    if (values := text.count(",")) > MOST_VALUES:
+        large = f"has about {values} values; expected at most {MOST_VALUES}"
+        raise ScenarioError(source, [f"{large}: put disturbances and recordings into files of their own"])
+    if (dotted := _DOTTED.search(text)) is not None:
+        line = text.count("\n", 0, dotted.start()) + 1
+        long = f"line {line} has a key of {_MOST_DOTS} or more parts"
+        raise ScenarioError(source, [f"{long}; expected one such as legitimate.link.quality"])
+    try:
+        tables = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
+        raise ScenarioError(source, [f"not TOML: {error}"]) from error
+    if mistakes := list(unusable(tables)):
+        raise ScenarioError(source, mistakes)
+    beside(tables, folder)
+    disturbances_beside(tables, folder)
+    for entry in ("secret_file", "modules"):
+        if isinstance(tables.get(entry), str):
+            tables[entry] = str((folder / tables[entry]).absolute())
+    return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
+
+
+def checked(
+    tables: dict[str, Any],
+    source: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    beyond_horizon: bool = False,
+    folder: Path = Path(),
+) -> Scenario:
+    """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake.
+
+    folder: where modules of anybody's own are, if the tables name any and no folder of modules.
+    """
+    for key, value in (changes or {}).items():
+        _set(tables, key, value)
+    if changes and (wrong := list(unusable(tables))):
+        raise ScenarioError(source, wrong)
+    if any(named_in(tables)):
+        tables.setdefault("modules", str(folder))
+    if isinstance(tables.get("modules"), str):
+        tables["modules"] = str(Path(tables["modules"]).absolute())
+    recordings = [*read_recordings(tables), *disturbances_read(tables), *filter_noise_read(tables)]
+    try:
+        scenario = Scenario.model_validate(tables)
+    except ValidationError as error:
+        raise ScenarioError(source, [*sentences(error), *recordings, *_across(tables, beyond_horizon, None)]) from error
+    broken = dry_run(scenario)
+    # A class that breaks in a dry run breaks again when it is asked about itself: that is not told twice.
+    mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
+    if scenario.nemesis is not None:
+        tables, found = with_faults(tables, scenario, sentences)
+        mistakes += found
+        if not mistakes:
+            scenario = Scenario.model_validate(tables)
+            mistakes = _across(tables, beyond_horizon, scenario)
+    if mistakes:
+        raise ScenarioError(source, mistakes)
+    return scenario
+
+
+def _across(
+    tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None, silent: bool = False
+) -> list[str]:
+    """What only shows across tables; an error of somebody's class that is asked on the way is a mistake too, unless silent."""
+    try:
+        return across_tables(tables, beyond_horizon, scenario)
+    except Exception as error:
+        if not foreign(tables):
+            raise
+        if silent:
+            return []
+        return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
+
+
+def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
+    """Put a value at a dotted key: names of tables that may be new, and numbers of list entries, the next one included."""
+    names = dotted.split(".")
+    inner: Any = tables
+    for name, after in pairwise(names):
+        new: Any = [] if after == "0" else {}
+        if isinstance(inner, dict) and name:
+            inner = inner.setdefault(name, new)
+        elif isinstance(inner, list) and name.isdecimal() and int(name) <= len(inner):
+            if int(name) == len(inner):
+                inner.append(new)
+            inner = inner[int(name)]
+        else:
+            raise _no_such_key(dotted, name, inner)
+    last = names[-1]
+    if isinstance(inner, dict) and last:
+        inner[last] = value
+    elif isinstance(inner, list) and last.isdecimal() and int(last) <= len(inner):
+        inner[int(last) : int(last) + 1] = [value]
+    else:
+        raise _no_such_key(dotted, last, inner)
+
+
+def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
+    if isinstance(inner, list):
+        return UsageError(f"--set {dotted}: {name} is no entry of a list of {len(inner)}; give 0 to {len(inner)}")
+    if isinstance(inner, dict):
+        return UsageError(f"--set {dotted}: it has an empty part; give a dotted key such as legitimate.link.quality")
+    return UsageError(f"--set {dotted}: {name} is not in a table or list; give the dotted key of a scenario entry")
+
+
+def value_of(text: str) -> Any:
+    """A value on the command line: as TOML, else as a string."""
+    try:
+        tables = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return tables["value"] if len(tables) == 1 else text

@@ -1,0 +1,1 @@
+"""The same trials without a network: simulation, Monte Carlo, and its workers."""

@@ -1,0 +1,294 @@
+"""Monte Carlo: the trials of a live run in memory, the same bits without a network.
+
+Trials run in fixed blocks of 500 and are merged in trial order: the results are the same for any number of workers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.expected.expectations import expected_traces_of
+from evedrop.memory.simulation import Mode
+from evedrop.memory.trials import BatchResult, Task, tasks_of
+from evedrop.memory.workers import connected, in_processes, in_this_process, on_cluster
+from evedrop.model.digest import RunDigest, block_starts
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.outcomes import eavesdropper_outcomes
+from evedrop.model.schemes import scheme_of
+from evedrop.results.folder import new_folder
+from evedrop.results.held_folder import HeldFolder
+from evedrop.results.writer import ResultsWriter, write_summary
+from evedrop.scenario import Scenario
+from evedrop.score.expectations_held import replay_of
+from evedrop.score.histogram import SlotHistograms
+from evedrop.score.joined import concatenated
+from evedrop.score.scorekeeper import Ending, events_of, summary_of, write_resolved
+from evedrop.score.sums import SlotSums, squared_errors
+from evedrop.score.totals import Totals
+from evedrop.signals import stop_on_signals
+
+_WORTH_A_PROCESS = 2_000_000  # trial-slots and receivers: below, starting workers costs more than it saves
+_TELL_SECONDS = 0.1
+
+News = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to simulate: what, and where."""
+
+    mode: Mode = Mode.EXACT
+    workers: int | None = None
+    """None: as many as pay on this machine."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, which then does the work."""
+
+    def workers_for(self, scenario: Scenario) -> int:
+        """The number of workers. Raises UsageError if it is not positive."""
+        if self.workers is not None and self.workers < 1:
+            raise UsageError(f"--workers {self.workers}: expected 1 or more")
+        if self.workers is not None:
+            return self.workers
+        work = scenario.trials * scenario.slots * len(scenario.receivers)
+        return len(os.sched_getaffinity(0)) if work > _WORTH_A_PROCESS else 1
+
+
+def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], plan: Plan = Plan()) -> int:
+    """Run all trials of a scenario into a results folder; the exit status. `tell` gets progress as it is made.
+
+    Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
+    what is done in the folder.
+    """
+    check_mode(scenario, plan.mode)
+    workers = plan.workers_for(scenario)
+    started = time.monotonic()
+    failure: RunError | None = None
+    merger = Merger(scenario, plan.mode)
+
+    def ending(how: str) -> Ending:
+        return Ending(time.monotonic() - started, how, replay_of(folder, scenario, plan.mode.value))
+
+    with stop_on_signals() as stop, connected(plan.scheduler) as client:
+        tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
+        with contextlib.closing(HeldFolder(new_folder(folder))) as held, said_of(folder):
+            write_resolved(folder, scenario)
+            with (
+                ResultsWriter.of(folder, scenario) as writer,
+                contextlib.closing(results_of(tasks, workers, client, told, stop.is_set)) as results,
+            ):
+                try:
+                    for result in results:
+                        merger.add(result, writer)
+                        writer.checkpoint(merger.at, lambda: merger.summary(ending("")), lambda: merger.write(writer))
+                except RunError as error:
+                    failure = error
+                how = str(failure) if failure else "complete" if merger.complete else "interrupted"
+                if merger.trials:
+                    merger.write(writer)
+                    summary = merger.summary(ending(how))
+                    writer.settle(merger.at, summary)
+            if not merger.trials:
+                shutil.rmtree(held.now)
+                raise failure or Interrupted("interrupted before anything was done; nothing was kept")
+            write_summary(held.now, summary)
+            if held.now != folder:
+                tell({"event": "moved", "folder": str(held.now)})
+    if failure is not None:
+        raise failure
+    if not merger.complete:
+        raise Interrupted("interrupted; what was done is in the results folder")
+    return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0
+
+
+@contextlib.contextmanager
+def said_of(folder: Path) -> Iterator[None]:
+    """Make a full disk, or whatever else keeps results from being written, an error that says so: RunError."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{folder} cannot be written ({error.strerror or error}); free some space, or give another --out"
+        ) from error
+
+
+def check_mode(scenario: Scenario, mode: Mode) -> None:
+    """Raise UsageError where a mode cannot follow the scenario: who reads packets, numbers that leave double precision."""
+    if mode is Mode.EXACT:
+        return
+    if mode is Mode.ERROR_COORDINATES and scenario.plant is not None:
+        raise UsageError(
+            f"--mode {mode.value} follows errors, not states, and the plant's inputs and disturbances depend on these; give "
+            "--mode exact, or covariance-only for what network and estimators believe of it"
+        )
+    _check_scheme(scenario, mode)
+    for name in scenario.receivers:
+        if scenario.timeline.outages[name] or scenario.window(name):
+            raise UsageError(
+                f"{name} makes use of late packets or goes away, which the mode {mode.value} cannot follow; "
+                "leave --mode out, or take its window and its outages out of the scenario"
+            )
+    for name, table in scenario.eavesdroppers.items():
+        if not STRATEGIES[table.strategy].follows_gamma(table.parameters):
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and what {name} does (strategy {table.strategy}) "
+                f"depends on more; give --mode exact, or take {name} out of the scenario"
+            )
+    for name, expected in expected_traces_of(scenario).items():
+        beyond = np.flatnonzero(np.isinf(expected))
+        if beyond.size:
+            raise UsageError(
+                f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
+                f"give --slots {beyond[0]} or fewer, or take {name} out of the scenario"
+            )
+
+
+def _check_scheme(scenario: Scenario, mode: Mode) -> None:
+    """Raise UsageError for schemes, and who takes their packets for states, whose events alone do not tell what happens."""
+    name = scenario.encoding.scheme
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    reasons = {
+        "reads its packets": scheme.reads_packets,
+        "acts on acknowledgements": scheme.needs_acknowledgements,
+        "may stay silent": scheme.may_be_silent,
+    }
+    for what, so in reasons.items():
+        if so:
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and the scheme {name} {what}; give --mode exact"
+            )
+    for receiver, table in scenario.eavesdroppers.items():
+        follows = STRATEGIES[table.strategy].follows_gamma(table.parameters)
+        if follows and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
+            raise UsageError(
+                f"--mode {mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) uses what "
+                f"the scheme {name} has made of the state; give --mode exact, or take {receiver} out of the scenario"
+            )
+
+
+def results_of(
+    tasks: list[Task], workers: int, client: Any, tell: Callable[[int], None], stopped: Callable[[], bool]
+) -> Generator[BatchResult]:
+    """What the tasks came to, in their order: done on the cluster of a client, else by workers here."""
+    if client is not None:
+        yield from on_cluster(tasks, client, tell, stopped)
+    elif workers == 1 or len(tasks) == 1:
+        yield from in_this_process(tasks, tell, stopped)
+    else:
+        yield from in_processes(tasks, min(workers, len(tasks)), tell, stopped)
+
+
+def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
+    """Progress in trial-slots, with their rate, a few times a second."""
+    started = told = time.monotonic()
+    done = 0
+
+    def take(count: int) -> None:
+        nonlocal told, done
+        done += count
+        now = time.monotonic()
+        if now - told > _TELL_SECONDS:
+            told = now
+            tell(
+                {
+                    "event": "progress",
+                    "total": total,
+                    "done": done,
+                    "rate": done / (now - started),
+                    "rate_unit": "trial-slots/s",
+                }
+            )
+
+    return take
+
+
+class Merger:
+    """Adds up results in trial order. Final."""
+
+    def __init__(self, scenario: Scenario, mode: Mode) -> None:
+        self._scenario = scenario
+        self._mode = mode
+        names = scenario.receivers
+        self._sums = {name: SlotSums.zero(scenario.slots) for name in names}
+        self._totals: list[Totals] = []
+        self._digests = {name: RunDigest() for name in scenario.digested}
+        self._errors: dict[str, SlotHistograms] = {}
+        self._traces: dict[str, SlotHistograms] = {}
+        self._whole = mode is Mode.EXACT
+        self.trials = 0
+
+    @property
+    def at(self) -> str:
+        """How far it came."""
+        return f"{self.trials} of {self._scenario.trials} trials"
+
+    @property
+    def complete(self) -> bool:
+        """Whether every trial has every slot."""
+        done = (tally.done == tally.slots for totals in self._totals for tally in totals.tallies.values())
+        return self.trials == self._scenario.trials and all(done)
+
+    @np.errstate(over="ignore")
+    def add(self, result: BatchResult, writer: ResultsWriter | None = None) -> None:
+        """Take the next batch; its digests and recorded trials are written if there is somewhere to."""
+        for block in result.blocks:
+            self.trials += block.trials
+            self._totals.append(block.totals)
+            for name in self._scenario.receivers:
+                self._sums[name].add(0, block.sums[name])
+            if self._mode is Mode.EXACT:
+                self._add_digests(block.start, block.digests, writer)
+        for mine, theirs in ((self._errors, result.errors), (self._traces, result.traces)):
+            for name, histograms in theirs.items():
+                if name in mine:
+                    mine[name].merge(histograms)
+                else:
+                    mine[name] = histograms
+        if writer is not None and result.recorded:
+            slots = concatenated(result.recorded)
+            writer.input_rows(slots, result.start)
+            errors = {name: squared_errors(slots.x, one.x_hat) for name, one in slots.receivers.items()}
+            writer.trial_rows(slots, errors, result.start)
+
+    def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter | None) -> None:
+        if writer is not None:
+            writer.digest_rows(start, digests)
+        for name, of_blocks in digests.items():
+            self._whole &= sorted(of_blocks) == block_starts(self._scenario.slots, self._scenario.cuts(name))
+            if self._whole:
+                self._digests[name].add(of_blocks)
+
+    @np.errstate(over="ignore")
+    def write(self, writer: ResultsWriter) -> None:
+        """Write the rows of all slots that some trial came to, in place of those that were written before."""
+        writer.restart_slots()
+        expected = expected_traces_of(self._scenario)
+        for name in self._scenario.receivers:
+            sums = self._sums[name].measured()
+            quantiles = np.hstack([self._errors[name].quantiles(), self._traces[name].quantiles()])
+            count = len(sums.trials)
+            covariances = self._mode is Mode.COVARIANCE_ONLY
+            writer.slot_rows(0, name, sums, expected[name][:count], quantiles[:count], covariances)
+
+    @property
+    def totals(self) -> Totals:
+        """Of all that was added."""
+        return Totals.merged(self._totals)
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def summary(self, ending: Ending) -> dict[str, Any]:
+        """The summary of all that was added; mode and events are told here."""
+        totals = self.totals
+        whole = self._whole and self.complete
+        digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
+        events = events_of(self._scenario, min(tally.done for tally in totals.tallies.values()))
+        return summary_of(self._scenario, totals, digests, replace(ending, mode=self._mode.value, events=events))

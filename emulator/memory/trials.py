@@ -1,0 +1,176 @@
+"""Batches of trials as tasks: what a worker is told, what it does, what it gives back.
+
+Sums are kept for fixed blocks of 500 trials, however many a worker simulates side by side, so results do not depend on
+how the work was spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from evedrop.expected.expectations import expected_traces_of
+from evedrop.memory.simulation import Chunk, Measured, Mode, Simulation
+from evedrop.model.digest import Digests
+from evedrop.model.process import Floats
+from evedrop.model.slot.account import Accountant
+from evedrop.scenario import Scenario
+from evedrop.score.histogram import SlotHistograms
+from evedrop.score.joined import Slots
+from evedrop.score.sums import SlotSums, slot_sums
+from evedrop.score.totals import Totals
+
+BLOCK_TRIALS = 500
+_SIDE_BY_SIDE = 4  # blocks: what a call of numpy costs is spread over more trials, and the state still fits the cache
+
+
+@dataclass(frozen=True)
+class Task:
+    """Some consecutive blocks of trials of a scenario."""
+
+    scenario: dict[str, Any]
+    """As `Scenario.model_dump` gives it."""
+    mode: Mode
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """What one block of trials came to: everything by receiver."""
+
+    start: int
+    trials: int
+    sums: dict[str, SlotSums]
+    totals: Totals
+    accountants: dict[str, Accountant]
+    digests: dict[str, dict[int, Digests]]
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """What a task came to."""
+
+    start: int
+    blocks: list[Block]
+    errors: dict[str, SlotHistograms]
+    traces: dict[str, SlotHistograms]
+    recorded: list[Slots] = field(default_factory=list)
+    """The recorded trials of the task, in parts."""
+
+
+def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
+    """The work, in trial order, in parts as equal as they can be and as many for each worker, so that all end together."""
+    blocks = -(-scenario.trials // BLOCK_TRIALS)
+    rounds = -(-blocks // (workers * _SIDE_BY_SIDE))
+    count = min(blocks, rounds * workers)
+    first, end = scenario.first_trial, scenario.first_trial + scenario.trials
+    bounds = [min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1)]
+    tables = scenario.model_dump(mode="json")
+    return [Task(tables, mode, start, stop) for start, stop in pairwise(bounds)]
+
+
+def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:
+    """Simulate a task. `tell` gets the trial-slots done since it was last called; it ends early once `stopped`."""
+    scenario = Scenario.model_validate(task.scenario)
+    names, slots = scenario.receivers, scenario.slots
+    trials = range(task.start, task.stop)
+    recorded = max(0, min(scenario.first_trial + scenario.record_trials, task.stop) - task.start)
+    simulation = Simulation(scenario, trials, recorded if task.mode is Mode.EXACT else 0, task.mode)
+    scale = float(np.trace(scenario.process.process.Q))
+    result = BatchResult(
+        task.start,
+        [_empty_block(scenario, task, start) for start in trials[::BLOCK_TRIALS]],
+        {name: SlotHistograms(slots, scale) for name in names},
+        {name: SlotHistograms(slots, scale) for name in names},
+    )
+    expected = expected_traces_of(scenario)
+    for chunk in simulation.chunks():
+        _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
+        _add_plant(result, chunk)
+        if chunk.recorded is not None:
+            result.recorded.append(chunk.recorded.copied())
+        tell(len(trials) * _count(chunk))
+        if stopped():
+            break
+    # All trials of the task were side by side, so that one decision was of all of them.
+    result.blocks[0].totals.solve_times.merge(simulation.solve_times)
+    for block in result.blocks:
+        rows = slice(block.start - task.start, block.start - task.start + block.trials)
+        for name, digests in simulation.digests.items():
+            block.digests[name] = {number: values[rows] for number, values in digests.items()}
+    return result
+
+
+def _empty_block(scenario: Scenario, task: Task, start: int) -> Block:
+    names = scenario.receivers
+    trials = min(BLOCK_TRIALS, task.stop - start)
+    totals = Totals.of if task.mode is Mode.EXACT else Totals.nothing
+    return Block(
+        start,
+        trials,
+        {name: SlotSums.zero(scenario.slots) for name in names},
+        totals(scenario, trials),
+        {name: Accountant(scenario.window(name), trials) for name in names},
+        {},
+    )
+
+
+@np.errstate(over="ignore")
+def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None:
+    """Take a chunk. The square of a naive receiver's error may leave double precision; then it is inf, as it should."""
+    for name, measured in chunk.receivers.items():
+        for block, part in _parts(result.blocks, result.start, measured):
+            if measured.error is measured.trace:
+                sums = slot_sums(part.error, part.action)
+            else:
+                trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
+                sums = slot_sums(part.error, part.action, trace)
+            block.sums[name].add(chunk.first, sums)
+            tally = block.totals.tallies[name]
+            tally.watched.add(chunk.first, part.error, part.action, sums.trace, part.late)
+            tally.add(chunk.first, part.error, sums, expected[name])
+            account = block.accountants[name].account(range(chunk.first, chunk.first + len(part.error)), part.fates)
+            tally.account(account.delivered, part.action, account.lost, account.unsent)
+            tally.count(account)
+            if account.late is not None and part.late is not None:
+                tally.account_late(account.late, *part.late)
+        result.errors[name].add(chunk.first, measured.error)
+        result.traces[name].add(chunk.first, measured.trace)
+
+
+def _add_plant(result: BatchResult, chunk: Chunk) -> None:
+    """Take what a chunk says of alarms, and of a plant's controller and filter."""
+    for block in result.blocks:
+        totals = block.totals
+        rows = slice(block.start - result.start, block.start - result.start + block.trials)
+        if totals.detection is not None and chunk.alarms is not None:
+            totals.detection.add(chunk.first, chunk.alarms[:, rows])
+        if totals.loop is not None and chunk.acted is not None:
+            totals.loop.add(chunk.acted.part(rows))
+        if totals.filter is not None and chunk.true_errors is not None:
+            totals.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
+
+
+def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tuple[Block, Measured]]:
+    """What was measured, block by block."""
+    for block in blocks:
+        rows = slice(block.start - start, block.start - start + block.trials)
+        yield (
+            block,
+            Measured(
+                measured.error[:, rows],
+                measured.trace[:, rows],
+                measured.action[:, rows],
+                measured.fates.part(trials=rows),
+                None if measured.late is None else measured.late[..., rows],
+            ),
+        )
+
+
+def _count(chunk: Chunk) -> int:
+    return len(next(iter(chunk.receivers.values())).error)

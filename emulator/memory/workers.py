@@ -1,0 +1,246 @@
+"""Carries tasks out: here, in worker processes on this machine, or on a Dask cluster. Results come in task order.
+
+A worker process has a pipe of its own and shares no lock with anybody, so that killing one cannot hang the others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing import connection
+from multiprocessing.connection import Connection, Pipe
+from typing import Any
+
+from evedrop.environment import own_environment
+from evedrop.errors import EvedropError, RunError, UsageError
+from evedrop.interrupts import SIGNALS
+from evedrop.memory.trials import BatchResult, Task, carry_out
+from evedrop.model.registry import place_of
+from evedrop.scenario.dry_run import foreign
+
+_LOOK_SECONDS = 0.1
+_LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
+_REACH_SECONDS = 5.0
+
+Tell = Callable[[int], None]
+Stopped = Callable[[], bool]
+
+
+def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
+    """One after the other, here."""
+    for task in tasks:
+        if stopped():
+            return
+        try:
+            result = carry_out(task, tell, stopped)
+        except EvedropError:
+            raise
+        except Exception as error:
+            # An error of ours shows where it comes from; one of somebody's class says what that is.
+            if isinstance(error, OSError) or not foreign(task.scenario):
+                raise
+            raise RunError(
+                f"one of the trials {task.start} to {task.stop - 1} failed: {place_of(error)}; run `evedrop check` on the "
+                "class it is in"
+            ) from error
+        yield result
+
+
+def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
+    """By worker processes of our own. Raises RunError if one dies."""
+    crew = [_Worker() for _ in range(workers)]
+    try:
+        yield from _in_order(_results(tasks, crew, tell, stopped))
+    finally:
+        for worker in crew:
+            worker.end()
+
+
+class _Worker:
+    """A worker process and this end of its pipe. Final."""
+
+    def __init__(self) -> None:
+        self.pipe, theirs = Pipe()
+        self.number: int | None = None
+        """Of the task under way."""
+        # A session of its own, so that a Ctrl-C in the terminal does not reach it. And not multiprocessing's own kind of
+        # process, which would run the caller's script a second time.
+        command = f"from evedrop.memory.workers import work; work({theirs.fileno()})"
+        # Until it can answer to it, our own stop waits: the mask is inherited.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", command],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env=own_environment(),
+            )
+        except OSError as error:
+            self.pipe.close()
+            raise RunError(f"no worker process can be started ({error}); try fewer --workers") from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            theirs.close()
+
+    def give(self, number: int, task: Task) -> None:
+        self.number = number
+        with contextlib.suppress(OSError):  # it died; the next look at its pipe says so
+            self.pipe.send(task)
+
+    def stop(self) -> None:
+        """Ask for what is done of the task under way."""
+        self.process.terminate()
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.pipe.close()
+
+
+def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stopped) -> Iterator[tuple[int, BatchResult]]:
+    """The results as they come, with their numbers; after a stop, what is done of the tasks under way."""
+    waiting = iter(enumerate(tasks))
+    for worker, (number, task) in zip(crew, waiting, strict=False):
+        worker.give(number, task)
+    deadline: float | None = None
+    while busy := {worker.pipe: worker for worker in crew if worker.number is not None}:
+        if deadline is None and stopped():
+            deadline = time.monotonic() + _LAST_SECONDS
+            for worker in busy.values():
+                worker.stop()
+        if deadline is not None and time.monotonic() > deadline:
+            return
+        for pipe in connection.wait(list(busy), _LOOK_SECONDS):
+            worker = busy[pipe]  # type: ignore[index]  # of the kinds of things to wait for, these are pipes
+            news = _received(worker)
+            if isinstance(news, int):
+                tell(news)
+                continue
+            if isinstance(news, str):
+                raise RunError(f"a worker failed: {news}")
+            if worker.number is not None:
+                yield worker.number, news
+            worker.number = None
+            if deadline is None and (following := next(waiting, None)) is not None:
+                worker.give(*following)
+
+
+def _received(worker: _Worker) -> int | str | BatchResult:
+    try:
+        news: int | str | BatchResult = worker.pipe.recv()
+    except (EOFError, OSError) as error:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            worker.process.wait(_LAST_SECONDS)
+        code = worker.process.returncode
+        how = f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with status {code}"
+        raise RunError(f"a worker process {how}; was it killed, or out of memory? try fewer --workers") from error
+    return news
+
+
+def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResult]:
+    """Results in the order of their numbers; what lies beyond one that never came is left out."""
+    held: dict[int, BatchResult] = {}
+    due = 0
+    for number, result in results:
+        held[number] = result
+        while due in held:
+            yield held.pop(due)
+            due += 1
+
+
+def work(descriptor: int) -> None:
+    """A worker's life: tasks from its pipe until it is ended, or whoever started it is gone."""
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    for number in (signal.SIGINT, signal.SIGHUP):  # these reach whoever started us too, who says when to stop
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    with contextlib.suppress(EOFError, OSError), Connection(descriptor) as pipe:
+        while True:
+            pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
+
+
+def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
+    try:
+        return carry_out(task, tell, stopped)
+    except OSError:
+        raise
+    except EvedropError as error:
+        return str(error)
+    except Exception as error:
+        return f"trials {task.start} to {task.stop - 1}: {place_of(error)}"
+
+
+@contextlib.contextmanager
+def connected(scheduler: str | None) -> Iterator[Any]:
+    """A client of the Dask scheduler at an address; None without an address.
+
+    Raises UsageError if it cannot be reached or the extra `cluster` is not installed.
+    """
+    if scheduler is None:
+        yield None
+        return
+    import asyncio  # noqa: PLC0415 - a tenth of what a worker imports, and none needs it
+
+    try:
+        from distributed import Client  # noqa: PLC0415 - an optional extra
+        from distributed.comm.core import connect  # noqa: PLC0415 - the same
+    except ImportError as error:
+        raise UsageError("--scheduler needs Dask: pip install 'evedrop[cluster]'") from error
+
+    async def reach() -> None:  # a client that finds nobody may hang, and prints what nobody wants to read
+        reached = connect(scheduler, timeout=_REACH_SECONDS)  # type: ignore[no-untyped-call]
+        comm = await asyncio.wait_for(reached, _REACH_SECONDS)
+        await comm.close()
+
+    try:
+        asyncio.run(reach())
+        client = Client(scheduler, timeout=_REACH_SECONDS, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError, TimeoutError) as error:
+        raise UsageError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS:g} s; start one with "
+            "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
+        ) from error
+    with contextlib.closing(client):
+        yield client
+
+
+def on_cluster(tasks: list[Task], client: Any, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
+    """By the workers of a Dask cluster, which must have this version of evedrop installed.
+
+    Raises RunError if one fails or the cluster is gone. After a stop, what is under way there is given up.
+    """
+    futures = [client.submit(_on_worker, task, pure=False) for task in tasks]
+    try:
+        for task, future in zip(tasks, futures, strict=True):
+            while not future.done():
+                if stopped():
+                    return
+                time.sleep(_LOOK_SECONDS)
+            yield _result(future)
+            tell((task.stop - task.start) * int(task.scenario["slots"]))
+    finally:
+        client.cancel(futures)
+
+
+def _result(future: Any) -> BatchResult:
+    try:
+        result: BatchResult = future.result()
+    except RunError as error:
+        raise RunError(f"a worker failed: {error}") from error
+    except Exception as error:
+        raise RunError(
+            f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "
+            "every worker needs this version of evedrop installed, and its log says more"
+        ) from error
+    return result
+
+
+def _on_worker(task: Task) -> BatchResult:
+    return carry_out(task, lambda _: None, lambda: False)

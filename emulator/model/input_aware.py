@@ -1,0 +1,73 @@
+"""The legitimate estimator that is told the inputs: over a slot without a packet it predicts A x̂ + B u instead of A x̂.
+
+A packet that is read has B u in it already, so nothing else changes; P is the same.
+
+Source: docs/mathematics.md, closed loop.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evedrop.model.plant import Plant
+from evedrop.model.process import Dynamics, Floats, Process
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver
+
+
+def guessed(action: Codes) -> Flags:
+    """Where an estimate is a prediction, (…, R), because no packet was read."""
+    unread: Flags = (action == int(Action.LOST)) | (action == int(Action.DISCARDED))
+    return unread
+
+
+class Informed(Receiver):
+    """A receiver that is told the inputs. Final.
+
+    window: slots by which a packet may be late, and so the inputs of as many slots are wanted once more.
+    """
+
+    def __init__(self, receiver: Receiver, plant: Plant, window: int = 0) -> None:
+        super().__init__(receiver.process, receiver.trials)
+        self._receiver, self._plant, self._window = receiver, plant, window
+        self._moved: dict[int, Floats] = {}
+
+    def learn(self, k: int, u: Floats) -> None:
+        """Take the inputs of slot k, (m, R); all slots' in turn, each before the packet of the next slot."""
+        self._moved[k] = self._plant.moved(u)
+        self._moved.pop(k - self._window - 1, None)
+
+    def prior(self, first: int = 0) -> Belief:
+        """The receiver's."""
+        return self._receiver.prior(first)
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """The receiver's."""
+        return self._receiver.act(k, gamma)
+
+    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+        """The receiver's, and B u_{k−1} where no packet was read."""
+        after = self._receiver.step(k, belief, heard)
+        if k == 0:
+            return after
+        moved = np.where(guessed(after.action), self._moved[k - 1], 0.0)
+        return after._replace(x_hat=after.x_hat + moved)
+
+
+class Offset:
+    """How much the estimate that knows the inputs is ahead of the one that does not, from the same packets. Final.
+
+    Both are the same linear recursion: c ← A c + B u where no packet was read, A c where an innovation was, 0 at a state.
+    """
+
+    def __init__(self, process: Process, plant: Plant, trials: int) -> None:
+        self._dynamics = Dynamics(process.A)
+        self._plant = plant
+        self._c = np.zeros((process.n, trials))
+        self._moved: Floats = self._c
+
+    def next(self, action: Codes, u: Floats) -> Floats:
+        """Of the next slot, (n, R), from what the estimator did in it (R,); u (m, R): the inputs of this slot."""
+        c = self._dynamics.product(self._c) + np.where(guessed(action), self._moved, 0.0)
+        self._c = np.where(action == int(Action.STATE), 0.0, c)
+        self._moved = self._plant.moved(u)
+        return self._c

@@ -1,0 +1,1 @@
+"""Numerical building blocks whose bits are the same on every machine."""

@@ -1,0 +1,77 @@
+"""A one-time pad for numbers: what is masked looks like any number of its range, whatever it was.
+
+Source: docs/mathematics.md, masking.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats, Process
+from evedrop.streams import Batch, BlockReader
+
+DEVIATIONS = 16.0
+"""The range reaches at least so many standard deviations of the state to either side: beyond lies less than 2⁻¹⁸⁹."""
+_RANGE_BITS = 53  # so that every number of the range is a float64
+_HALF = 2**52
+
+
+class Mask:
+    """Adds the pad of a slot to a state, modulo a public range, and takes it off again.
+
+    Final. State i of slot k is rounded to a grid of 2⁵³ points over [−H, H), H the least power of two above
+    16 √Σ_k[i, i]; the pad, uniform on the same grid, is added modulo 2H. So what is masked is finite, is uniform on the
+    grid whatever the state, and says nothing about it. Slots may be asked for in any order; in order is quick.
+    """
+
+    def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
+        self._process = process
+        self._reader = BlockReader(key, batch, process.n)
+        self._slots = range(0)
+        self._pads: NDArray[np.int64]
+        self._k = 0
+        self._sigma: Floats = process.initial_covariance[:, :, None]
+        self._exponents: dict[int, NDArray[np.int32]] = {}
+
+    def hide(self, k: int, x: Floats) -> Floats:
+        """The masked state, (n, R), from x_k (n, R)."""
+        return self._turned(k, x, 1)
+
+    def reveal(self, k: int, z: Floats) -> Floats:
+        """The state on its grid, (n, R), from what `hide` made of it."""
+        return self._turned(k, z, -1)
+
+    def steps(self, k: int) -> Floats:
+        """Distance of the grid's points in slot k, (n,): what masking rounds to."""
+        return np.ldexp(1.0, self._exponent(k) + 1 - _RANGE_BITS)
+
+    def _turned(self, k: int, values: Floats, sign: int) -> Floats:
+        exponent = self._exponent(k)[:, None]
+        shift = _RANGE_BITS - 1 - exponent
+        H = np.ldexp(1.0, exponent)
+        # A state beyond 16 deviations is cut to the range, not wrapped around it.
+        points = np.rint(np.ldexp(np.minimum(np.maximum(values, -H), H), shift)).astype(np.int64)
+        points = np.minimum(points, _HALF - 1)
+        turned = (points + _HALF + sign * self._pad(k)) & (2 * _HALF - 1)
+        masked: Floats = np.ldexp((turned - _HALF).astype(np.float64), -shift)
+        return masked
+
+    def _pad(self, k: int) -> NDArray[np.int64]:
+        if k not in self._slots:
+            self._slots = self._reader.block(k)
+            self._pads = (self._reader.uniforms(self._slots) * 2.0**_RANGE_BITS).astype(np.int64)
+        pad: NDArray[np.int64] = self._pads[k - self._slots.start]
+        return pad
+
+    def _exponent(self, k: int) -> NDArray[np.int32]:
+        """The exponents of H in slot k, (n,); of the last two slots asked for, or anew."""
+        if k not in self._exponents:
+            if k < self._k:
+                self._k, self._sigma = 0, self._process.initial_covariance[:, :, None]
+            while self._k < k:
+                self._sigma = self._process.diffuse(self._process.carry(self._sigma))
+                self._k += 1
+            variances = np.array([self._sigma[i, i, 0] for i in range(self._process.n)])
+            self._exponents = {k: np.frexp(DEVIATIONS * np.sqrt(variances))[1]}
+        return self._exponents[k]

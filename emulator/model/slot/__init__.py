@@ -1,0 +1,1 @@
+"""What happens in a slot: process, packets, links, beliefs."""

@@ -1,0 +1,311 @@
+"""A link: the way from the router to one receiver, from random numbers and a timeline to the fate of every packet.
+
+A packet sent in slot k meets, in this order: the queue of a link of limited rate, a cut, the loss model, corruption, the
+delay, the receiver's own window for late packets, and the receiver, which may be down. The first that stops it is the
+reason for which it is lost.
+
+Source: docs/mathematics.md, links; docs/links.md.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.delays import delay_of
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Fate, LossModel
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
+from evedrop.streams import Batch, BlockReader
+
+NEVER = 2**62
+"""A slot that no run comes to."""
+
+
+class Fates(NamedTuple):
+    """What becomes of the packets of c slots."""
+
+    codes: Codes
+    """`Fate`, (c, R)."""
+    delays: NDArray[np.uint32] | None = None
+    """How many slots after its own each packet arrives, (c, R); None: all in their own."""
+    again: Flags | None = None
+    """Whether a second copy arrives with it, (c, R); None: none does."""
+    rests: Floats | None = None
+    """The part of a slot that the first trial's packets take besides, (c,); None where there are no delays."""
+
+    @property
+    def in_time(self) -> Flags:
+        """γ: delivered in its own slot, (c, R)."""
+        delivered: Flags = self.codes == Fate.DELIVERED
+        return delivered if self.delays is None else delivered & (self.delays == 0)
+
+    def in_time_of(self, row: int) -> Flags:
+        """γ of one slot, (R,)."""
+        delivered: Flags = self.codes[row] == Fate.DELIVERED
+        return delivered if self.delays is None else delivered & (self.delays[row] == 0)
+
+    def copied(self) -> Fates:
+        """The same in arrays of its own, of which some may be silenced."""
+        return Fates(self.codes.copy(), self.delays, None if self.again is None else self.again.copy())
+
+    def silence(self, row: int, sent: Flags) -> None:
+        """Make the packets of one slot that are not sent (R,) unsent, in place."""
+        self.codes[row][~sent] = Fate.UNSENT
+        if self.again is not None:
+            self.again[row] &= sent
+
+    def part(self, slots: slice = slice(None), trials: slice = slice(None)) -> Fates:
+        """Of some of the slots and some of the trials."""
+        return Fates(
+            self.codes[slots, trials],
+            None if self.delays is None else self.delays[slots, trials],
+            None if self.again is None else self.again[slots, trials],
+            None if self.rests is None else self.rests[slots],
+        )
+
+
+@dataclass(frozen=True)
+class Outage:
+    """Slots start ≤ k < stop in which a receiver is not there."""
+
+    start: int
+    stop: int
+    reason: Fate
+
+
+@dataclass(frozen=True)
+class Change:
+    """From slot `at` on, a link's settings are others, or it is cut or whole again."""
+
+    at: int
+    settings: Mapping[str, Any] | None = None
+    """As in `Course.settings`; None leaves them."""
+    cut: bool | None = None
+    """None leaves it."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """All that is known of a link in advance: its settings at slot 0, and when they change."""
+
+    settings: Mapping[str, Any]
+    """`loss`: {"model": …}; and, where they are not the default, `delay`: {"model": …}, `reorder`, `duplicate`, `corrupt`:
+    probabilities, `rate` in packets a slot with `queue` in packets."""
+    window: int = 0
+    """Slots by which a packet may be late for its receiver."""
+    changes: tuple[Change, ...] = ()
+    outages: tuple[Outage, ...] = ()
+    correlation: tuple[str, float] | None = None
+    """Whose losses these are tied to, and how strongly."""
+
+    @classmethod
+    def of(cls, spec: Mapping[str, Any]) -> Course:
+        """From plain values, as `plain` gives them."""
+        return cls(
+            spec["settings"],
+            spec["window"],
+            tuple(Change(**change) for change in spec["changes"]),
+            tuple(Outage(start, stop, Fate(reason)) for start, stop, reason in spec["outages"]),
+            tuple(spec["correlation"]) if spec["correlation"] is not None else None,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """As values that a brief can hold."""
+        return {
+            "settings": dict(self.settings),
+            "window": self.window,
+            "changes": [{"at": one.at, "settings": one.settings, "cut": one.cut} for one in self.changes],
+            "outages": [[one.start, one.stop, int(one.reason)] for one in self.outages],
+            "correlation": None if self.correlation is None else list(self.correlation),
+        }
+
+
+def streams_of(receiver: str, course: Course) -> tuple[str, ...]:
+    """The random streams of a receiver's link: losses, delays, everything else that may befall, and correlation."""
+    names = (f"link/{receiver}", f"delay/{receiver}", f"fate/{receiver}")
+    return names if course.correlation is None else (*names, f"mix/{receiver}", f"link/{course.correlation[0]}")
+
+
+@dataclass
+class _State:
+    """What a link remembers from slot to slot: all that must be copied to decide some slots once more. Final."""
+
+    settings: Mapping[str, Any]
+    loss: LossModel
+    cut: bool = False
+    free: float = 0.0
+    """When the queue will have sent all that is in it, in slots."""
+
+    def copied(self) -> _State:
+        """The same, to be changed apart; a loss model never changes what it holds in place."""
+        return replace(self, loss=copy.copy(self.loss))
+
+
+@dataclass
+class Link:
+    """One receiver's link. Final. Must be read in order, any number of slots at a time.
+
+    keys: of `streams_of`.
+    """
+
+    course: Course
+    receiver: str
+    keys: Mapping[str, bytes]
+    batch: Batch
+    _state: _State = field(init=False)
+    _before: tuple[_State, range] | None = field(init=False, default=None)
+    _changes: list[Change] = field(init=False)
+    _readers: dict[tuple[str, int], BlockReader] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._state = _State(self.course.settings, loss_of(self.course.settings["loss"]))
+        self._changes = sorted(self.course.changes, key=lambda change: change.at)
+
+    def planned(self, slots: range) -> Fates:
+        """As `fates`, of slots that may still be amended."""
+        self._before = (self._state.copied(), slots)
+        return self.fates(slots)
+
+    def amended(self, at: int, changes: Iterable[Change]) -> Fates:
+        """The slots last planned from `at` on, decided once more; these changes replace all that were due from then on."""
+        if self._before is None or at not in self._before[1]:
+            raise ValueError(f"slot {at} is not among those last planned")
+        self._state, slots = self._before
+        if at > slots.start:
+            self.fates(range(slots.start, at))
+        earlier = [change for change in self._changes if change.at < at]
+        self._changes = sorted([*earlier, *changes], key=lambda change: change.at)
+        return self.planned(range(at, slots.stop))
+
+    def fates(self, slots: range) -> Fates:
+        """What becomes of the packets of the next slots in every trial."""
+        marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
+        bounds = [slots.start, *marks, slots.stop]
+        parts = []
+        for start, stop in pairwise(bounds):
+            for change in self._changes:
+                if change.at == start:
+                    self._apply(change)
+            parts.append(self._unchanged(range(start, stop)))
+        return parts[0] if len(parts) == 1 else _joined(parts)
+
+    def _apply(self, change: Change) -> None:
+        if change.settings is not None:
+            if change.settings["loss"] != self._state.settings["loss"]:
+                self._state.loss = loss_of(change.settings["loss"])
+            self._state.settings = change.settings
+        if change.cut is not None:
+            self._state.cut = change.cut
+
+    def _unchanged(self, slots: range) -> Fates:
+        """The fates of slots throughout which the settings are the same."""
+        settings, shape = self._state.settings, (len(slots), self.batch.trials)
+        codes = self._state.loss.fates(slots.start, self._loss_uniforms(slots))
+        befalls = any(settings.get(name) for name in ("reorder", "duplicate", "corrupt"))
+        chances = self._uniforms("fate", slots, 3) if befalls else None
+        if chances is not None and settings.get("corrupt"):
+            codes = np.where((codes == 0) & (chances[:, 0] < settings["corrupt"]), np.uint8(Fate.CORRUPTED), codes)
+        delays = self._delays(slots, chances)
+        if settings.get("rate"):
+            waits, full = self._queue(slots)
+            codes = np.where(full[:, None], np.uint8(Fate.OVERFLOW), codes)
+            delays = waits[:, None] + (np.zeros(shape) if delays is None else delays)
+        if self._state.cut:
+            codes = np.where(codes == Fate.OVERFLOW, codes, np.uint8(Fate.CUT))
+        whole = None if delays is None else delays.astype(np.uint32)
+        codes = self._received(slots, codes, whole)
+        again = None
+        if chances is not None and settings.get("duplicate"):
+            again = (codes == Fate.DELIVERED) & (chances[:, 2] < settings["duplicate"])
+        rests = None if delays is None or whole is None else delays[:, 0] - whole[:, 0]
+        return Fates(codes, whole, again, rests)
+
+    def _delays(self, slots: range, chances: Floats | None) -> Floats | None:
+        """In slots, (c, R), before the queue's; None if there are none."""
+        settings = self._state.settings
+        if settings.get("delay") is None:
+            return None
+        model = delay_of(settings["delay"])
+        reader = self._reader("delay", 1)
+        numbers = (reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0]
+        delays = model.delays(slots.start, numbers)
+        if chances is not None and settings.get("reorder"):
+            delays = np.where(chances[:, 1] < settings["reorder"], 0.0, delays)
+        return delays
+
+    def _queue(self, slots: range) -> tuple[Floats, Flags]:
+        """How long the packet of each slot waits for those before it, in slots, (c,), and whether it finds no place."""
+        rate, places = float(self._state.settings["rate"]), int(self._state.settings["queue"])
+        waits, full = np.zeros(len(slots)), np.zeros(len(slots), np.bool_)
+        for row, k in enumerate(slots):
+            wait = max(0.0, self._state.free - k)
+            full[row] = wait * rate > places
+            waits[row] = 0.0 if full[row] else wait
+            if not full[row]:
+                self._state.free = max(self._state.free, float(k)) + 1.0 / rate
+        return waits, full
+
+    def _received(self, slots: range, codes: Codes, delays: NDArray[np.uint32] | None) -> Codes:
+        """The fates once it is seen whether the receiver can take what the network delivers."""
+        arrives: NDArray[np.int64] = np.arange(slots.start, slots.stop)[:, None]
+        sent = arrives
+        if delays is not None:
+            arrives = sent + delays
+            codes = np.where((codes == 0) & (delays > self.course.window), np.uint8(Fate.LATE), codes)
+        for outage in self.course.outages:
+            if delays is not None or (outage.start < slots.stop and slots.start < outage.stop):
+                away = (codes == 0) & (sent < outage.stop) & (arrives >= outage.start)
+                codes = np.where(away, np.uint8(outage.reason), codes)
+        if delays is not None:
+            codes = np.where((codes == 0) & (arrives >= self.batch.slots), np.uint8(Fate.UNDERWAY), codes)
+        return codes
+
+    def _loss_uniforms(self, slots: range) -> Floats:
+        """Of this link's own stream, or in some slots of the one that its losses are tied to."""
+        width = self._state.loss.uniforms_per_slot
+        own = self._uniforms("link", slots, width)
+        if self.course.correlation is None:
+            return own
+        other, strength = self.course.correlation
+        mixed = self._uniforms("mix", slots, 1)
+        theirs = self._reader_of(f"link/{other}", width).uniforms(slots)
+        return np.where(mixed < strength, theirs, own)
+
+    def _uniforms(self, stream: str, slots: range, width: int) -> Floats:
+        return self._reader(stream, width).uniforms(slots)
+
+    def _reader(self, stream: str, width: int) -> BlockReader:
+        return self._reader_of(f"{stream}/{self.receiver}", width)
+
+    def _reader_of(self, name: str, width: int) -> BlockReader:
+        if (name, width) not in self._readers:
+            self._readers[name, width] = BlockReader(self.keys[name], self.batch, width)
+        return self._readers[name, width]
+
+
+def _joined(parts: list[Fates]) -> Fates:
+    """Fates of consecutive slots as one."""
+    shapes = [part.codes.shape for part in parts]
+
+    def column(name: str, dtype: Any, axes: int = 2) -> Any:
+        values = [getattr(part, name) for part in parts]
+        if all(value is None for value in values):
+            return None
+        blank = [np.zeros(shape[:axes], dtype) for shape in shapes]
+        return np.concatenate([one if one is not None else zero for one, zero in zip(values, blank, strict=True)])
+
+    codes = np.concatenate([part.codes for part in parts])
+    return Fates(codes, column("delays", np.uint32), column("again", np.bool_), column("rests", np.float64, 1))
+
+
+def link_of(loss: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
+    """A link that does nothing but lose: its loss model, `{"model": …}`, and the key of its losses."""
+    return Link(Course({"loss": loss}), "it", {"link/it": key}, batch)

@@ -1,0 +1,123 @@
+"""The probabilities of a link: how likely a packet of each slot is there some slots later, piece by piece of its course.
+
+Source: docs/mathematics.md, late packets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from evedrop.model.delays import delay_of
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Chain
+from evedrop.model.process import Floats
+from evedrop.model.slot.link import Course
+
+_FAR = 10**8  # a slot by which everything that moves has come to rest
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Slots from `start` on, until the next segment, in which a link's settings are the same."""
+
+    start: int
+    chain: Chain
+    """That the losses follow; of losses without a memory that differ from slot to slot, a single state."""
+    passes: float
+    """Probability that a packet that is not lost comes through: 1 − corrupt, and 0 while the link is cut."""
+    arrived: Floats
+    """Probability that a packet that comes through is there 0, 1, … slots later, (window + 1,)."""
+    quality_at: Callable[[range], Floats] | None = None
+    """Of losses that differ from slot to slot: probability that a packet is not lost, (c,)."""
+
+    def quality(self, slots: range) -> Floats:
+        """Probability that a packet comes through in each slot and state, (c, states)."""
+        if self.quality_at is not None:
+            return self.passes * self.quality_at(slots)[:, None]
+        return np.repeat(self.passes * self.chain.quality[None], len(slots), axis=0)
+
+
+@dataclass(frozen=True)
+class LinkLaw:
+    """A link's segments, and when its receiver is not there."""
+
+    segments: tuple[Segment, ...]
+    outages: tuple[tuple[int, int, bool], ...] = ()
+    """First slot, first slot after, and whether the receiver keeps its state."""
+
+    @classmethod
+    def steady(cls, chain: Chain) -> LinkLaw:
+        """Of a link that does nothing but lose, by a chain."""
+        return cls((Segment(0, chain, 1.0, np.ones(1)),))
+
+    @property
+    def window(self) -> int:
+        """Slots by which a packet may be late."""
+        return len(self.segments[0].arrived) - 1
+
+    @property
+    def last(self) -> Chain:
+        """What the link comes to: its last segment's chain, with the packets that arrive in the end."""
+        segment = self.segments[-1]
+        gone = any(stop > _FAR for _, stop, _ in self.outages)
+        quality = segment.quality(range(_FAR, _FAR + 1))[0] * (0.0 if gone else segment.arrived[-1])
+        return Chain(segment.chain.transitions, segment.chain.law, quality)
+
+    @property
+    def alike(self) -> Chain | None:
+        """A single state, if every packet's fate is independent of all others' and alike, and none is late; as in the paper."""
+        one = len(self.segments) == 1 and not self.outages and self.window == 0
+        return self.last if one and self.segments[0].quality_at is None and self.segments[0].chain.independent else None
+
+
+def law_of(course: Course) -> LinkLaw | None:
+    """The law of a link, from all that is known of it in advance; None if theory does not know it.
+
+    It does not know losses with a memory that is no chain, or that never settle, queues, delays that are no independent
+    draws, and receivers that are away while packets are under way.
+    """
+    segments = []
+    for start, settings, cut in stretches(course):
+        segment = _segment(start, settings, cut, course.window)
+        if segment is None:
+            return None
+        segments.append(segment)
+    late = any(segment.arrived[0] < segment.arrived[-1] for segment in segments)
+    if late and course.outages:
+        return None
+    if not late:
+        segments = [replace(one, arrived=one.arrived[-1:]) for one in segments]
+    outages = tuple((one.start, one.stop, getattr(one, "keeps_state", True)) for one in course.outages)
+    return LinkLaw(tuple(segments), outages)
+
+
+def stretches(course: Course) -> list[tuple[int, Mapping[str, Any], bool]]:
+    """First slots of stretches in which a link's settings are the same, with them and whether it is cut."""
+    settings, cut = course.settings, False
+    marks = [(0, settings, False)]
+    for change in sorted(course.changes, key=lambda one: one.at):
+        settings = settings if change.settings is None else change.settings
+        cut = cut if change.cut is None else change.cut
+        marks = [mark for mark in marks if mark[0] != change.at] + [(change.at, settings, cut)]
+    return marks
+
+
+def _segment(start: int, settings: Mapping[str, Any], cut: bool, window: int) -> Segment | None:
+    loss = loss_of(settings["loss"])
+    if settings.get("rate", 1.0) < 1.0 or not (loss.chain is not None or (loss.memoryless and loss.settles)):
+        return None
+    arrived = np.ones(window + 1)
+    if settings.get("delay") is not None:
+        model, reorder = delay_of(settings["delay"]), settings.get("reorder", 0.0)
+        there = [model.arrived(lag) for lag in range(window + 1)]
+        if any(one is None for one in there):
+            return None
+        arrived = reorder + (1.0 - reorder) * np.array(there, np.float64)
+    passes = 0.0 if cut else 1.0 - settings.get("corrupt", 0.0)
+    if loss.chain is not None:
+        return Segment(start, loss.chain, passes, arrived)
+    return Segment(start, Chain(np.ones((1, 1)), np.ones(1), np.ones(1)), passes, arrived, loss.quality_at)

@@ -1,0 +1,66 @@
+"""Packets under way on a link: what arrives in each slot, in time, late, or twice."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.links.link import Fate
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags, Heard
+from evedrop.model.slot.link import Fates
+
+
+class Late(NamedTuple):
+    """Packets of an earlier slot, or once more of this one, that arrive now."""
+
+    k: int
+    """The slot they were sent in."""
+    heard: Heard
+    """The packets; γ marks the trials in which one arrives."""
+    copy: bool = False
+    """Whether these are second copies of packets that have arrived."""
+
+
+class Arrival(NamedTuple):
+    """All that arrives at a receiver in a slot."""
+
+    heard: Heard
+    """The slot's own packets."""
+    late: tuple[Late, ...] = ()
+
+
+class Transit:
+    """Final. Slots must be passed on in order; packets wait here until they arrive."""
+
+    def __init__(self) -> None:
+        self._due: dict[int, list[Late]] = {}
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything is under way."""
+        return bool(self._due)
+
+    def arrival(self, k: int, fates: Fates, row: int, z: Floats, header: NDArray[np.int64] | None = None) -> Arrival:
+        """What arrives in slot k, whose packets z (n, R) and header (h, R) have the fates of one row."""
+        codes, delays, again = fates.codes[row], fates.delays, fates.again
+        delivered: Flags = codes == Fate.DELIVERED
+        due = self._due.pop(k, [])
+        if delays is not None:
+            waits = delays[row]
+            for wait in np.unique(waits[delivered]):
+                if wait:
+                    self._keep(k, int(wait), Heard(delivered & (waits == wait), z, header), copy=False)
+            delivered = delivered & (waits == 0)
+        if again is not None and again[row].any():
+            waits = np.zeros(len(codes), np.uint32) if delays is None else delays[row]
+            for wait in np.unique(waits[again[row]]):
+                self._keep(k, int(wait), Heard(again[row] & (waits == wait), z, header), copy=True)
+            due += self._due.pop(k, [])
+        return Arrival(Heard(delivered, z, header), tuple(due))
+
+    def _keep(self, k: int, wait: int, heard: Heard, copy: bool) -> None:
+        header = None if heard.header is None else heard.header.copy()
+        self._due.setdefault(k + wait, []).append(Late(k, Heard(heard.gamma, heard.z.copy(), header), copy))

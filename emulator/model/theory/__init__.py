@@ -1,0 +1,1 @@
+"""What theory says: expectations, limits, bounds, and the choice of parameters."""

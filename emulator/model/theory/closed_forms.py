@@ -1,0 +1,160 @@
+"""Closed forms of schemes that the outcomes of a slot alone do not give: bounds, and chains with a memory.
+
+Source: docs/mathematics.md, twin track, acknowledged references, schedules by holding time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evedrop.model.process import Floats, Process
+
+
+def twin_track_bound(process: Process, slots: int) -> Floats:
+    """½ tr A^k Σ0 A^kᵀ for k = 0 … slots−1, (slots,): no eavesdropper of twin tracks has a smaller mean squared error.
+
+    Holds for μ_e = 1 and unlimited means, without coin and starts. inf once it overflows.
+
+    Source: docs/mathematics.md, twin track.
+    """
+    bound = np.empty(slots)
+    grown = process.initial_covariance
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(slots):
+            trace = 0.5 * float(np.trace(grown))
+            bound[k] = trace if np.isfinite(trace) else np.inf
+            grown = process.A @ grown @ process.A.T
+    return bound
+
+
+def reference_covariances(process: Process, received: float, acknowledged: tuple[float, float], slots: int) -> Floats:
+    """E P_k of a reader of state-secrecy codes with L = A, for k = 0 … slots−1, (slots, n, n); inf from where it overflows.
+
+    received: the probability that it hears a packet. acknowledged: the probabilities that the packet is acknowledged to
+    the sensor and it heard it, and that it is acknowledged and it did not. With P⁻ and R⁻ the error and the error of the
+    reference, each carried on,
+
+        P_k = R⁻ if heard, else P⁻;   R_k = P_k if acknowledged, else R⁻;   R = 0 before the first acknowledgement,
+
+    which is linear in (P, R), so the expectations follow it.
+
+    Source: docs/mathematics.md, acknowledged references.
+    """
+    _, unheard = acknowledged
+    found = np.empty((slots, process.n, process.n))
+    P = R = np.zeros_like(process.Q)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(slots):
+            A = process.A
+            predicted = A @ P @ A.T + process.Q if k else process.initial_covariance
+            carried = A @ R @ A.T
+            P = received * carried + (1.0 - received) * predicted
+            R = (1.0 - unheard) * carried + unheard * predicted
+            if not np.isfinite(P).all():
+                found[k:] = np.inf
+                break
+            found[k] = P
+    return found
+
+
+@dataclass(frozen=True)
+class SensorChain:
+    """What the sensor does, as a Markov chain, and what that does to one receiver's error.
+
+    Entry [s, r] of the two matrices is the probability, in state s, that the receiver's error is reset to 0, or carried
+    on, and that the next state is r. All slots start in `start`.
+
+    Source: docs/mathematics.md, schedules by holding time.
+    """
+
+    start: Floats
+    """Law of the state in slot 0, (S,)."""
+    reset: Floats
+    """P ← 0, (S, S)."""
+    carried: Floats
+    """P ← A P Aᵀ + Q, (S, S); together with `reset`, rows sum to 1."""
+
+    def covariances(self, process: Process, slots: int) -> Floats:
+        """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows."""
+        found = np.empty((slots, process.n, process.n))
+        law = self.start
+        E = np.zeros((len(law), process.n, process.n))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(slots):
+                source = process.Q if k else process.initial_covariance
+                grown = process.A @ E @ process.A.T + law[:, None, None] * source
+                E = np.tensordot(self.carried.T, grown, axes=1)
+                law = law @ (self.reset + self.carried)
+                found[k] = E.sum(axis=0)
+                if not np.isfinite(found[k]).all():
+                    found[k:] = np.inf
+                    break
+        return found
+
+    def limit(self, process: Process) -> Floats:
+        """Limit of E P_k, (n, n); all inf if it is unbounded."""
+        states, n = len(self.start), process.n
+        operator = np.kron(self.carried.T, np.kron(process.A, process.A))
+        if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
+            return np.full((n, n), np.inf)
+        noise = self.carried.T @ self.law
+        solution = np.linalg.solve(np.eye(len(operator)) - operator, np.kron(noise, process.Q.reshape(-1)))
+        total: Floats = solution.reshape(states, n, n).sum(axis=0)
+        return total
+
+    @property
+    def law(self) -> Floats:
+        """Stationary law of the state, (S,)."""
+        states = len(self.start)
+        balance = np.vstack([(self.reset + self.carried).T - np.eye(states), np.ones(states)])
+        law: Floats = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0), rcond=None)[0]
+        return law
+
+
+def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:
+    """A receiver of the scheme `scheduled`; state s is a holding time of s + 1, the last one of threshold and more.
+
+    received: the probability that it hears a packet that is sent. acknowledged: the probabilities that such a packet is
+    acknowledged to the sensor and it heard it, and that it is acknowledged and it did not.
+
+    Source: docs/mathematics.md, schedules by holding time.
+    """
+    start, reset, carried = _blank(threshold)
+    for s in range(threshold - 1):
+        carried[s, s + 1] = 1.0
+    _hear(reset, carried, threshold - 1, threshold - 1, received, acknowledged)
+    return SensorChain(start, reset, carried)
+
+
+def encrypted_schedule(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:
+    """The selective eavesdropper of the scheme `encrypted-schedule`; states and arguments as those of `scheduled`.
+
+    The last state's entry of `law` is the fraction of packets that are encrypted.
+
+    Source: docs/mathematics.md, schedules by holding time.
+    """
+    start, reset, carried = _blank(threshold)
+    top = threshold - 1
+    for s in range(top):
+        _hear(reset, carried, s, s + 1, received, acknowledged)
+    _hear(reset, carried, top, top, 0.0, (0.0, sum(acknowledged)))
+    return SensorChain(start, reset, carried)
+
+
+def _blank(threshold: int) -> tuple[Floats, Floats, Floats]:
+    start = np.zeros(threshold)
+    start[-1] = 1.0
+    return start, np.zeros((threshold, threshold)), np.zeros((threshold, threshold))
+
+
+def _hear(
+    reset: Floats, carried: Floats, s: int, unacknowledged: int, received: float, acknowledged: tuple[float, float]
+) -> None:
+    """A packet is sent in state s: acknowledged, the next state is 0."""
+    heard, unheard = acknowledged
+    reset[s, 0] += heard
+    carried[s, 0] += unheard
+    reset[s, unacknowledged] += received - heard
+    carried[s, unacknowledged] += 1.0 - received - unheard

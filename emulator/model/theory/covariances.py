@@ -1,0 +1,346 @@
+"""What theory says of a receiver's error covariance: its expectation in every slot, its limit, its bounds, its tails.
+
+Everything follows from how likely a slot's outcomes are (`Outcomes`). Two covariances must be told apart: the actual
+one of the error, and the one the receiver believes, which ignores that innovations may have misled it
+(`Outcomes.believed`).
+
+Source: docs/mathematics.md, expectations.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evedrop.model.process import MARGINAL, Floats, Process
+from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
+
+_BLOCK = 256  # slots computed from one starting point: long enough to hide Python, few enough to set up in 3 ms
+_LARGEST_POWER = 1e100  # of A's entries within a block, far from overflow
+_ROUNDING = 1e-12
+LARGEST_OPERATOR = 512
+"""Rows of a linear operator whose limit is worked out: some seconds; more than that and no limit is said."""
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Probabilities of what a receiver does with a slot k ≥ 1; `predicted`, `decoded`, `leaked`, `state`, `misled` sum to 1.
+
+    Source: docs/mathematics.md, expectations.
+    """
+
+    predicted: float
+    """p_d: dropped, or discarded. P ← A P Aᵀ + Q."""
+    state: float
+    """p_r: the state was used. P ← 0."""
+    misled: float
+    """p_i of an eavesdropper: an innovation was used as if it were the state. P ← f_k = 2 A Σ_{k−1} Aᵀ."""
+    decoded: float
+    """p_i of the legitimate estimator: an innovation was decoded. P ← A P Aᵀ."""
+    initial: float
+    """p_0: the packet of slot 0, always the state, was not used. P_0 = Σ0."""
+    leaked: float = 0.0
+    """p_l of the genie: an innovation was read for what it leaks. P ← A P Aᵀ + Q − QΣ_k⁻¹Q."""
+
+    @classmethod
+    def legitimate(cls, mu: float, mu_d: float) -> Outcomes:
+        """The estimator that holds the secret, behind a link of quality μ; μ_d is P(ν = 0)."""
+        return cls(predicted=1.0 - mu, state=mu * mu_d, misled=0.0, decoded=mu * (1.0 - mu_d), initial=1.0 - mu)
+
+    @classmethod
+    def plain(cls, mu: float) -> Outcomes:
+        """Any receiver of a sensor that always sends the state."""
+        return cls.legitimate(mu, 1.0)
+
+    @classmethod
+    def eavesdropper(cls, mu_e: float, mu_d: float, use_state: float, use_innovation: float) -> Outcomes:
+        """A user of packets behind a link of quality μ_e, with P(b=1 | ν=0) and P(b=1 | ν=1)."""
+        state = mu_e * mu_d * use_state
+        misled = mu_e * (1.0 - mu_d) * use_innovation
+        return cls(1.0 - state - misled, state, misled, decoded=0.0, initial=1.0 - mu_e * use_state)
+
+    @classmethod
+    def genie(cls, mu_e: float, mu_d: float) -> Outcomes:
+        """Who knows the type of every packet and uses all that it tells, behind a link of quality μ_e.
+
+        Source: docs/mathematics.md, genie.
+        """
+        return cls(1.0 - mu_e, mu_e * mu_d, misled=0.0, decoded=0.0, initial=1.0 - mu_e, leaked=mu_e * (1.0 - mu_d))
+
+    @property
+    def believed(self) -> Outcomes:
+        """The same with every used packet taken for the state, which is what the receiver's own covariance assumes."""
+        return replace(self, state=self.state + self.misled, misled=0.0)
+
+    @property
+    def kept(self) -> float:
+        """Probability that the error is carried on to the next slot: not to 0, not to f_k."""
+        return self.predicted + self.decoded + self.leaked
+
+
+OutcomesAt = Callable[[float], Outcomes]
+"""From the quality of a link to what its receiver does with a slot."""
+
+NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
+"""Who is told nothing: its error covariance is that of the state itself."""
+
+
+def state_covariances(process: Process, slots: int) -> Floats:
+    """Σ_k = E[x_k x_kᵀ] for k = 0 … slots−1, (slots, n, n): Σ_0 given, Σ_k = A Σ_{k−1} Aᵀ + Q; inf once it overflows.
+
+    Source: docs/mathematics.md, model.
+    """
+    return expected_covariances(process, NOBODY, slots)
+
+
+def noise_covariances(process: Process, slots: int) -> Floats:
+    """E[χ_k χ_kᵀ] = A Σ_{k−1} Aᵀ for k = 0 … slots−1, (slots, n, n); 0 at k = 0. inf from where it overflows.
+
+    Source: docs/mathematics.md, encoding noise.
+    """
+    sigma = state_covariances(process, max(slots - 1, 0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        carried = process.A @ sigma @ process.A.T
+    zero = np.zeros((min(slots, 1), process.n, process.n))
+    return _unbounded_from_overflow(np.concatenate([zero, carried]))
+
+
+def misled_covariances(process: Process, slots: int) -> Floats:
+    """f_k = 2 A Σ_{k−1} Aᵀ, (slots, n, n): the error of taking an innovation for the state; 0 at k = 0.
+
+    Source: Lemma V.1 (third case).
+    """
+    with np.errstate(over="ignore"):
+        return 2.0 * noise_covariances(process, slots)
+
+
+class ExpectedCovariance:
+    """E P_k of a receiver, the next slots at a time from k = 0. Final.
+
+    E_0 = p_0 Σ0, E_k = p_k (A E_{k−1} Aᵀ) + p_d Q + p_i f_k with p_k = `kept`, solved for a block of slots at once: for
+    j slots beyond s, with F = √p_k A and W_j = Σ_{l<j} A^l Q A^lᵀ,
+
+        E_{s+j} = F^j E_s F^jᵀ + p_d Σ_{l<j} F^l Q F^lᵀ + 2 p_i (Σ_{l<j} p_k^l) A^j Σ_s A^jᵀ
+                  + 2 p_i Σ_{l<j} F^l (W_{j−l} − Q) F^lᵀ,
+
+    all terms positive semidefinite, so nothing cancels. Values do not depend on how many slots are asked for at a time.
+    From the slot where a value leaves double precision, every entry is inf. What is leaked differs from slot to slot, and
+    its recursion is followed slot by slot.
+
+    Source: Theorem IV.3 (proof, corrected), Theorem V.2 (corrected); docs/mathematics.md, expectations.
+    """
+
+    def __init__(self, process: Process, outcomes: Outcomes) -> None:
+        n = process.n
+        self._process = process
+        self._outcomes = outcomes
+        self._remaining = RemainingCovariances(process) if outcomes.leaked else None
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = _block_length(process.A)
+            self._powers = _powers(process.A, length)
+            self._kept_powers = _powers(math.sqrt(outcomes.kept) * process.A, length)
+            self._diffusion = np.empty((length, n, n))
+            self._spread = np.empty((length, n, n))
+            self._weights = 2.0 * outcomes.misled * np.cumsum(outcomes.kept ** np.arange(length))
+            E = np.zeros((n, n))
+            W = np.zeros((n, n))
+            for j in range(length):
+                carried = process.A @ W @ process.A.T
+                E = (
+                    outcomes.kept * (process.A @ E @ process.A.T)
+                    + outcomes.predicted * process.Q
+                    + 2.0 * outcomes.misled * carried
+                )
+                W = carried + process.Q
+                self._diffusion[j], self._spread[j] = E, W
+            self._block: Floats = outcomes.initial * process.initial_covariance[None]
+        self._sigma: Floats = process.initial_covariance
+        self._next = 0
+
+    def next(self, slots: int) -> Floats:
+        """The expectation in the next slots, (slots, n, n)."""
+        parts = []
+        while slots > 0:
+            if self._next == len(self._block):
+                self._advance()
+            part = self._block[self._next : self._next + slots]
+            self._next += len(part)
+            slots -= len(part)
+            parts.append(part)
+        return np.concatenate(parts) if parts else np.empty((0, *self._sigma.shape))
+
+    def next_traces(self, slots: int) -> Floats:
+        """The trace of the expectation in the next slots, (slots,)."""
+        with np.errstate(over="ignore"):
+            traces: Floats = np.trace(self.next(slots), axis1=1, axis2=2)
+        return traces
+
+    def _advance(self) -> None:
+        E = self._block[-1]
+        self._next = 0
+        if not np.isfinite(E[0, 0]):
+            self._block = np.full(self._powers.shape, np.inf)
+            return
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self._remaining is not None:
+                self._block = _unbounded_from_overflow(self._slot_by_slot(E, self._remaining))
+                return
+            block = _congruences(self._kept_powers, E) + self._diffusion
+            if self._outcomes.misled:
+                grown = _congruences(self._powers, self._sigma)
+                block += self._weights[:, None, None] * grown
+                self._sigma = grown[-1] + self._spread[-1]
+        self._block = _unbounded_from_overflow(block)
+
+    def _slot_by_slot(self, E: Floats, remaining: RemainingCovariances) -> Floats:
+        block, one, A = np.empty(self._powers.shape), self._outcomes, self._process.A
+        noise = one.predicted * self._process.Q
+        for j in range(len(block)):
+            E = block[j] = one.kept * (A @ E @ A.T) + noise + one.leaked * remaining.next()
+        return block
+
+
+def expected_covariances(process: Process, outcomes: Outcomes, slots: int) -> Floats:
+    """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows. `outcomes.believed` gives E of the belief.
+
+    Source: docs/mathematics.md, expectations.
+    """
+    return ExpectedCovariance(process, outcomes).next(slots)
+
+
+def expected_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:
+    """Trace of E P_k for k = 0 … slots−1, (slots,); inf from where it overflows.
+
+    Source: docs/mathematics.md, expectations.
+    """
+    return ExpectedCovariance(process, outcomes).next_traces(slots)
+
+
+def radius(process: Process) -> float:
+    """ρ(A), exactly 1 for a marginally stable process whatever its eigenvalues' rounding.
+
+    Source: docs/mathematics.md, limits.
+    """
+    rho = process.spectral_radius
+    return 1.0 if abs(rho - 1.0) <= MARGINAL else rho
+
+
+def stability_bound(process: Process, mu: float) -> float:
+    """(1 − ρ⁻²)/μ: a receiver behind a link of quality μ, never misled, has a bounded error iff μ_d lies above it.
+
+    0 for ρ = 1: any μ_d > 0 will do. 1 or more: no μ_d ≤ 1 lies above it. inf for μ = 0 and ρ ≥ 1: none at all.
+
+    Source: docs/mathematics.md, limits.
+    """
+    rho = radius(process)
+    if rho < 1.0:
+        return 0.0
+    return (1.0 - rho**-2.0) / mu if mu > 0.0 else math.inf
+
+
+def lyapunov(process: Process, kept: float) -> Floats:
+    """S = kept · A S Aᵀ + Q, (n, n): S(q) of the paper with kept = 1 − q. All inf where kept · ρ² ≥ 1: unbounded.
+
+    Source: Theorem IV.3.
+    """
+    return _stationary(process, kept, process.Q)
+
+
+def limit(process: Process, outcomes: Outcomes) -> Floats:
+    """Limit of E P_k, (n, n), all inf if it is unbounded: p_d S(1 − kept), for whoever is never misled.
+
+    Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics.md, limits and genie.
+    """
+    source = outcomes.predicted * process.Q
+    if outcomes.leaked:
+        source = source + outcomes.leaked * remaining_limit(process)
+    if outcomes.misled:
+        if radius(process) >= 1.0:
+            return np.full_like(process.Q, np.inf)
+        source = source + 2.0 * outcomes.misled * (process.A @ lyapunov(process, 1.0) @ process.A.T)
+    elif outcomes.predicted + outcomes.leaked + outcomes.initial == 0.0:
+        return np.zeros_like(process.Q)
+    return _stationary(process, outcomes.kept, source)
+
+
+def limit_trace(process: Process, outcomes: Outcomes) -> float:
+    """Limit of tr E P_k, inf if it is unbounded: J(μ_d) of the legitimate estimator, J_e(μ_d) of an eavesdropper.
+
+    Source: docs/mathematics.md, limits.
+    """
+    return float(np.trace(limit(process, outcomes)))
+
+
+def tail_index(process: Process, outcomes: Outcomes) -> float:
+    """Exponent α of P(tr P_k > t) ~ t^−α for large k: −ln(1 − p_r) / (2 ln ρ). inf where there is no heavy tail.
+
+    inf too for whoever is misled, and for whoever never uses a state: tr P_k then stays within a factor of its own,
+    growing expectation.
+
+    Source: docs/mathematics.md, heavy tails.
+    """
+    if outcomes.state == 0.0:
+        return math.inf
+    rho = radius(process)
+    if rho <= 1.0 or outcomes.misled or outcomes.predicted + outcomes.leaked == 0.0 or outcomes.state >= 1.0:
+        return math.inf
+    return -math.log1p(-outcomes.state) / (2.0 * math.log(rho))
+
+
+def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
+    """Whether tr P_k has no finite variance in the limit, so that a sample mean proves nothing: α ≤ 2.
+
+    Source: docs/mathematics.md, heavy tails.
+    """
+    return tail_index(process, outcomes) <= 2.0
+
+
+def _stationary(process: Process, kept: float, source: Floats) -> Floats:
+    from scipy.linalg import LinAlgError, LinAlgWarning, solve_discrete_lyapunov  # noqa: PLC0415 - slow to import
+
+    unbounded = np.full_like(source, np.inf)
+    if kept * radius(process) ** 2 >= 1.0 - _ROUNDING:
+        return unbounded
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LinAlgWarning)  # near the bound; the definiteness below decides
+        try:
+            S: Floats = np.asarray(solve_discrete_lyapunov(math.sqrt(kept) * process.A, source))
+        except LinAlgError:
+            return unbounded
+    if not np.all(np.isfinite(S)) or np.linalg.eigvalsh(0.5 * (S + S.T))[0] < -1e-9 * np.abs(S).max():
+        return unbounded
+    return S
+
+
+def _block_length(A: Floats) -> int:
+    power, length = A, 1
+    while length < _BLOCK:
+        power = power @ power
+        if not np.abs(power).max() < _LARGEST_POWER:
+            break
+        length *= 2
+    return length
+
+
+def _powers(A: Floats, length: int) -> Floats:
+    """A, A², … A^length, (length, n, n), by doubling."""
+    powers = A[None]
+    while len(powers) < length:
+        powers = np.concatenate([powers, powers @ powers[-1]])
+    return powers
+
+
+def _congruences(powers: Floats, P: Floats) -> Floats:
+    result: Floats = (powers @ P) @ powers.transpose(0, 2, 1)
+    return result
+
+
+def _unbounded_from_overflow(covariances: Floats) -> Floats:
+    beyond = np.flatnonzero(~np.all(np.isfinite(covariances), axis=(1, 2)))
+    if beyond.size:
+        covariances[beyond[0] :] = np.inf
+    return covariances

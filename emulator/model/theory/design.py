@@ -1,0 +1,357 @@
+"""Choosing μ_d: what is admissible, what is secret against whom, what is best, and what it costs.
+
+Source: docs/mathematics.md, design.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from evedrop.errors import UsageError
+from evedrop.model.process import Process
+from evedrop.model.receiver import Flags
+from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace, stability_bound
+
+Interval = tuple[float, float]
+
+_EQUAL = 1e-12  # relative difference below which two traces count as equal
+_XTOL = 1e-13
+_NEAREST = 1e-9  # distance to a pole, relative to the interval, from where differences are looked at
+_ATTAINED = 1e-5  # a maximum nearer than this to the open end of the interval is none
+
+
+@dataclass(frozen=True)
+class Adversary:
+    """An eavesdropper as the design sees it."""
+
+    name: str
+    mu_e: float
+    """Quality of its link."""
+    use_state: float
+    """P(b = 1 given ν = 0)."""
+    use_innovation: float
+    """P(b = 1 given ν = 1)."""
+    reads_leak: bool = False
+    """Whether it uses what innovations leak: the genie, with the probabilities of smart."""
+
+    @classmethod
+    def who(cls, name: str, mu_e: float, half: Outcomes) -> Adversary:
+        """From what it would do with a slot behind a link that loses nothing, at μ_d = 1/2."""
+        return cls(name, mu_e, 2.0 * half.state, 2.0 * half.misled, half.leaked > 0.0)
+
+    def outcomes(self, mu_d: float) -> Outcomes:
+        """What it does with a slot."""
+        if self.reads_leak:
+            return Outcomes.genie(self.mu_e, mu_d)
+        return Outcomes.eavesdropper(self.mu_e, mu_d, self.use_state, self.use_innovation)
+
+
+@dataclass(frozen=True)
+class Against:
+    """What can be had against one eavesdropper."""
+
+    bound: float
+    """Lower end of the μ_d at which its error is bounded: (1 − ρ⁻²)/μ_e for smart; inf if there is no such μ_d."""
+    perfect: Interval | None
+    """(lo, hi]: its error is unbounded and the legitimate one is not."""
+    relative: tuple[Interval, ...]
+    """Where J < J_e ≤ ∞ and J is bounded: secrecy in the limit, between the ends."""
+    best_difference: float | None
+    """μ_d* that maximises J_r = J_e − J; None if there is no maximum: J_r is unbounded, or nowhere positive."""
+    best_ratio: float | None
+    """μ_d that maximises J_r / J; None if there is no maximum."""
+    trace: float
+    """J_e at the scenario's own μ_d."""
+    difference: float
+    """J_r = J_e − J there: the gain. nan if both are unbounded."""
+    violated: tuple[tuple[int, int], ...]
+    """(first, last) of each stretch of the run's slots k ≥ 1 in which tr E P_k < tr E Pᵉ_k does not hold at the
+    scenario's own μ_d."""
+    relative_from: int | None
+    """First slot k ≥ 1 from which on it holds to the end of the run; None if not in the last slot. 1 is the paper's
+    "for all k"."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON of `evedrop design`; inf is null."""
+        return {
+            "bound": _finite(self.bound),
+            "perfect": None if self.perfect is None else list(self.perfect),
+            "relative": [list(interval) for interval in self.relative],
+            "best_difference": self.best_difference,
+            "best_ratio": self.best_ratio,
+            "trace": _finite(self.trace),
+        }
+
+
+@dataclass(frozen=True)
+class Design:
+    """The design of μ_d for one process, one legitimate link and any number of eavesdroppers."""
+
+    rho: float
+    """ρ(A)."""
+    mu: float
+    mu_d: float
+    """The scenario's own."""
+    bound: float
+    """(1 − ρ⁻²)/μ: the legitimate error is bounded iff μ_d lies above it."""
+    admissible: Interval | None
+    """(lo, 1], the μ_d of a bounded legitimate error; None if there are none."""
+    minimum: float | None
+    """μ_d_min for the asked Ω; None if none was asked."""
+    trace: float
+    """J at the scenario's own μ_d; inf if unbounded."""
+    plain_trace: float
+    """J(1): what the same link gives when every packet is the state."""
+    eavesdroppers: dict[str, Against]
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Eavesdropper → strategy, of those whose error has no closed form: nothing can be designed by it."""
+
+    @property
+    def cost(self) -> float:
+        """J(μ_d) / J(1), by which factor secrecy raises the legitimate error: 1 for a lossless link, nan for a bad one."""
+        return 1.0 if self.plain_trace == 0.0 else self.trace / self.plain_trace
+
+    @property
+    def remark(self) -> str | None:
+        """A sentence if no μ_d is admissible."""
+        if self.admissible is not None:
+            return None
+        return (
+            f"no μ_d is admissible: the legitimate link's quality μ = {self.mu:g} does not exceed "
+            f"1 − ρ⁻² = {1.0 - self.rho**-2:.6g}, so its error is unbounded even if every packet is the state; "
+            "a better link is needed"
+        )
+
+    @property
+    def omission(self) -> str | None:
+        """A sentence if eavesdroppers were left out."""
+        if not self.left_out:
+            return None
+        who = ", ".join(f"{name} ({strategy})" for name, strategy in self.left_out.items())
+        return f"left out: {who}: no closed form of its error is known; what holds against a genie holds against all"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON of `evedrop design`; inf is null, and `minimum` and `left_out` are there only if there are any."""
+        legitimate: dict[str, Any] = {"bound": _finite(self.bound), "trace": _finite(self.trace)}
+        if self.minimum is not None:
+            legitimate["minimum"] = self.minimum
+        found = {
+            "rho": self.rho,
+            "legitimate": legitimate,
+            "eavesdroppers": {name: against.as_dict() for name, against in self.eavesdroppers.items()},
+        }
+        return {**found, "left_out": self.left_out} if self.left_out else found
+
+
+def design(
+    process: Process,
+    mu: float,
+    mu_d: float,
+    eavesdroppers: Sequence[Adversary],
+    slots: int,
+    max_trace: float | None = None,
+) -> Design:
+    """Everything to choose μ_d by. `slots` is the run's length, `max_trace` is Ω.
+
+    Raises UsageError if Ω cannot be kept by any μ_d.
+
+    Source: docs/mathematics.md, design.
+    """
+    bound = stability_bound(process, mu)
+    own = Outcomes.legitimate(mu, mu_d)
+    ours = expected_traces(process, own, slots)
+    trace = limit_trace(process, own)
+
+    def against(adversary: Adversary) -> Against:
+        theirs = expected_traces(process, adversary.outcomes(mu_d), slots)
+        violated = _stretches(~(ours[1:] < theirs[1:]))
+        held_from = violated[-1][1] + 1 if violated else 1
+        its_trace = limit_trace(process, adversary.outcomes(mu_d))
+        return Against(
+            bound=adversary_bound(process, adversary),
+            perfect=perfect_secrecy(process, mu, adversary),
+            relative=relative_secrecy(process, mu, adversary),
+            best_difference=best_difference(process, mu, adversary),
+            best_ratio=best_ratio(process, mu, adversary),
+            trace=its_trace,
+            difference=math.nan if math.isinf(trace) and math.isinf(its_trace) else its_trace - trace,
+            violated=violated,
+            relative_from=held_from if held_from < slots else None,
+        )
+
+    return Design(
+        rho=process.spectral_radius,
+        mu=mu,
+        mu_d=mu_d,
+        bound=bound,
+        admissible=(bound, 1.0) if bound < 1.0 else None,
+        minimum=None if max_trace is None else least_state_probability(process, mu, max_trace),
+        trace=trace,
+        plain_trace=limit_trace(process, Outcomes.plain(mu)),
+        eavesdroppers={adversary.name: against(adversary) for adversary in eavesdroppers},
+    )
+
+
+def adversary_bound(process: Process, adversary: Adversary) -> float:
+    """Infimum of the μ_d at which an eavesdropper's error is bounded; inf if there is none.
+
+    Whoever may be misled is bounded at μ_d = 1 at most, where nothing misleads.
+
+    Source: docs/mathematics.md, design.
+    """
+    bound = stability_bound(process, adversary.mu_e * adversary.use_state)
+    if math.isinf(limit_trace(process, adversary.outcomes(0.5))) and adversary.outcomes(0.5).misled:
+        return 1.0 if bound < 1.0 else math.inf
+    return bound
+
+
+def perfect_secrecy(process: Process, mu: float, adversary: Adversary) -> Interval | None:
+    """(lo, hi] of the μ_d with J bounded and J_e unbounded; None if there are none.
+
+    hi = 1 itself does not belong to it where only innovations, of which there are none at μ_d = 1, unbound the error.
+
+    Source: Theorem V.9, Corollaries V.3 and V.4.
+    """
+    low = stability_bound(process, mu)
+    high = min(1.0, adversary_bound(process, adversary))
+    return (low, high) if low < high else None
+
+
+def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple[Interval, ...]:
+    """The intervals of μ_d on which J < J_e ≤ ∞ with J bounded.
+
+    Source: Theorem V.8 for μ_e ≤ μ; docs/mathematics.md, design, for any μ_e.
+    """
+    from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
+
+    low = stability_bound(process, mu)
+    if low >= 1.0:
+        return ()
+
+    def advantage(mu_d: float) -> float:
+        return _advantage(*_traces(process, mu, adversary, mu_d))
+
+    poles = sorted({low, min(max(low, adversary_bound(process, adversary)), 1.0)})
+    points = np.concatenate([_between(a, b) for a, b in zip(poles, [*poles[1:], 1.0], strict=True) if a < b])
+    signs = [np.sign(advantage(point)) for point in points]
+    edges = [low]
+    for (a, before), (b, after) in pairwise(zip(points, signs, strict=True)):
+        if before * after < 0:
+            edges.append(float(brentq(advantage, a, b, xtol=_XTOL)))
+        elif before != after:
+            edges.append(float(b if after == 0 else a))
+    edges.append(1.0)
+    intervals: list[Interval] = []
+    for a, b in pairwise(edges):
+        if b - a <= _EQUAL or advantage(0.5 * (a + b)) <= 0.0:
+            continue
+        if intervals and intervals[-1][1] == a:
+            intervals[-1] = (intervals[-1][0], b)
+        else:
+            intervals.append((a, b))
+    return tuple(intervals)
+
+
+def least_state_probability(process: Process, mu: float, max_trace: float) -> float:
+    """μ_d_min, the root of J = Ω: the error stays below Ω, in the limit, for every larger μ_d. Ω is `max_trace`.
+
+    The stability bound for a lossless link. Raises UsageError if not even μ_d = 1 keeps Ω.
+
+    Source: docs/mathematics.md, design; Lemma VI.1 (J falls).
+    """
+    from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
+
+    low = stability_bound(process, mu)
+    best = limit_trace(process, Outcomes.plain(mu))
+    if not low < 1.0 or not best < max_trace:
+        found = f"{best:.6g}" if low < 1.0 and math.isfinite(best) else "unbounded"
+        raise UsageError(
+            f"no μ_d keeps the legitimate trace below {max_trace:g}: at μ_d = 1, where it is least, it is {found}; "
+            "ask for a larger trace, or improve the legitimate link"
+        )
+
+    def excess(mu_d: float) -> float:
+        trace = limit_trace(process, Outcomes.legitimate(mu, mu_d))
+        return 1.0 if math.isinf(trace) else (trace - max_trace) / (trace + max_trace)
+
+    start = next((mu_d for e in range(1, 16) if excess(mu_d := low + 10.0**-e * (1.0 - low)) > 0.0), None)
+    return low if start is None else float(brentq(excess, start, 1.0, xtol=_XTOL))
+
+
+def best_difference(process: Process, mu: float, adversary: Adversary) -> float | None:
+    """μ_d* = argmax J_r over the admissible μ_d; None if J_r has no maximum or is nowhere positive.
+
+    None for smart with μ_e ≤ μ, where J_r → ∞ at the lower end.
+
+    Source: docs/mathematics.md, design.
+    """
+    return _argmax(process, mu, adversary, lambda ours, theirs: theirs - ours)
+
+
+def best_ratio(process: Process, mu: float, adversary: Adversary) -> float | None:
+    """Argmax of J_r / J over the admissible μ_d; None if it has no maximum or J_r is nowhere positive.
+
+    Source: docs/mathematics.md, design.
+    """
+    return _argmax(process, mu, adversary, lambda ours, theirs: (theirs - ours) / ours if ours else math.inf)
+
+
+def _argmax(process: Process, mu: float, adversary: Adversary, gain: Callable[[float, float], float]) -> float | None:
+    from scipy.optimize import minimize_scalar  # noqa: PLC0415 - slow to import
+
+    low = stability_bound(process, mu)
+    if low >= 1.0 or adversary_bound(process, adversary) > low + _EQUAL:
+        return None
+
+    def loss(mu_d: float) -> float:
+        return -gain(*_traces(process, mu, adversary, mu_d))
+
+    points = _between(low, 1.0)
+    points = points[points - low > 0.1 * _ATTAINED * (1.0 - low)]
+    losses = np.array([loss(point) for point in points])
+    lowest = int(np.argmin(losses))
+    if not np.all(np.isfinite(losses)) or losses[lowest] >= 0.0 or lowest in (0, len(points) - 1):
+        return None
+    found = minimize_scalar(
+        loss, bounds=(points[lowest - 1], points[lowest + 1]), method="bounded", options={"xatol": 1e-10}
+    )
+    mu_d = float(found.x)
+    return mu_d if mu_d - low > _ATTAINED * (1.0 - low) else None
+
+
+def _traces(process: Process, mu: float, adversary: Adversary, mu_d: float) -> tuple[float, float]:
+    ours = limit_trace(process, Outcomes.legitimate(mu, mu_d))
+    return ours, limit_trace(process, adversary.outcomes(mu_d))
+
+
+def _advantage(ours: float, theirs: float) -> float:
+    """(J_e − J)/(J_e + J), −1 … 1, and 0 where the two are equal to rounding; −1 if J is unbounded."""
+    if math.isinf(ours):
+        return -1.0
+    if math.isinf(theirs):
+        return 1.0
+    relative = (theirs - ours) / (theirs + ours) if theirs + ours else 0.0
+    return relative if abs(relative) > _EQUAL else 0.0
+
+
+def _between(low: float, high: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Points of (low, high], dense towards low, where there may be a pole."""
+    steps = np.concatenate([np.geomspace(_NEAREST, 0.02, 60), np.linspace(0.02, 1.0, 99)[1:]])
+    points: np.ndarray[tuple[int], np.dtype[np.float64]] = low + steps * (high - low)
+    return points
+
+
+def _stretches(flags: Flags) -> tuple[tuple[int, int], ...]:
+    """(first, last) of each stretch of true flags; the first flag is that of slot 1."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))) + 1
+    return tuple((int(first), int(end) - 1) for first, end in edges.reshape(-1, 2))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

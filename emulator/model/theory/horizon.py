@@ -1,0 +1,66 @@
+"""How long float64 can follow a process: until rounding of the state drowns the innovation hidden in it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evedrop.model.process import Floats, Process
+from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
+
+UNIT_ROUNDOFF = 2.0**-53
+TOLERANCE = 0.01
+_NO_NOISE = 1e-12  # of the largest eigenvalue of a singular Q: what rounding explains
+_EACH = 2**22  # numbers in the covariances of the slots that are looked at each; beyond them, halves are searched
+_AT_LEAST = 1024
+
+
+def horizon(process: Process, slots: int) -> int | None:
+    """Largest k in float64's reach, if it is below slots−1; None if the whole run is.
+
+    The last k such that up to it 2⁻⁵³ √λ_max(Σ_k) ≤ 0.01 √λ_min(Q). Among the first slots, thousands of them, each is looked
+    at; after these Σ_k is taken to grow from one slot to the next, once it has outgrown its beginning.
+
+    Source: docs/mathematics.md, horizon.
+    """
+    noise = np.linalg.eigvalsh(process.Q)
+    least = noise[noise > _NO_NOISE * noise[-1]][0] if process.singular_noise and noise[-1] > 0.0 else noise[0]
+    limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * float(least)
+    states = ExpectedCovariance(process, NOBODY)
+    count = min(slots, max(_AT_LEAST, _EACH // process.n**2))
+    ahead = max(2, _EACH // (16 * process.n**2))
+    sigma = process.initial_covariance[None]
+    for first in range(0, count, ahead):
+        sigma = states.next(min(ahead, count - first))
+        # The trace bounds the largest eigenvalue, so almost always nothing needs to be decomposed.
+        with np.errstate(over="ignore"):
+            doubtful = np.flatnonzero(~(np.trace(sigma, axis1=1, axis2=2) <= limit))
+        for k in doubtful.tolist():
+            if _beyond(sigma[k], limit):
+                return first + k - 1
+        if len(sigma) > 1 and np.array_equal(sigma[-1], sigma[-2]) and not math.isnan(limit):
+            return None
+    last = _last_within(process, sigma[-1], count - 1, slots - 1, limit)
+    return None if last == slots - 1 else last
+
+
+def _beyond(sigma: Floats, limit: float) -> bool:
+    return not np.isfinite(sigma).all() or float(np.linalg.eigvalsh(sigma)[-1]) > limit
+
+
+def _last_within(process: Process, sigma: Floats, k: int, last: int, limit: float) -> int:
+    """The last slot up to `last` that is within the limit, searched from slot k on, whose covariance is `sigma`."""
+    # A^m and W_m = Σ_{l<m} A^l Q A^lᵀ for m = 1, 2, 4, …: m slots further, Σ is A^m Σ A^mᵀ + W_m.
+    steps = [(1, process.A, process.Q)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        while 2 * steps[-1][0] <= last - k:
+            m, power, W = steps[-1]
+            steps.append((2 * m, power @ power, power @ W @ power.T + W))
+        for m, power, W in reversed(steps):
+            # Twice, for the steps need not be a binary number of what is left.
+            for _ in range(2):
+                further = power @ sigma @ power.T + W
+                if k + m <= last and not _beyond(further, limit):
+                    sigma, k = further, k + m
+    return k

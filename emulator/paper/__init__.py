@@ -1,0 +1,1 @@
+"""The paper's figures and numbers, ours beside the paper's."""

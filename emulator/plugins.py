@@ -1,0 +1,136 @@
+"""Modules of anybody's own: which ones a scenario or a brief names, and the folder in which they are looked for first.
+
+A class in such a module is code that every process of a run imports; nothing is imported but what somebody has named.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from hashlib import sha256
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.model.registry import is_own
+
+_TRUSTED = ("scheme", "model")
+_ENTRIES = (*_TRUSTED, "strategy", "reads_as")
+"""Entries, of any table, that name a class."""
+
+
+def names_in(tables: Any, entries: tuple[str, ...] = _ENTRIES) -> Iterator[str]:
+    """Every name of a class that tables give at these entries, in their order, whatever it stands for."""
+    if isinstance(tables, Mapping):
+        for entry, inner in tables.items():
+            if entry in entries and isinstance(inner, str):
+                yield inner
+            elif isinstance(inner, (Mapping, list, tuple)):
+                yield from names_in(inner, entries)
+    elif isinstance(tables, (list, tuple)):
+        for inner in tables:
+            if isinstance(inner, (dict, Mapping, list, tuple)):
+                yield from names_in(inner, entries)
+
+
+def named_in(tables: Any) -> Iterator[str]:
+    """Every PACKAGE.MODULE:CLASS among them."""
+    return (name for name in names_in(tables) if is_own(name))
+
+
+def trusted_in(tables: Any) -> Iterator[str]:
+    """Those of them that are not eavesdroppers': schemes and links, which hold the secret or see all packets."""
+    return (name for name in names_in(tables, _TRUSTED) if is_own(name))
+
+
+def sources_of(tables: Any) -> dict[str, str]:
+    """`module NAME` → the SHA-256 of its file, of every module that tables name and that is found. None is imported."""
+    found = {}
+    folder = tables.get("modules") if isinstance(tables, Mapping) else None
+    for name in named_in(tables):
+        module = name.partition(":")[0]
+        file = getattr(sys.modules.get(module), "__file__", None) or _file_of(module, folder)
+        if file is not None and Path(file).is_file():
+            found[f"module {module}"] = f"sha256 {sha256(Path(file).read_bytes()).hexdigest()}"
+    return found
+
+
+def _file_of(module: str, folder: str | None) -> str | None:
+    """Where the file of a module is that may not be imported here."""
+    top, *inner = module.split(".")
+    spec = _installed(top) or PathFinder.find_spec(top, [folder] if folder is not None else [])
+    for name in inner:
+        if spec is None:
+            return None
+        spec = PathFinder.find_spec(f"{spec.name}.{name}", spec.submodule_search_locations or [])
+    return None if spec is None else spec.origin
+
+
+def _installed(top: str) -> ModuleSpec | None:
+    """Where a module is found on the path, if it is."""
+    with suppress(ValueError):  # of __main__ and the like
+        return find_spec(top)
+    return None
+
+
+class _Folder(str):
+    """A folder on the path that `look_in` has put there. Final."""
+
+    __slots__ = ()
+
+
+def look_in(folder: str) -> None:
+    """Have modules looked for in this folder, after all that is installed and before other folders of this kind.
+
+    So nothing in it stands in place of a module of ours, of Python's or of a library's.
+    """
+    if folder not in sys.path:
+        first = next((i for i, place in enumerate(sys.path) if isinstance(place, _Folder)), len(sys.path))
+        sys.path.insert(first, _Folder(folder))
+    importlib.invalidate_caches()
+
+
+def elsewhere(folder: str, tables: Any) -> Iterator[str]:
+    """A sentence for every module that tables name, that is in this folder, and that this process has from another place."""
+    for name in dict.fromkeys(named_in(tables)):
+        top = name.partition(":")[0].partition(".")[0]
+        there = PathFinder.find_spec(top, [folder])
+        asked_in = ANSWERS.folder_of(name)
+        known = getattr(sys.modules.get(top), "__spec__", None)
+        if known is None and asked_in is not None:
+            known = PathFinder.find_spec(top, [asked_in])
+        if there is None:
+            continue
+        if known is not None and _home(there) != _home(known):
+            yield (
+                f"has a module {top} ({_home(there)}), and another one of this name is loaded already "
+                f"({_home(known)}); give one of them another name"
+            )
+            continue
+        installed = None if known is not None else _installed(top)
+        if installed is not None and _home(there) != _home(installed) and not _put_there(installed):
+            yield (
+                f"has a module {top} ({_home(there)}), and another one of this name is installed ({_home(installed)}); "
+                "give it another name"
+            )
+
+
+def _put_there(spec: ModuleSpec) -> bool:
+    """Whether a module is in a folder that `look_in` has put on the path: it is not loaded, and comes after this one."""
+    return any(
+        isinstance(place, _Folder) and _home(spec).startswith(f"{Path(place).resolve()}{os.sep}") for place in sys.path
+    )
+
+
+def _home(spec: ModuleSpec) -> str:
+    """Where a module or a package is."""
+    if spec.origin is not None:
+        return str(Path(spec.origin).resolve()) if Path(spec.origin).is_absolute() else spec.origin
+    return ", ".join(spec.submodule_search_locations or ())

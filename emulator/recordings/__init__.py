@@ -1,0 +1,1 @@
+"""Recordings that a scenario names: of links, and of a plant's disturbances."""

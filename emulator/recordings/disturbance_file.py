@@ -1,0 +1,247 @@
+"""The disturbances of a plant, from a CSV file: a line with their names, then a line of numbers for every slot.
+
+    time [s], P_solar [kW], P_load [kW]
+    0, 0.0, 0.235
+    1, 0.0, 0.235
+
+A name may have its unit beside it. Where the scenario says in which units disturbances are, the file must say so too; powers in
+W and kW are made what the scenario asks for. A column `time`, in seconds, shows where slots are missing. The file may be
+compressed (`.csv.gz`), may have other columns, and may be longer than the run: what comes after the last slot is not read.
+
+Source: docs/scenario.md, plant; docs/microgrid.md, a day of your own.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from itertools import islice, pairwise
+from pathlib import Path
+
+from evedrop.errors import DisturbanceError
+from evedrop.files import Limit, Unreadable, lines_of
+
+_KILOWATTS = {"W": 1e-3, "kW": 1.0}
+_HEADER = re.compile(r"^(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]$")
+_TIME = "time"
+_EXAMPLE = "time [s], P_solar [kW], P_load [kW]"
+_MOST_SAID = 5
+_TIME_ERROR = 1e-6  # of a slot: times may be rounded
+MOST_NUMBERS = 10_000_000
+"""Of a table of disturbances: slots times columns, a month of two columns by the second with room to spare."""
+_ROWS_UNASKED = 10_000  # of a scenario that does not say how many slots it has, which is a mistake of its own
+
+
+def found_file(name: str, folder: Path) -> Path:
+    """Where a file that a scenario in this folder names is: in the folder, or else among those that are shipped."""
+    beside = folder / name
+    shipped = Path(str(resources.files("evedrop.scenarios"))) / name
+    try:
+        return shipped if not beside.exists() and shipped.is_file() else beside
+    except OSError:  # of a name that no file can have: who opens it says so
+        return beside
+
+
+def read_disturbances(
+    path: Path,
+    names: Sequence[str],
+    units: Sequence[str] | None = None,
+    slots: int | None = None,
+    slot_seconds: float = 1.0,
+) -> list[list[float]]:
+    """A row for each slot with the numbers of these names, in their order and units.
+
+    Raises DisturbanceError with every mistake: no file, missing columns, wrong units, what is no finite number, times that do
+    not advance by `slot_seconds`, fewer rows than `slots`.
+    """
+    most = MOST_NUMBERS // max(1, len(names))
+    if slots is not None and slots > most:
+        raise DisturbanceError(
+            str(path),
+            [
+                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or disturbances fewer"
+            ],
+        )
+    limit = _ROWS_UNASKED if slots is None else max(0, slots)
+    rows = _rows(path, limit)
+    head = next(rows, None)
+    if head is None:
+        what = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
+        raise DisturbanceError(str(path), [what])
+    columns, mistakes = _columns(head, names, units)
+    if mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    found = _numbers(islice(rows, limit), len(head.cells), columns)
+    numbers, mistakes = found.numbers, found.mistakes
+    timed = columns != [] and columns[0].name == _TIME and _TIME not in names
+    if timed and not mistakes:
+        mistakes = list(_few(_time_mistakes(found.lines, [row[0] for row in numbers], slot_seconds), "times"))
+    if not mistakes and slots is not None and len(numbers) < slots:
+        few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
+        mistakes = [f"{few}: a longer file, or --slots {len(numbers)}" if numbers else few]
+    if mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    return [row[1:] for row in numbers] if timed else numbers
+
+
+def disturbances_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
+    """A file that is read back to the same bits."""
+    head = names if units is None else [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
+    return "".join(f"{','.join(line)}\n" for line in [list(head), *([repr(value) for value in row] for row in rows)])
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A line of the file, by its number."""
+
+    line: int
+    cells: list[str]
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column that is wanted: its place in the file, and what its values are multiplied by."""
+
+    name: str
+    place: int
+    factor: float
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the lines after the first have in them: a list of numbers for each, its line, and what is wrong."""
+
+    numbers: list[list[float]]
+    lines: list[int]
+    mistakes: list[str]
+
+
+def _rows(path: Path, slots: int) -> Iterator[_Row]:
+    """Every line that is neither blank nor a comment, of a file of so many slots. Raises DisturbanceError."""
+    try:
+        reader = csv.reader(lines_of(path, Limit.of_rows(slots)), skipinitialspace=True)
+        for cells in reader:
+            row = _Row(reader.line_num, [cell.strip() for cell in cells])
+            if any(row.cells) and not row.cells[0].startswith("#"):
+                yield row
+    except (Unreadable, csv.Error) as error:
+        what = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
+        raise DisturbanceError(str(path), [what]) from error
+
+
+def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> tuple[list[_Column], list[str]]:
+    """The time, if there is one, and the columns of these names; and what is wrong with the first line."""
+    found: dict[str, tuple[int, str | None]] = {}
+    mistakes = []
+    for place, cell in enumerate(head.cells):
+        match = _HEADER.match(cell)
+        name, unit = (match["name"], match["unit"].strip()) if match else (cell, None)
+        if name in found and name in (_TIME, *names):
+            mistakes.append(f'line {head.line} names "{name}" twice; expected each column once')
+        found[name] = (place, unit)
+    columns = []
+    if _TIME in found and _TIME not in names:
+        place, unit = found[_TIME]
+        columns.append(_Column(_TIME, place, 1.0))
+        if unit not in (None, "s"):
+            mistakes.append(f'line {head.line}: the column "{_TIME}" is in [{unit}]; expected {_TIME} [s]')
+    for i, name in enumerate(names):
+        wanted = None if units is None or i >= len(units) else units[i]
+        if name not in found:
+            there = ", ".join(f'"{cell}"' for cell in head.cells[:8])
+            known = name if wanted is None else f"{name} [{wanted}]"
+            mistakes.append(f'line {head.line} has no column "{name}", only {there}; expected {known} among them')
+            continue
+        place, unit = found[name]
+        factor = 1.0 if wanted is None else _factor(unit, wanted)
+        if factor is None:
+            given = "has no unit" if unit is None else f"is in [{unit}]"
+            choice = [wanted, *(one for one in _KILOWATTS if one != wanted)] if wanted in _KILOWATTS else [wanted]
+            known = " or ".join(f"{name} [{one}]" for one in choice)
+            mistakes.append(f'line {head.line}: the column "{name}" {given}; expected {known}')
+        else:
+            columns.append(_Column(name, place, factor))
+    return columns, mistakes
+
+
+def _factor(unit: str | None, wanted: str | None) -> float | None:
+    """What makes of one unit the other; None if nothing does."""
+    if unit == wanted:
+        return 1.0
+    if unit in _KILOWATTS and wanted in _KILOWATTS:
+        return _KILOWATTS[unit] / _KILOWATTS[wanted]
+    return None
+
+
+def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _Found:
+    """The columns' values of every line, and what is wrong with lines."""
+    places = [(column.place, column.factor) for column in columns]
+    numbers: list[list[float]] = []
+    lines: list[int] = []
+    wrong: list[_Row] = []
+    all_lines = all_wrong = 0
+    for row in rows:
+        all_lines += 1
+        try:
+            values = [float(row.cells[place]) * factor for place, factor in places]
+        except (ValueError, IndexError):
+            values = [math.nan]
+        if len(row.cells) == width and all(map(math.isfinite, values)):
+            numbers.append(values)
+            lines.append(row.line)
+            continue
+        all_wrong += 1
+        if all_wrong <= _MOST_SAID + 1:  # more are not told, and so need not be kept
+            wrong.append(row)
+    mistakes = list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines"))
+    return _Found(numbers, lines, mistakes)
+
+
+def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> Iterator[str]:
+    for row in rows:
+        if len(row.cells) != width:
+            yield f"line {row.line} has {len(row.cells)} columns; expected {width}, as the first line has"
+            continue
+        for column in columns:
+            cell = row.cells[column.place]
+            if not _is_finite(cell):
+                shown = f'"{cell[:40]}"' if cell else "empty"
+                yield f"line {row.line}: {column.name} is {shown}; expected a finite number"
+
+
+def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float) -> Iterator[str]:
+    """Where the time does not start at 0, or does not advance by a slot."""
+    if times and times[0] != 0.0:
+        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, and every time less that"
+    for line, (before, time) in zip(lines[1:], pairwise(times), strict=True):
+        if abs(time - before - slot_seconds) <= _TIME_ERROR * slot_seconds:
+            continue
+        slots = (time - before) / slot_seconds
+        missing = round(slots) - 1 if math.isfinite(slots) else 0
+        what = "times must grow by a slot from line to line"
+        if missing > 0:
+            what = f"a gap of {missing:.10g} slot{'' if missing == 1 else 's'}: fill it, such as with the line before"
+        yield (
+            f"line {line}: the time is {time:.10g} s after {before:.10g} s; expected {before + slot_seconds:.10g} s, "
+            f"for slots of {slot_seconds:.10g} s: {what}"
+        )
+
+
+def _few(mistakes: Iterator[str], where: str) -> Iterator[str]:
+    """The first of them, and that there are more."""
+    for i, mistake in enumerate(mistakes):
+        if i == _MOST_SAID:
+            yield f"and more of the kind, in {where}"
+            return
+        yield mistake
+
+
+def _is_finite(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False

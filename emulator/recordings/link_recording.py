@@ -1,0 +1,225 @@
+"""Recordings of a link: what became of every packet, and if it was measured, how long it took. CSV or Parquet.
+
+Source: docs/links.md, traces.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.errors import TraceError
+from evedrop.files import Limit, Unreadable, lines_of, opened, why_of
+from evedrop.model.delays.trace import MOST_DELAYS
+from evedrop.model.links.trace import MOST_OUTCOMES
+
+Outcomes = NDArray[np.uint8]
+"""1 delivered, 0 lost, (packets,)."""
+
+_PARQUET = (".parquet", ".pq")
+_EXPECTED = "expected a CSV or Parquet file of 0 (lost) and 1 (delivered)"
+_LIMIT = Limit.of_rows(MOST_OUTCOMES)
+_MOST_BYTES = 2**28  # of a column in a row group of a Parquet file, decompressed, which is in memory at once
+_LONGEST_VALUE = 100  # characters of a text that stands where a number should
+_MOST_NAMES = 20  # columns that a message names
+
+
+class Recording:
+    """A recording in a file, read whenever it is asked. Final.
+
+    Raises TraceError for what is no file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            opened(path).close()
+        except Unreadable as error:
+            self._unreadable(error)
+
+    def outcomes(self, column: str | None = None) -> Outcomes:
+        """What became of each packet. Raises TraceError, also for anything but 0 and 1, and for more than ten million."""
+        found = bytearray()
+        for place, value in self._values(column):
+            if value not in {"0", "1"}:
+                self._no("file", f"{place} is {_shown(value)}; expected 0 (lost) or 1 (delivered)")
+            found.append(value == "1")
+            if len(found) > MOST_OUTCOMES:
+                self._no(
+                    "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most so many, such as a part of it"
+                )
+        if not found:
+            self._no("file", f"is empty; {_EXPECTED}")
+        return np.frombuffer(bytes(found), np.uint8)
+
+    def delays(self, column: str | None = None) -> NDArray[np.float64]:
+        """How long each packet took, in slots, (packets,); NaN where nothing stands. Raises TraceError as `outcomes`."""
+        found = []
+        for place, value in self._values(column):
+            found.append(self._delay(place, value))
+            if len(found) > MOST_DELAYS:
+                self._no(
+                    "file", f"has more than {MOST_DELAYS} delays; expected at most that many, such as a part of it"
+                )
+        return np.array(found)
+
+    def _delay(self, place: str, value: str) -> float:
+        if not value:
+            return math.nan
+        try:
+            delay = float(value)
+        except ValueError:
+            delay = -1.0
+        if not delay >= 0.0 or math.isinf(delay):
+            self._no("file", f"{place} is {_shown(value)}; expected a delay in slots, or nothing for a lost packet")
+        return delay
+
+    def columns(self) -> list[str]:
+        """Their names; none if the file has no header."""
+        with self._readable():
+            if self._is_parquet:
+                return list(_parquet(self._path).schema_arrow.names)
+            first = next(_rows(lines_of(self._path, _LIMIT)), (0, []))[1]
+            return [] if all(map(_is_number, first)) else first
+
+    @property
+    def _is_parquet(self) -> bool:
+        return self._path.suffix.lower() in _PARQUET
+
+    def _values(self, column: str | None) -> Iterator[tuple[str, str]]:
+        """Where each value of a column stands, and the value as text."""
+        with self._readable():
+            yield from (self._parquet_values if self._is_parquet else self._csv_values)(column)
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
+        """Make errors of reading the file errors that say so."""
+        try:
+            yield
+        except TraceError:
+            raise
+        except (Unreadable, csv.Error) as error:
+            self._unreadable(error)
+        except Exception as error:
+            if not self._is_parquet:
+                raise
+            self._unreadable(error)  # a damaged Parquet file makes pyarrow raise errors of many kinds
+
+    def _csv_values(self, column: str | None) -> Iterator[tuple[str, str]]:
+        rows = _rows(lines_of(self._path, _LIMIT))
+        number, first = next(rows, (0, []))
+        if not first:
+            return
+        named = column is not None or not all(map(_is_number, first))
+        names = first if named else [""] * len(first)
+        place = self._place(names, column)
+        for line, row in rows if named else chain([(number, first)], rows):
+            if len(row) != len(names):
+                self._no("file", f"line {line} has {len(row)} columns; expected {len(names)}, as the first line has")
+            yield f"line {line}", row[place]
+
+    def _parquet_values(self, column: str | None) -> Iterator[tuple[str, str]]:
+        table = _parquet(self._path)
+        names = list(table.schema_arrow.names)
+        place = self._place(names, column)
+        if table.schema_arrow.field(place).type.num_fields:
+            self._no("file", f"has lists or tables in the column {_shown(names[place])}; {_EXPECTED}")
+        groups = [table.metadata.row_group(i) for i in range(table.metadata.num_row_groups)]
+        paths = [table.schema.column(i).path for i in range(len(table.schema))]
+        sizes = [group.column(paths.index(names[place])).total_uncompressed_size for group in groups]
+        if max(sizes, default=0) > _MOST_BYTES:
+            large = f"has {max(sizes)} bytes in a row group of the column {_shown(names[place])}"
+            self._no("file", f"{large}; expected at most {_MOST_BYTES}")
+        row = 0
+        for batch in table.iter_batches(columns=[names[place]]):
+            values = batch.column(0)
+            # Texts one by one: the same long one may stand in every row.
+            for value in (one.as_py() for one in values) if _is_dictionary(values) else values.to_pylist():
+                row += 1
+                yield f"row {row}", _as_text(value)
+
+    def _place(self, names: Sequence[str], column: str | None) -> int:
+        if column is not None:
+            if column not in names:
+                there = (
+                    f"there are {_some(names)}" if names and not all(map(_is_number, names)) else "there are no names"
+                )
+                self._no("column", f"{_shown(column)} is no column of {self._path.name}; {there}")
+            return names.index(column)
+        if len(names) != 1:
+            if not any(names):
+                self._no(
+                    "file", f"has {len(names)} columns without names; expected one column, or a line of names first"
+                )
+            self._no(
+                "column", f"is missing; {self._path.name} has {_some(names)}; expected column = {_shown(names[0])}"
+            )
+        return 0
+
+    def _unreadable(self, error: Exception) -> NoReturn:
+        self._no("file", f"cannot be read ({why_of(error)}); {_EXPECTED}", error)
+
+    def _no(self, entry: str, what: str, cause: Exception | None = None) -> NoReturn:
+        raise TraceError(str(self._path), entry, what) from cause
+
+
+def _rows(file: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of every line that is not blank."""
+    reader = csv.reader(file)
+    for row in reader:
+        if row:
+            yield reader.line_num, [cell.strip() for cell in row]
+
+
+def _parquet(path: Path) -> Any:
+    import pyarrow as pa  # noqa: PLC0415 - half a second that a CSV need not wait for
+    import pyarrow.parquet as pq  # noqa: PLC0415 - the same
+
+    texts = [
+        field.name
+        for field in pq.read_schema(path)
+        if not (pa.types.is_boolean(field.type) or pa.types.is_integer(field.type) or pa.types.is_floating(field.type))
+    ]
+    # A text that stands in every row of a million is kept once.
+    return pq.ParquetFile(path, read_dictionary=texts)
+
+
+def _is_dictionary(values: Any) -> bool:
+    return hasattr(values, "dictionary")
+
+
+def _some(names: Sequence[str]) -> str:
+    """Names of columns, in one line of some length."""
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(name[:40] for name in names[:_MOST_NAMES]) + more
+
+
+def _as_text(value: Any) -> str:
+    """A Parquet value as a CSV file would have it."""
+    if value is None:
+        return ""
+    if isinstance(value, (str, bytes)):
+        return str(value[:_LONGEST_VALUE])
+    if isinstance(value, (bool, float)) and value in {0, 1}:
+        return str(int(value))
+    return str(value)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _shown(value: str) -> str:
+    return f'"{value[:40]}{"…" if len(value) > 40 else ""}"' if value else "empty"

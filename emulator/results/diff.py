@@ -1,0 +1,146 @@
+"""Where two runs part: the first slot, trial and receiver that differ, with both values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from evedrop.live.network.access import CONTROLLER
+from evedrop.model.digest import BLOCK_SLOTS
+from evedrop.results.writer import Results
+
+_COMPARED = ("sent", "action", "x", "x_hat", "P")
+_INPUTS = ("u", "d", "failed")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first difference, and whether there is one at all."""
+
+    same: bool
+    text: str
+
+
+def difference(a: Results, b: Results) -> Difference:
+    """Compare what every receiver received and believed, trial by trial, over the trials and receivers both have."""
+    blocks_a, blocks_b = _blocks(a), _blocks(b)
+    ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
+    common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]
+    first = _first(a, b)
+    if not common and first is None:
+        return Difference(
+            False, "the runs have no whole block of a trial and receiver in common; compare runs of one scenario"
+        )
+    unequal = sorted(
+        (block, trial, peer) for peer, trial, block in common if _differ(blocks_a, blocks_b, peer, trial, block)
+    )
+    only = len(blocks_a) + len(blocks_b) - 2 * len(common)
+    rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
+    if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
+        return Difference(False, first.text + rest)
+    if not unequal:
+        peers = ", ".join(sorted({peer for peer, _, _ in common}))
+        return Difference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
+    block, trial, peer = unequal[0]
+    slots = f"slots {block} to {ends_a[peer, block] - 1}"
+    remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
+    return Difference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
+
+
+def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:
+    """(Receiver, first slot of a block) → the first slot after it: a multiple of 256, the next block's, or the run's end."""
+    starts: dict[str, set[int]] = {}
+    for peer, _, block in blocks:
+        starts.setdefault(peer, set()).add(block)
+    ends = {}
+    for peer, of_peer in starts.items():
+        for block, after in pairwise([*sorted(of_peer), int(results.summary["slots"])]):
+            ends[peer, block] = min((block // BLOCK_SLOTS + 1) * BLOCK_SLOTS, after)
+    return ends
+
+
+def _blocks(results: Results) -> dict[tuple[str, int, int], bytes]:
+    columns = results.digests.to_pydict()
+    keys = zip(columns["peer"], columns["trial"], columns["block"], strict=True)
+    return dict(zip(keys, columns["digest"], strict=True))
+
+
+def _differ(
+    a: dict[tuple[str, int, int], bytes], b: dict[tuple[str, int, int], bytes], peer: str, trial: int, block: int
+) -> bool:
+    return a[peer, trial, block] != b[peer, trial, block]
+
+
+@dataclass(frozen=True)
+class _Row:
+    slot: int
+    text: str
+
+
+def _first(a: Results, b: Results) -> _Row | None:
+    """The first recorded row that differs, of a receiver, or of the controller."""
+    found = _first_row(a.trials, b.trials, ("slot", "trial", "peer"), _COMPARED)
+    inputs = (a.inputs, b.inputs)
+    if inputs[0] is None or inputs[1] is None:
+        return found
+    compared = [name for name in _INPUTS if name in inputs[0].schema.names and name in inputs[1].schema.names]
+    steered = _first_row(inputs[0], inputs[1], ("slot", "trial"), compared)
+    # What is decided in a slot is decided from what is believed after it.
+    return steered if steered is not None and (found is None or steered.slot < found.slot) else found
+
+
+def _first_row(a: pa.Table, b: pa.Table, keys: Sequence[str], compared: Sequence[str]) -> _Row | None:
+    order = [(key, "ascending") for key in keys]
+    tables = [_plain(table, (*keys, *compared)).sort_by(order) for table in (a, b)]
+    joined = tables[0].join(tables[1], [*keys], join_type="inner", right_suffix="_b")
+    unequal = None
+    for name in compared:
+        differs = pc.not_equal(joined[name], joined[f"{name}_b"])
+        unequal = differs if unequal is None else pc.or_(unequal, differs)
+    rows = joined.filter(unequal).sort_by(order).slice(0, 1).to_pylist()
+    if not rows:
+        return None
+    row = rows[0]
+    values = "; ".join(
+        f"{name} {_shown(row[name])} against {_shown(row[f'{name}_b'])}"
+        for name in compared
+        if row[name] != row[f"{name}_b"]
+    )
+    return _Row(
+        row["slot"],
+        f"first difference: slot {row['slot']}, trial {row['trial']}, {row.get('peer', CONTROLLER)}: {values}",
+    )
+
+
+def _plain(table: pa.Table, names: Sequence[str]) -> pa.Table:
+    """Columns that can be joined and compared: strings for dictionaries, the numbers' bytes for lists."""
+    columns = {}
+    for name in names:
+        column = table[name]
+        if pa.types.is_dictionary(column.type):
+            column = column.cast(pa.string())
+        elif pa.types.is_fixed_size_list(column.type):
+            column = _as_bytes(column)
+        columns[name] = column
+    return pa.table(columns)
+
+
+def _as_bytes(column: pa.ChunkedArray) -> pa.Array:
+    width = 8 * column.type.list_size
+    if not column.num_chunks:
+        return pa.array([], pa.binary())
+    values = pa.concat_arrays([chunk.flatten() for chunk in column.chunks]).to_numpy()
+    return pa.FixedSizeBinaryArray.from_buffers(pa.binary(width), len(column), [None, pa.py_buffer(values)]).cast(
+        pa.binary()
+    )
+
+
+def _shown(value: str | bytes | bool) -> str:
+    if not isinstance(value, bytes):
+        return str(value)
+    numbers = memoryview(value).cast("d").tolist()
+    return "[" + ", ".join(repr(number) for number in numbers) + "]"

@@ -1,0 +1,132 @@
+"""The folder that results go into, and the files in it: for the user who started the run, and for nobody else.
+
+Results hold the seed, the truth and, while a run goes on, the operator's password. So a folder has the mode 0700 and a
+file 0600 from the moment it is there, whatever the umask is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.files import shown
+
+
+def default_folder(scenario: str | Path) -> Path:
+    """`runs/<scenario>-<time>`, in the current folder: what a results folder is called if nobody says."""
+    stem = Path(scenario).stem if Path(scenario).suffix else Path(scenario).name
+    return Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def claimed(wanted: Path) -> Path:
+    """Make a new folder of that name, or of that name and a number: nobody else makes the same one. Raises UsageError."""
+    for number in itertools.count(1):
+        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
+        try:
+            make_private(folder, exist_ok=False)
+        except FileExistsError as error:
+            if not folder.parent.is_dir():
+                raise _unusable(folder, "a part of it is a file") from error
+            continue
+        except OSError as error:
+            raise _unusable(folder, str(error.strerror)) from error
+        return folder
+    raise AssertionError  # there is always another number
+
+
+@contextlib.contextmanager
+def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Path]:
+    """The folder for results: `out`, else a new one of the scenario's name, which is removed if it is still empty."""
+    if out is not None:
+        yield Path(out)
+        return
+    folder = claimed(default_folder(scenario))
+    try:
+        yield folder
+    finally:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # only an empty one can be removed
+            folder.parent.rmdir()
+
+
+def _unusable(folder: Path, why: str) -> UsageError:
+    return UsageError(f"{shown(folder)} cannot be written ({why}); give another --out")
+
+
+_FOLDER_MODE, _FILE_MODE = 0o700, 0o600
+
+
+def new_folder(folder: Path) -> Path:
+    """Create a results folder, or take an empty one; nobody else may look into it.
+
+    Raises UsageError if it has something in it, belongs to another user, or cannot be written.
+    """
+    if shown(folder) != str(folder):
+        raise UsageError(f"--out {shown(folder)} is not a name in UTF-8, which results and messages are; give another")
+    try:
+        make_private(folder)
+        _narrow(folder)
+        if any(folder.iterdir()):
+            raise UsageError(f"{folder} is not empty; give another --out, or empty it")
+    except NotADirectoryError as error:
+        raise UsageError(f"{folder}: a part of it is a file; give another --out") from error
+    except FileExistsError as error:
+        raise UsageError(f"{folder} is a file; give another --out") from error
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error
+    return folder
+
+
+def make_private(folder: Path, exist_ok: bool = True) -> None:
+    """Create a folder, and those above it that are missing, for this user alone. Raises OSError as `Path.mkdir` does."""
+    for missing in reversed([one for one in folder.parents if not one.exists()]):
+        missing.mkdir(_FOLDER_MODE, exist_ok=True)
+    folder.mkdir(_FOLDER_MODE, exist_ok=exist_ok)
+
+
+def _narrow(folder: Path) -> None:
+    """Take the rights of everybody else from a folder that was there before. Raises UsageError if it is not ours."""
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # the folder that is checked is the one that is changed
+    try:
+        found = os.fstat(opened)
+        if found.st_uid != os.geteuid():
+            raise UsageError(
+                f"{folder} belongs to the user with the number {found.st_uid}, who could read the seed and the truth in it; "
+                "give another --out, or a folder of your own"
+            )
+        if found.st_mode & 0o077:
+            os.fchmod(opened, _FOLDER_MODE)
+    finally:
+        os.close(opened)
+
+
+def private_opener(path: str, flags: int) -> int:
+    """An `opener` of `open`: a file that is made is readable by this user alone, and one that is there becomes so."""
+    opened = os.open(path, flags, _FILE_MODE)
+    with suppress(PermissionError):  # a file system without modes
+        os.fchmod(opened, _FILE_MODE)
+    return opened
+
+
+def private_file(path: Path) -> Path:
+    """Create an empty file that only this user can read, for a library that opens it by its name; its path."""
+    with open(path, "wb", opener=private_opener):
+        return path
+
+
+def private_pictures(path: Path) -> Path:
+    """The same of the two files of a picture, `path`.png and `path`.pdf; `path`."""
+    for suffix in (".png", ".pdf"):
+        private_file(path.with_suffix(suffix))
+    return path
+
+
+def write_private(path: Path, text: str) -> None:
+    """Write a text into a file that only this user can read."""
+    private_file(path).write_text(text, encoding="utf-8")

@@ -1,0 +1,316 @@
+"""Tables that grow while a run goes on, in a form that survives whatever ends it, and the Parquet files made of them.
+
+While a run goes on, each table is an Arrow IPC stream in the folder `unfinished` of the results folder, to which record
+batches are appended. All tables are written together, in rounds; after each round a line of `unfinished/rounds` says how many
+rows each table has. A reader takes the last whole line and that many rows, so it does not matter in which byte the
+writer was killed or the disk became full. When the run ends, the streams become Parquet files one after the other.
+
+Source: docs/results.md, while a run goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from evedrop.results.folder import make_private, private_opener, write_private
+from evedrop.results.tables import NULLABLE
+
+UNFINISHED = "unfinished"
+"""The folder inside a results folder that holds what is not finished."""
+BATCH_BYTES = 16 * 2**20
+"""No record batch and no row group of a Parquet file is larger, unless a single row is."""
+_GROUP_ROWS = 65_536
+_ROUNDS = "rounds"
+_SUMMARY = "summary.json"
+_TAIL_BYTES = 65_536  # more than the longest line of the rounds
+
+
+@final
+class Stream:
+    """An Arrow IPC stream that grows: one table of a run. Rows are held back until the next round."""
+
+    def __init__(self, path: Path, schema: pa.Schema, names: Mapping[str, tuple[str, ...]]) -> None:
+        """names: what the codes of each dictionary column stand for. Raises OSError if the file cannot be made."""
+        self.file = path.name
+        self.rows = 0
+        """Rows on disk."""
+        self.held_bytes = 0
+        self._schema = schema
+        self._names = {column: pa.array(words) for column, words in names.items()}
+        self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
+        self._held_rows = 0
+        self._sink = _Sink(path)
+        options = pa.ipc.IpcWriteOptions(compression="lz4")
+        self._writer = pa.ipc.new_stream(pa.PythonFile(self._sink, mode="w"), schema, options=options)
+        # Arrow writes the schema with the first batch, and a reader needs it before there is a row.
+        empty = [
+            pa.DictionaryArray.from_arrays(pa.array([], pa.int8()), self._names[one.name])
+            if one.name in self._names
+            else pa.array([], one.type)
+            for one in schema
+        ]
+        self._writer.write_batch(pa.RecordBatch.from_arrays(empty, schema=schema))
+
+    def add(self, columns: Sequence[NDArray[Any]]) -> int:
+        """Hold back rows until the next round; how many bytes they have.
+
+        columns: an array for each column, codes where it has names, two-dimensional where it holds lists or bytes.
+        """
+        # Copies: a view would keep a whole message in memory.
+        copies = [np.array(column) for column in columns]
+        for held, column in zip(self._held, copies, strict=True):
+            held.append(column)
+        self._held_rows += len(columns[0])
+        size = sum(column.nbytes for column in copies)
+        self.held_bytes += size
+        return size
+
+    def write(self) -> None:
+        """Write what is held back to the file. Raises OSError if it cannot be written whole."""
+        if self._held_rows:
+            whole = [np.concatenate(held) for held in self._held]
+            at_once = max(1, self._held_rows * BATCH_BYTES // max(1, self.held_bytes))
+            for first in range(0, self._held_rows, at_once):
+                columns = [
+                    self._column(one, values[first : first + at_once])
+                    for one, values in zip(self._schema, whole, strict=True)
+                ]
+                self._writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=self._schema))
+                self._sink.flush()
+        self._sink.flush()
+        self.rows += self._held_rows
+        self._held, self._held_rows, self.held_bytes = [[] for _ in self._schema], 0, 0
+
+    def _column(self, one: pa.Field, values: NDArray[Any]) -> pa.Array:
+        if one.name in self._names:
+            return pa.DictionaryArray.from_arrays(pa.array(values.astype(np.int8)), self._names[one.name])
+        if pa.types.is_fixed_size_list(one.type):
+            return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+        if pa.types.is_fixed_size_binary(one.type):
+            return pa.FixedSizeBinaryArray.from_buffers(one.type, len(values), [None, pa.py_buffer(values)])
+        if pa.types.is_binary(one.type):
+            ends = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
+            return pa.BinaryArray.from_buffers(one.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)])
+        return pa.array(values, one.type, from_pandas=one.name in NULLABLE)
+
+    def close(self) -> None:
+        """Close the file as it is; what is held back is dropped."""
+        self._sink.close()
+
+
+@final
+class _Sink:
+    """A file for Arrow, which writes every byte or raises: of a short write Arrow would take no notice."""
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
+        self._waiting: list[bytes] = []
+        self.closed = False
+
+    def write(self, data: Any) -> int:
+        self._waiting.append(bytes(data))
+        return len(self._waiting[-1])
+
+    def flush(self) -> None:
+        left, self._waiting = memoryview(b"".join(self._waiting)), []
+        while left:
+            left = left[os.write(self._descriptor, left) :]
+
+    def close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            os.close(self._descriptor)
+
+
+@dataclass(frozen=True)
+class Round:
+    """What an unfinished results folder has on disk."""
+
+    at: str = ""
+    """How far its run came, in words."""
+    slots: int = 0
+    """How many slots have rows."""
+    tables: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+    """Table → its file and the rows that count."""
+
+
+class Unfinished:
+    """The writer's side of the folder `unfinished`. Holds a lock on it, by which a reader knows that the run goes on."""
+
+    def __init__(self, folder: Path) -> None:
+        """Make it in a results folder. Raises OSError if that cannot be done."""
+        place = folder / UNFINISHED
+        make_private(place, exist_ok=False)
+        self._descriptor = os.open(place, os.O_RDONLY)
+        with contextlib.suppress(OSError):  # of a file system without locks, where a run that goes on looks killed
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
+
+    def round(self, at: str, slots: int, streams: Mapping[str, Stream]) -> None:
+        """Write what every stream holds back, then the line that makes it count. Raises OSError if that fails."""
+        for stream in streams.values():
+            stream.write()
+        tables = {name: (stream.file, stream.rows) for name, stream in streams.items()}
+        line = json.dumps({"at": at, "slots": slots, "tables": tables}).encode() + b"\n"
+        if os.write(self._rounds, line) != len(line):
+            raise OSError(28, os.strerror(28), _ROUNDS)  # ENOSPC: only a disk that has become full takes a part
+
+    def close(self) -> None:
+        """Release the lock; the files stay."""
+        os.close(self._rounds)
+        os.close(self._descriptor)
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether a results folder has tables that are not Parquet files yet."""
+    return (folder / UNFINISHED).is_dir()
+
+
+def goes_on(folder: Path) -> bool:
+    """Whether somebody still writes to an unfinished results folder."""
+    try:
+        descriptor = os.open(folder / UNFINISHED, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def last_round(folder: Path) -> Round:
+    """What a results folder has in streams: the last round that was written whole; nothing if there was none."""
+    try:
+        with (folder / UNFINISHED / _ROUNDS).open("rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
+            lines = file.read().rpartition(b"\n")[0].splitlines()
+    except OSError:
+        return Round()
+    for line in reversed(lines):
+        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
+            found = json.loads(line)
+            tables = {str(name): (Path(str(file)).name, int(rows)) for name, (file, rows) in found["tables"].items()}
+            return Round(str(found["at"]), int(found["slots"]), tables)
+    return Round()
+
+
+def write_figures(folder: Path, text: str) -> None:
+    """Write the summary of what was measured so far, whole at any moment."""
+    place = folder / UNFINISHED
+    write_private(place / f"{_SUMMARY}.new", text)
+    os.replace(place / f"{_SUMMARY}.new", place / _SUMMARY)
+
+
+def figures_path(folder: Path) -> Path:
+    """Where `write_figures` puts them."""
+    return folder / UNFINISHED / _SUMMARY
+
+
+def batches_of(folder: Path, name: str) -> Iterator[pa.RecordBatch]:
+    """The rows of a table in a stream, batch by batch; none if there is no such stream, fewer if it is damaged."""
+    file, rows = last_round(folder).tables.get(name, ("", 0))
+    if not file:
+        return
+    with (
+        contextlib.suppress(OSError, pa.ArrowException, StopIteration),
+        pa.OSFile(str(folder / UNFINISHED / file)) as source,
+        pa.ipc.open_stream(source) as reader,
+    ):
+        while rows > 0:
+            batch = reader.read_next_batch()
+            yield batch.slice(0, rows)
+            rows -= batch.num_rows
+
+
+def schema_of(folder: Path, name: str) -> pa.Schema | None:
+    """The schema of a table in a stream; None if there is no such stream."""
+    file, _ = last_round(folder).tables.get(name, ("", 0))
+    if not file:
+        return None
+    try:
+        with pa.OSFile(str(folder / UNFINISHED / file)) as source, pa.ipc.open_stream(source) as reader:
+            return reader.schema
+    except (OSError, pa.ArrowException):
+        return None
+
+
+def parquet_or_stream(folder: Path, name: str, rows: int = _GROUP_ROWS) -> Iterator[pa.RecordBatch]:
+    """The rows of a table, so many at a time if it is a Parquet file; none if there is no such table or it is damaged."""
+    path = folder / f"{name}.parquet"
+    if path.exists():
+        with contextlib.suppress(OSError, pa.ArrowException):
+            yield from pq.ParquetFile(path).iter_batches(rows)
+    else:
+        yield from batches_of(folder, name)
+
+
+def finish(folder: Path) -> None:
+    """Make Parquet files of all streams, each removed when its file is whole. Memory: that of a row group.
+
+    Raises OSError if one cannot be written: it and those after it stay streams, which are read as well.
+    """
+    for name, (file, _) in last_round(folder).tables.items():
+        schema = schema_of(folder, name)
+        if schema is None:
+            continue
+        unfinished = folder / UNFINISHED / f"{name}.parquet"
+        try:
+            _write_parquet(unfinished, schema, batches_of(folder, name))
+        except (OSError, pa.ArrowException):
+            unfinished.unlink(missing_ok=True)
+            raise
+        os.replace(unfinished, folder / f"{name}.parquet")
+        (folder / UNFINISHED / file).unlink()
+
+
+def _write_parquet(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> None:
+    names = [one.name for one in schema if pa.types.is_dictionary(one.type)]
+    with (
+        open(path, "wb", opener=private_opener) as file,
+        pq.ParquetWriter(file, schema, compression="zstd", compression_level=1, use_dictionary=names) as writer,
+    ):
+        for group in _groups(batches):
+            writer.write_table(pa.Table.from_batches(group, schema).combine_chunks())
+
+
+def _groups(batches: Iterator[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]:
+    """Batches put together to row groups."""
+    held: list[pa.RecordBatch] = []
+    rows = size = 0
+    for batch in batches:
+        if not batch.num_rows:
+            continue
+        if held and size + batch.nbytes > BATCH_BYTES:
+            yield held
+            held, rows, size = [], 0, 0
+        held.append(batch)
+        rows, size = rows + batch.num_rows, size + batch.nbytes
+        if rows >= _GROUP_ROWS:
+            yield held
+            held, rows, size = [], 0, 0
+    if held:
+        yield held
+
+
+def forget(folder: Path) -> None:
+    """Remove the folder `unfinished`, if all its tables are Parquet files and the summary is written."""
+    if not any((folder / UNFINISHED / file).exists() for file, _ in last_round(folder).tables.values()):
+        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)

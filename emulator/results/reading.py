@@ -1,0 +1,177 @@
+"""Results folders read: the summary, and the tables as Arrow, of a run that ended, goes on, or was killed.
+
+Source: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from evedrop.errors import UsageError
+from evedrop.files import Unreadable, opened, text_of
+from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
+from evedrop.results.input_table import inputs_schema_in
+from evedrop.results.summary_file import plain
+from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, trials_schema
+
+_MOST_BYTES = 2**28
+_LAST_SLOT = 100_000_000
+
+
+@dataclass(frozen=True)
+class Results:
+    """A results folder, read: `summary` as in docs/results.md, the tables as Arrow."""
+
+    folder: Path
+    summary: Mapping[str, Any]
+
+    @property
+    def remark(self) -> str | None:
+        """What there is to say of a run that did not come to its end; None of one that did."""
+        ended = str(self.summary.get("ended", "complete"))
+        return None if ended == "complete" else f"{self.folder}: {ended.splitlines()[0]}"
+
+    def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
+        path = self.folder / f"{name}.parquet"
+        schema = None if path.exists() else schema_of(self.folder, name)
+        try:
+            if schema is None:
+                with opened(path) as file:  # a pipe would be waited for
+                    table = pq.read_table(file)
+            else:
+                table = pa.Table.from_batches(batches_of(self.folder, name), schema)
+        except Exception as error:  # a damaged file makes pyarrow raise errors of many kinds
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+        wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
+        if not table.schema.equals(wanted):
+            other = [field.name for field in wanted if field not in table.schema] or table.schema.names
+            raise UsageError(
+                f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
+            )
+        empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
+        if empty:
+            raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
+        return table
+
+    @property
+    def slots(self) -> pa.Table:
+        """A row per slot and peer: statistics over trials."""
+        return self._table("slots", SLOTS)
+
+    @property
+    def trials(self) -> pa.Table:
+        """A row per slot, peer and recorded trial."""
+        return self._table("trials")
+
+    @property
+    def journal(self) -> pa.Table:
+        """A row per slot and link."""
+        return self._table("journal", JOURNAL)
+
+    @property
+    def inputs(self) -> pa.Table | None:
+        """A row per slot and recorded trial of a closed loop; None without a controller."""
+        if self.summary.get("controller") is None:
+            return None
+        path = self.folder / "inputs.parquet"
+        schema = None if path.exists() else schema_of(self.folder, "inputs")
+        return self._table("inputs", inputs_schema_in(path) if schema is None else schema)
+
+    @property
+    def digests(self) -> pa.Table:
+        """A row per peer, trial and block of 256 slots."""
+        return self._table("digests", DIGESTS)
+
+
+def _states_in(schema: pa.Schema) -> int:
+    """The number of states in a table of trials, as far as it is one."""
+    x = schema.field("x").type if "x" in schema.names else None
+    return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def load_results(folder: str | Path) -> Results:
+    """Read a results folder, also one whose run goes on or was killed: `ended` of its summary says so, and where.
+
+    Raises UsageError if it is none, naming the file that is missing or broken.
+    """
+    place = Path(folder)
+    path = place / "summary.json"
+    if not path.exists() and (place / "shards").is_dir():
+        raise UsageError(
+            f"{folder} is of a run in shards that goes on or was killed; each of its shards is a results folder by "
+            f"itself, such as {place / 'shards' / '1'}"
+        )
+    if not path.exists() and is_unfinished(place):
+        return Results(place, _cut_short(place))
+    return Results(place, _read_summary(path))
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads(text_of(path, _MOST_BYTES))
+    except Unreadable as error:
+        raise UsageError(
+            f"{path.parent} is no results folder ({path.name}: {error}); give the --out of a run"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
+    parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
+    if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
+        raise UsageError(f"{path} is no summary of a run; run the scenario again")
+    events = summary.get("events", [])
+    if not isinstance(events, list) or not all(map(_is_event, events)):
+        raise UsageError(f"{path} has events that are none; run the scenario again")
+    return summary
+
+
+def _is_event(found: Any) -> bool:
+    return (
+        isinstance(found, dict)
+        and type(found.get("slot")) is int
+        and 0 <= found["slot"] <= _LAST_SLOT
+        and all(isinstance(found.get(name), str) for name in ("event", "by"))
+    )
+
+
+def _cut_short(folder: Path) -> dict[str, Any]:
+    """The summary of a results folder that has none of its own yet: the last figures that were written."""
+    found = last_round(folder)
+    at = found.at
+    if not at:
+        raise UsageError(
+            f"{folder} has nothing yet: its run has just begun, or was killed then; run the scenario again"
+        )
+    try:
+        summary = _read_summary(figures_path(folder))
+    except UsageError:
+        summary = _no_figures(folder)
+    ended = f"the run goes on, at {at}" if goes_on(folder) else f"cut short at {at}, for its run was killed"
+    if summary["ended"] != at:
+        ended += f" (the figures are as of {summary['ended']}; the tables have more)"
+    return {**summary, "slots": found.slots, "ended": ended}
+
+
+def _no_figures(folder: Path) -> dict[str, Any]:
+    """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
+    # The others need neither theory nor scenario to read results.
+    from evedrop.scenario import load  # noqa: PLC0415
+    from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
+    from evedrop.score.totals import Totals  # noqa: PLC0415
+
+    scenario = load(folder, beyond_horizon=True)
+    nothing = Totals.nothing(scenario, scenario.trials)
+    summary: dict[str, Any] = plain(
+        summary_of(scenario, nothing, dict.fromkeys(scenario.digested), Ending(0.0, "slot 0"))
+    )
+    return summary

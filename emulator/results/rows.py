@@ -1,0 +1,40 @@
+"""What the messages of a live run are held to, and the rows that are made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import islice
+from typing import final
+
+from evedrop.model.digest import Digests
+from evedrop.results.writer import ResultsWriter
+from evedrop.score.joined import Slots
+from evedrop.score.scorekeeper import Scored
+
+
+def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
+    """All rows of some slots."""
+    for name, one in scored.items():
+        writer.slot_rows(slots.first, name, one.sums, one.expected)
+    writer.input_rows(slots, first_trial)
+    writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
+    writer.journal_rows(slots)
+
+
+@final
+class DigestRows:
+    """The digests of a run, whose rows are written as the blocks are reported."""
+
+    def __init__(self, digests: Mapping[str, Mapping[int, Digests]], first_trial: int) -> None:
+        """digests: receiver, or controller → block → digests of the trials from first_trial on; blocks are added."""
+        self._digests = digests
+        self._first_trial = first_trial
+        self._written = dict.fromkeys(digests, 0)
+
+    def write(self, writer: ResultsWriter) -> None:
+        """Write the blocks that were added since the last time."""
+        for name, blocks in self._digests.items():
+            if len(blocks) > self._written[name]:
+                new = dict(islice(blocks.items(), self._written[name], None))
+                writer.digest_rows(self._first_trial, {name: new})
+                self._written[name] = len(blocks)

@@ -1,0 +1,59 @@
+"""summary.json, which ends a results folder.
+
+Source: docs/results.md, summary.json.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evedrop.results.folder import write_private
+from evedrop.results.growing_tables import forget
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write summary.json, which ends a results folder; infinite and undefined numbers as strings, which JSON lacks."""
+    unfinished = folder / "summary.json.new"
+    try:
+        write_private(unfinished, summary_text(summary))
+        os.replace(unfinished, folder / "summary.json")
+    except OSError:
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
+        raise
+    forget(folder)
+
+
+def summary_text(summary: Mapping[str, Any]) -> str:
+    """A summary as it is in a file."""
+    return json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """The same with infinite and undefined numbers as strings, which JSON lacks."""
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    return value
+
+
+def unwritten(error: OSError) -> str:
+    """What a summary and a message say of results that could not be written."""
+    if isinstance(error, FileNotFoundError):
+        return (
+            f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
+        )
+    return (
+        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; what was "
+        "measured before can be looked at"
+    )

@@ -1,0 +1,299 @@
+"""The results folder: written while the run goes on, whole whenever it ends, and read back as typed tables.
+
+Source: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from evedrop.live.network.access import CONTROLLER
+from evedrop.live.protocol.codec import packed_flags
+from evedrop.model.digest import Digests
+from evedrop.model.links.link import REASONS
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish, write_figures
+from evedrop.results.held_folder import HeldFolder
+from evedrop.results.input_table import input_columns, inputs_schema
+from evedrop.results.reading import Results, load_results
+from evedrop.results.summary_file import plain, summary_text, write_summary
+from evedrop.results.tables import ACTIONS, DIGESTS, JOURNAL, NULLABLE, SENT, SLOTS, trials_schema
+from evedrop.scenario import Scenario
+from evedrop.scenario.disturbances import disturbances_of
+from evedrop.score.histogram import LEVELS
+from evedrop.score.joined import Slots
+from evedrop.score.sums import SlotSums
+
+_ROUND_SECONDS = 3.0  # at the longest from one round to the next: what a killed writer loses
+_ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # held back at the most, at the start of a run and later
+_ROUND_SHARE = 8  # of what is on disk, so much less may be held back
+_FIGURES_SHARE = 50  # so many times as long as figures took nothing is spent on them
+
+__all__ = [
+    "ACTIONS", "DIGESTS", "JOURNAL", "NULLABLE", "SENT", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
+    "seen_actions", "write_summary",
+]  # fmt: skip
+
+
+class ResultsWriter:
+    """Writes the tables of a results folder. Final; a context manager.
+
+    While the block runs, rows go to streams that can be read whatever ends the writer; on leaving it they become Parquet
+    files. `write_summary` then ends the folder.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        receivers: tuple[str, ...],
+        n: int,
+        around: Sequence[float] | None = None,
+        loop: tuple[Plant, Floats] | None = None,
+    ) -> None:
+        """around: what is added to states and estimates, (n,); loop: of a closed one, plant and disturbances (slots, q).
+
+        Raises OSError if the folder cannot be written.
+        """
+        self._digested = receivers if loop is None else (*receivers, CONTROLLER)
+        self._around = None if around is None or not any(around) else np.array(around)
+        self._held = HeldFolder(folder)
+        self._unfinished = Unfinished(folder)
+        self._loop = loop
+        peers = {"peer": self._digested}
+        words = {**peers, "sent": SENT, "action": ACTIONS}
+        self._kinds: dict[str, tuple[pa.Schema, Mapping[str, tuple[str, ...]]]] = {
+            "slots": (SLOTS, peers),
+            "trials": (trials_schema(n), words),
+            "journal": (JOURNAL, {"link": receivers}),
+            "digests": (DIGESTS, peers),
+        }
+        if loop is not None:
+            plant, disturbances = loop
+            self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1]), {})
+        self._streams = {name: self._stream(name, 0) for name in self._kinds}
+        self._outdated: list[Stream] = []
+        self._restarts = self._bytes = self._on_disk = self._slots = 0
+        self._at = "slot 0"
+        self._broken = self._figures_before = False
+        self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
+        self._round()
+
+    def _stream(self, name: str, number: int) -> Stream:
+        schema, names = self._kinds[name]
+        return Stream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
+
+    @classmethod
+    def of(cls, folder: Path, scenario: Scenario) -> Self:
+        """Of the results of a scenario."""
+        loop = (
+            None
+            if scenario.driven is None or scenario.controller is None
+            else (scenario.driven, disturbances_of(scenario))
+        )
+        return cls(folder, scenario.receivers, len(scenario.process.A), scenario.process.around, loop)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        failure: OSError | None = None
+        try:
+            if not self._broken:
+                self._round()
+        except OSError as found:
+            failure = found
+        for stream in (*self._streams.values(), *self._outdated):
+            stream.close()
+        try:
+            finish(self._held.now)
+        except (OSError, pa.ArrowException) as found:  # what was measured stays where it is, and can be read
+            failure = failure or (found if isinstance(found, OSError) else OSError(str(found)))
+        self._unfinished.close()
+        self._held.close()
+        if failure is not None and error is None:
+            raise failure
+
+    def checkpoint(
+        self, at: str, figures: Callable[[], Mapping[str, Any]], before: Callable[[], None] = lambda: None
+    ) -> None:
+        """See to it that what was measured is on disk: within seconds, or when there is much that is not.
+
+        at: how far the run came, in words; figures: the summary so far, which is asked for more rarely if it takes long;
+        before: called before figures are asked for. Raises OSError if the disk is full or the folder is gone.
+        """
+        self._at = at
+        began = time.monotonic()
+        least, most = _ROUND_BYTES
+        if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_SHARE)):
+            return
+        if began >= self._figures_due:
+            before()
+        self._round()
+        self._round_due = time.monotonic() + _ROUND_SECONDS
+        if began >= self._figures_due:
+            self._figures_due = self._round_due
+            self.write_figures(figures())
+            # The first time theory is imported, which says nothing about the next.
+            took = time.monotonic() - began if self._figures_before else 0.0
+            self._figures_before = True
+            self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
+
+    def settle(self, at: str, figures: Mapping[str, Any]) -> None:
+        """Have everything on disk, with the last figures: nothing more will come. Raises OSError as above."""
+        self._at = at
+        self._round()
+        self.write_figures(figures)
+
+    def write_figures(self, figures: Mapping[str, Any]) -> None:
+        """Write the summary so far, of a run that did not end yet."""
+        write_figures(self._held.now, summary_text({**figures, "ended": self._at}))
+
+    def restart_slots(self) -> None:
+        """Forget the rows of all slots, for others will take their place."""
+        self._restarts += 1
+        self._outdated.append(self._streams["slots"])
+        self._streams["slots"] = self._stream("slots", self._restarts)
+
+    def _round(self) -> None:
+        if self._broken:  # what would come after a part of a batch could not be read
+            raise OSError(errno.EIO, "an earlier part could not be written")
+        self._broken = True  # unless all goes well
+        self._unfinished.round(self._at, self._slots, self._streams)
+        self._broken = False
+        self._on_disk, self._bytes = self._on_disk + self._bytes, 0
+        for stream in self._outdated:
+            stream.close()
+            (self._held.now / UNFINISHED / stream.file).unlink()
+        self._outdated = []
+
+    def _add(self, table: str, columns: Sequence[NDArray[Any]]) -> None:
+        stream = self._streams[table]
+        self._bytes += stream.add(columns)
+        if stream.held_bytes >= BATCH_BYTES:  # these rows count from the next round on
+            stream.write()
+
+    def slot_rows(
+        self,
+        first: int,
+        name: str,
+        sums: SlotSums,
+        expected: Floats,
+        quantiles: Floats | None = None,
+        covariance_only: bool = False,
+    ) -> None:
+        """A row per slot: statistics over trials of one receiver.
+
+        expected: the trace that theory gives, (c,); quantiles: of error and of trace, (c, 2 levels), NaN where there are
+        none; covariance_only: the error is the trace of the actual covariance, not a squared error.
+        """
+        count, trials = len(expected), sums.trials
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            mean = sums.error / trials
+            variance = np.maximum(0.0, sums.error_squared / trials - mean * mean) * trials / (trials - 1.0)
+            standard_error = np.where(trials > 1, np.sqrt(variance / trials), np.nan)
+            columns = [sums.trace / trials, expected, sums.received / trials, sums.used / trials]
+        self._slots = max(self._slots, first + count)
+        nothing = np.full(count, np.nan)
+        spread = quantiles if quantiles is not None else np.full((count, 2 * len(LEVELS)), np.nan)
+        self._add(
+            "slots",
+            [
+                np.arange(first, first + count),
+                self._names(name, count),
+                trials.astype(np.int64),
+                nothing if covariance_only else mean,
+                mean if covariance_only else nothing,
+                standard_error,
+                *columns,
+                *spread.T,
+            ],
+        )
+
+    def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
+        """A row per slot, receiver and recorded trial, the first of which is first_trial: everything."""
+        recorded = next(iter(slots.receivers.values())).P.shape[3]
+        count = slots.count * recorded
+        k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
+        trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
+        nu = slots.nu[:, :recorded]
+        packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, len(SENT) - 1)
+        x = self._levels(slots.x[:, :, :recorded])
+        for name, receiver in slots.receivers.items():
+            self._add(
+                "trials",
+                [
+                    k,
+                    self._names(name, count),
+                    trials,
+                    packets.reshape(-1),
+                    seen_actions(receiver.action[:, :recorded], nu).reshape(-1),
+                    squared_errors[name][:, :recorded].reshape(-1),
+                    np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
+                    x,
+                    self._levels(receiver.x_hat[:, :, :recorded]),
+                    np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
+                ],
+            )
+
+    def _levels(self, x: Floats) -> Floats:
+        """States (c, n, r) as rows, (c r, n), with the reference added from which they are deviations."""
+        rows = x.transpose(0, 2, 1).reshape(-1, x.shape[1])
+        return rows if self._around is None else rows + self._around
+
+    def input_rows(self, slots: Slots, first_trial: int) -> None:
+        """A row per slot and recorded trial, the first of which is first_trial: what moved the plant."""
+        if slots.inputs is None or self._loop is None:
+            return
+        self._add("inputs", input_columns(slots, *self._loop, first_trial))
+
+    def journal_rows(self, slots: Slots) -> None:
+        """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
+        for name, receiver in slots.receivers.items():
+            silent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
+            offered = np.full(slots.count, slots.trials) - silent
+            delivered = np.count_nonzero(receiver.delivered, axis=1)
+            by_reason = [receiver.lost[reason].astype(np.int64) for reason in REASONS]
+            lost = np.sum(by_reason, axis=0)
+            self._add(
+                "journal",
+                [
+                    np.arange(slots.first, slots.first + slots.count),
+                    self._names(name, slots.count),
+                    offered,
+                    delivered,
+                    offered - delivered - lost,
+                    lost,
+                    *by_reason,
+                    packed_flags(receiver.delivered),
+                ],
+            )
+
+    def _names(self, name: str, count: int) -> NDArray[np.int8]:
+        return np.full(count, self._digested.index(name), np.int8)
+
+    def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
+        """A row per receiver, trial and block: receiver → block → digests (R, 32) of the trials from first_trial on."""
+        for name, blocks in digests.items():
+            for block, values in sorted(blocks.items()):
+                trials = len(values)
+                numbers = np.arange(first_trial, first_trial + trials)
+                self._add("digests", [self._names(name, trials), numbers, np.full(trials, block), values])
+
+
+def seen_actions(action: Codes, nu: Flags) -> Codes:
+    """Indices into `ACTIONS`: what was done, with the truth about the packet's type."""
+    misled = (action == Action.STATE) & nu
+    return np.where(misled, np.uint8(ACTIONS.index("misled")), action)

@@ -1,1 +1,0 @@
-"""A run: its processes, its score, its results, and the same trials in memory."""

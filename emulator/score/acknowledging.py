@@ -1,0 +1,126 @@
+"""Acknowledgements of a scenario: their way back, who attacks it when, and the chart by which the sensor notices.
+
+Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.acknowledgements import WayBack, rates_of
+from evedrop.model.numeric.detection import Chart, Watch, chart_for
+from evedrop.model.receiver import Flags
+from evedrop.scenario import Scenario
+from evedrop.streams import Batch
+
+_ATTACK_LOOKED_FOR = "all"  # of a sensor whose scenario attacks nothing
+
+
+class WayBackSpec(NamedTuple):
+    """What the router is told of the way back."""
+
+    quality: float
+    attack: str
+    jammer: str | None
+    spans: list[list[int]] | None
+    """Slots [from, to) in which the attack is on; None is always."""
+
+
+def way_back_of(scenario: Scenario) -> WayBackSpec | None:
+    """Of a scenario; None if its scheme needs no acknowledgements."""
+    table = scenario.acknowledgements
+    if table is None:
+        return None
+    return WayBackSpec(table.link.quality, table.attack, table.jammer, scenario.timeline.jams)
+
+
+def chart_of(scenario: Scenario) -> Chart | None:
+    """The sensor's, for the attack that the scenario describes, or where it has none for one that blocks all.
+
+    None where no chart tells the two rates apart as seldom wrongly as the scenario wants.
+    """
+    table = scenario.acknowledgements
+    if table is None:
+        return None
+    attack = _ATTACK_LOOKED_FOR if table.attack == "none" else table.attack
+    quality = scenario.quality
+    mu, mu_e = quality[LEGITIMATE], 1.0 if table.jammer is None else quality[table.jammer]
+    normal, attacked = (rates_of(name, mu, mu_e, table.link.quality).arrives for name in ("none", attack))
+    if normal == 1.0 and attacked < 1.0:
+        return Chart(acknowledged=0, missing=1, threshold=1)
+    try:
+        return chart_for(normal, attacked, table.false_alarms)
+    except ValueError:
+        return None
+
+
+class Acknowledging:
+    """The way back in memory: what the legitimate estimator, the router and the sensor's watch do of a live run. Final."""
+
+    def __init__(self, spec: WayBackSpec, chart: Chart | None, key: bytes, batch: Batch) -> None:
+        self._way = WayBack(spec.attack, spec.quality, key, batch, spec.spans)
+        self._jammer = spec.jammer
+        self._watch = None if chart is None else Watch(chart, batch.trials)
+        self.alarms: Flags = np.zeros(batch.trials, np.bool_)
+        """Where the last slot has raised an alarm, (R,)."""
+
+    @classmethod
+    def of(cls, scenario: Scenario, key: bytes, batch: Batch) -> Acknowledging | None:
+        """Of a scenario; None if there are no acknowledgements."""
+        spec = way_back_of(scenario)
+        return None if spec is None else cls(spec, chart_of(scenario), key, batch)
+
+    @property
+    def watches(self) -> bool:
+        """Whether the sensor watches for an attack."""
+        return self._watch is not None
+
+    def take(self, k: int, sent: Flags | None, gammas: Mapping[str, Flags]) -> Flags:
+        """The acknowledgements of slot k that reach the sensor, (R,); gammas: receiver → γ (R,)."""
+        gamma = gammas[LEGITIMATE]
+        gamma_e = gamma if self._jammer is None else gammas[self._jammer]
+        arrived = self._way.arrived(k, sent, gamma, gamma_e)
+        if self._watch is not None:
+            self.alarms = self._watch.take(arrived, sent)
+        return arrived
+
+
+class Detection:
+    """When the sensor of every trial became sure of an attack. Final."""
+
+    def __init__(self, trials: int) -> None:
+        self.first: NDArray[np.int64] = np.full(trials, -1, np.int64)
+        """The slot, (R,); −1 where it has not."""
+
+    @classmethod
+    def merged(cls, parts: Sequence[Detection]) -> Detection:
+        """Of several sets of trials, in order."""
+        whole = cls(0)
+        whole.first = np.concatenate([part.first for part in parts])
+        return whole
+
+    def add(self, first: int, alarms: Flags) -> None:
+        """Take slots from `first` on, alarms (c, R)."""
+        raised = alarms.any(axis=0)
+        self.first = np.where(raised & (self.first < 0), first + np.argmax(alarms, axis=0), self.first)
+
+    def summary(self, scenario: Scenario) -> dict[str, Any] | None:
+        """What became of the sensor's watch, for the summary; None if it does not watch."""
+        chart, spec = chart_of(scenario), way_back_of(scenario)
+        if chart is None or spec is None:
+            return None
+        start = None if spec.attack == "none" else 0 if spec.spans is None else min(s for s, _ in spec.spans)
+        raised = self.first >= 0
+        true = raised & (self.first >= start) if start is not None else np.zeros_like(raised)
+        return {
+            "attack_from": start,
+            "alarms": int(np.count_nonzero(raised)),
+            "false_alarms": int(np.count_nonzero(raised & ~true)),
+            "mean_delay": float((self.first[true] - start + 1).mean()) if true.any() and start is not None else None,
+            "first_alarm": int(self.first[raised].min()) if raised.any() else None,
+        }

@@ -1,0 +1,149 @@
+"""The channel checks itself: what a link did in a run, against what its models say it does.
+
+Source: docs/results.md, links; docs/mathematics.md, links.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from evedrop.model.delays import delay_of
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Chain, LossModel
+from evedrop.model.slot.link import Course
+from evedrop.model.slot.link_law import stretches
+from evedrop.scenario import Scenario
+from evedrop.score.sums import Tally
+
+CONFIDENCE = 0.999
+QUANTILES = (0.5, 0.9, 0.99)
+
+
+def channel_of(scenario: Scenario, receiver: str, tally: Tally) -> dict[str, Any]:
+    """What the summary says of a link beside its account.
+
+    `rate`: of the packets that met the loss model, the fraction it let through; `expected_rate`: by the model;
+    `interval`: of the model's rate given what was found, at 99.9 % confidence; `within_interval`: whether the model's rate
+    lies in it; `lost_by`; `bursts`, `mean_burst` and `expected_mean_burst` of consecutive losses; `delays` and what the
+    model says of them. None where nothing was measured, or nothing is known.
+    """
+    course = scenario.course(receiver)
+    pieces = _pieces(course, tally.done)
+    met = sum(len(slots) for slots, _ in pieces) * tally.trials - tally.lost.get("overflow", 0)
+    found = {
+        "lost_by": {reason: count for reason, count in sorted(tally.lost.items()) if count},
+        "rate": None,
+        "expected_rate": None,
+        "interval": None,
+        "within_interval": None,
+        "bursts": np.trim_zeros(tally.bursts, "b").tolist(),
+        "mean_burst": _mean_burst(tally),
+        "expected_mean_burst": None if tally.lost.get("overflow") else _expected_burst(pieces),
+        **_delays(course, tally),
+    }
+    if tally.offered != tally.done * tally.trials:
+        return found  # trials that were cut short at different slots, in which other models may have ruled
+    if tally.unsent:
+        # What a scheme sends may depend on what came before: of a loss model with a memory these packets are no fair sample.
+        if len(pieces) != 1 or len(pieces[0][0]) < tally.done or not _independent(pieces[0][1]):
+            return found
+        met -= tally.unsent
+    if met <= 0:
+        return found
+    rate = 1.0 - tally.lost.get("lost", 0) / met
+    slots = sum(len(piece) for piece, _ in pieces)
+    expected = sum(float(loss.quality_at(piece).sum()) for piece, loss in pieces) / slots
+    variance = sum(loss.rate_variance(piece) * len(piece) ** 2 for piece, loss in pieces) / slots**2 / tally.trials
+    variance *= slots * tally.trials / met if tally.unsent else 1.0
+    low, high = interval(rate, expected, variance)
+    within = low - _ROUNDING <= expected <= high + _ROUNDING
+    found |= {"rate": rate, "expected_rate": expected, "interval": [low, high], "within_interval": bool(within)}
+    return found
+
+
+def _independent(loss: LossModel) -> bool:
+    return loss.chain is not None and loss.chain.independent
+
+
+_ROUNDING = 1e-12
+
+
+def interval(rate: float, expected: float, variance: float) -> tuple[float, float]:
+    """Clopper and Pearson's interval for a probability at 99.9 % confidence.
+
+    Of as many independent packets as would scatter like these: `variance` is that of the rate if it is `expected`. A rate
+    that cannot scatter is its own interval.
+    """
+    from scipy.special import betaincinv  # noqa: PLC0415 - 0.2 s that only a summary needs
+
+    if variance <= 0.0:
+        return rate, rate
+    count = expected * (1.0 - expected) / variance
+    received, tail = rate * count, (1.0 - CONFIDENCE) / 2.0
+    low = float(betaincinv(received, count - received + 1.0, tail)) if received > 0.0 else 0.0
+    high = float(betaincinv(received + 1.0, count - received, 1.0 - tail)) if received < count else 1.0
+    return low, high
+
+
+def _pieces(course: Course, done: int) -> list[tuple[range, LossModel]]:
+    """The slots below `done` in which packets met a loss model, and the model."""
+    marks = stretches(course)
+    ends = [*(start for start, _, _ in marks[1:]), done]
+    return [
+        (range(start, min(end, done)), loss_of(settings["loss"]))
+        for (start, settings, cut), end in zip(marks, ends, strict=True)
+        if not cut and start < min(end, done)
+    ]
+
+
+def _mean_burst(tally: Tally) -> float | None:
+    """Mean number of consecutive losses; None where there are none, or where some are too long to be told apart."""
+    count = int(tally.bursts.sum())
+    if not count or tally.bursts[-1]:
+        return None
+    return float(tally.bursts @ np.arange(1, len(tally.bursts) + 1)) / count
+
+
+def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
+    """Mean number of consecutive losses by the model: P(lost) over P(lost after a packet that was not)."""
+    models = {id(loss): loss for _, loss in pieces}
+    chain: Chain | None = next(iter(models.values())).chain if len(pieces) == 1 else None
+    if chain is None:
+        return None
+    lost = 1.0 - chain.quality
+    begins = float((chain.law * chain.quality) @ chain.transitions @ lost)
+    return float(chain.law @ lost) / begins if begins > 0.0 else None
+
+
+def _delays(course: Course, tally: Tally) -> dict[str, Any]:
+    """Fractions of the packets that came through by the slots they took, the last for more than the window; quantiles."""
+    total = int(tally.delays.sum())
+    if course.settings.get("delay") is None or not total:
+        return {"delays": None, "expected_delays": None, "delay_quantiles": None}
+    fractions = tally.delays / total
+    return {
+        "delays": fractions.tolist(),
+        "expected_delays": _expected_delays(course),
+        "delay_quantiles": {f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
+    }
+
+
+def _expected_delays(course: Course) -> list[float] | None:
+    """The same by the model, of a link whose delays stay the same and which has no queue."""
+    if any(change.settings is not None for change in course.changes) or course.settings.get("rate", 1.0) < 1.0:
+        return None
+    model, reorder = delay_of(course.settings["delay"]), course.settings.get("reorder", 0.0)
+    there = [model.arrived(lag) for lag in range(course.window + 1)]
+    if any(one is None for one in there):
+        return None
+    reached = [0.0, *(reorder + (1.0 - reorder) * one for one in there if one is not None), 1.0]
+    return [after - before for before, after in pairwise(reached)]
+
+
+def _quantile(reached: np.ndarray[Any, np.dtype[np.float64]], level: float) -> int | None:
+    """The least delay that a fraction of the packets does not exceed; None if it is beyond the window."""
+    place = int(np.searchsorted(reached, level))
+    return place if place < len(reached) - 1 else None

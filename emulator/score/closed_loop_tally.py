@@ -1,0 +1,155 @@
+"""What became of a closed loop: failed decisions, clipped inputs, and the error of the two estimators that there could be.
+
+Source: docs/results.md, controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.model.input_aware import Offset
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Codes
+from evedrop.scenario import Scenario
+from evedrop.score.household_tally import HouseholdTally
+from evedrop.score.joined import InputSlots
+
+ESTIMATORS = ("ignoring_input", "knowing_input")
+
+
+@dataclass(frozen=True)
+class Acted:
+    """A closed loop over c slots of R trials."""
+
+    inputs: InputSlots
+    x: Floats
+    """(c, n, R)."""
+    estimates: Mapping[str, Floats]
+    """Receiver → x̂, (c, n, R)."""
+    action: Codes
+    """The legitimate estimator's, (c, R)."""
+    true: Floats
+    """The true states, (c, n, R): x, but of a sensor that filters."""
+
+    def part(self, trials: slice) -> Acted:
+        """Of some trials."""
+        inputs = InputSlots(self.inputs.u[..., trials], self.inputs.failed[:, trials])
+        estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
+        return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials], self.true[..., trials])
+
+
+@dataclass
+class SolveTimes:
+    """What decisions take, of all trials that are simulated side by side. Final."""
+
+    decisions: int = 0
+    seconds: float = 0.0
+    longest: float = 0.0
+
+    def add(self, seconds: Iterable[float]) -> None:
+        """Take some decisions."""
+        for one in seconds:
+            self.decisions += 1
+            self.seconds += one
+            self.longest = max(self.longest, one)
+
+    def merge(self, other: SolveTimes) -> None:
+        """Take another's."""
+        self.decisions += other.decisions
+        self.seconds += other.seconds
+        self.longest = max(self.longest, other.longest)
+
+    @property
+    def mean(self) -> float | None:
+        """Mean seconds a decision; None without one."""
+        return self.seconds / self.decisions if self.decisions else None
+
+
+class LoopTally:
+    """A closed loop's totals over a set of trials, whose slots come in order. Final."""
+
+    def __init__(self, process: Process, plant: Plant, trials: int, knows_input: bool, comparable: bool) -> None:
+        """comparable: whether the error of the other estimator, which is not in the loop, is to be had."""
+        self._plant = plant
+        self._sign = -1.0 if knows_input else 1.0
+        self._offset = Offset(process, plant, trials) if comparable else None
+        self.slots = 0
+        """Trial-slots."""
+        self.failed = 0
+        """Trial-slots whose inputs are held because a decision failed."""
+        self.clipped = 0
+        """Trial-slots in which the plant clips an input."""
+        self.other_error = 0.0
+        self.household: HouseholdTally | None = None
+        """Of a plant that is a house."""
+
+    @classmethod
+    def of(cls, scenario: Scenario, trials: int) -> LoopTally | None:
+        """Of so many trials of a scenario; None without a controller."""
+        if scenario.driven is None or scenario.controller is None:
+            return None
+        comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
+        process = scenario.process.process
+        tally = cls(process, scenario.driven, trials, scenario.legitimate.knows_input, comparable)
+        tally.household = HouseholdTally.of(scenario, trials)
+        return tally
+
+    def add(self, acted: Acted) -> None:
+        """Take the next slots."""
+        inputs = acted.inputs
+        if self.household is not None:
+            self.household.add(acted.true, inputs.u, acted.estimates)
+        self.slots += inputs.failed.size
+        self.failed += int(np.count_nonzero(inputs.failed))
+        self.clipped += int(np.count_nonzero(self._plant.clips(inputs.u)))
+        if self._offset is None:
+            return
+        error = acted.x - acted.estimates[LEGITIMATE]
+        for row, (action, u) in enumerate(zip(acted.action, inputs.u, strict=True)):
+            error[row] -= self._sign * self._offset.next(action, u)
+        error *= error
+        self.other_error += float(error.sum(axis=(1, 2)).sum())
+
+    @classmethod
+    def merged(cls, parts: Sequence[LoopTally | None]) -> LoopTally | None:
+        """Of several sets of trials, in order."""
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        whole = copy(known[0])
+        for part in known[1:]:
+            whole.slots += part.slots
+            whole.failed += part.failed
+            whole.clipped += part.clipped
+            whole.other_error += part.other_error
+        whole.household = HouseholdTally.merged([part.household for part in known])
+        return whole
+
+    def summary(
+        self, scenario: Scenario, peer: dict[str, Any], times: SolveTimes, digest: str | None
+    ) -> dict[str, Any]:
+        """What the summary says of the controller; peer: what it says of the legitimate estimator."""
+        assert scenario.controller is not None  # noqa: S101 - else there is no tally
+        knows = scenario.legitimate.knows_input
+        errors = [peer["mean_squared_error"], self.other_error / self.slots if self._offset and self.slots else None]
+        return {
+            "strategy": scenario.controller.strategy,
+            "period": scenario.controller.period,
+            "acts_on": scenario.controller.acts_on,
+            "knows_input": knows,
+            "decisions": times.decisions,
+            "mean_solve_seconds": times.mean,
+            "longest_solve_seconds": times.longest,
+            "failed_fraction": self.failed / self.slots if self.slots else None,
+            "clipped_fraction": self.clipped / self.slots if self.slots else None,
+            "mean_squared_errors": dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
+            "mean_trace_covariance": peer["mean_trace_covariance"],
+            "digest": digest,
+        }

@@ -1,0 +1,87 @@
+"""A sensor that measures and filters, in a run: errors against what it transmits are not errors against the truth.
+
+Source: docs/results.md, filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any
+
+import numpy as np
+
+from evedrop.live.network.access import SENSOR
+from evedrop.model.local_filter import LocalFilter, Steps
+from evedrop.model.process import Floats
+from evedrop.scenario import Scenario
+from evedrop.score.sums import squared_errors
+from evedrop.streams import Batch
+
+
+def local_filter_of(scenario: Scenario, key: bytes, batch: Batch) -> LocalFilter | None:
+    """The sensor's; None of one that knows the state."""
+    driven = scenario.driven
+    if driven is None or driven.output_matrix is None:
+        return None
+    return LocalFilter(scenario.process.process, driven, key, batch)
+
+
+def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Squared errors against the true state (c, n, R): of the sensor's estimate x, and of the receivers', (c, R) each."""
+    return {SENSOR: squared_errors(true, x), **{name: squared_errors(true, x_hat) for name, x_hat in x_hats.items()}}
+
+
+class FilterTally:
+    """Sums of errors against the true state, over the slots and trials so far. Final."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.slots = 0
+        self.sums: dict[str, float] = {}
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> FilterTally | None:
+        """Of a scenario; None if its sensor knows the state."""
+        driven = scenario.driven
+        return None if driven is None or driven.output_matrix is None else cls()
+
+    def add(self, errors: Mapping[str, Floats]) -> None:
+        """Take the next slots, (c, R) each."""
+        self.slots += len(errors[SENSOR])
+        self.count += errors[SENSOR].size
+        for name, error in errors.items():
+            self.sums[name] = self.sums.get(name, 0.0) + float(error.sum(axis=1).sum())
+
+    @classmethod
+    def merged(cls, parts: Sequence[FilterTally | None]) -> FilterTally | None:
+        """Of several sets of trials, in order."""
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        whole = copy(known[0])
+        whole.sums = dict(whole.sums)
+        for part in known[1:]:
+            whole.slots = min(whole.slots, part.slots)
+            whole.count += part.count
+            for name, value in part.sums.items():
+                whole.sums[name] = whole.sums.get(name, 0.0) + value
+        return whole
+
+    def summary(self, scenario: Scenario) -> dict[str, Any]:
+        """What the summary says of the filter."""
+        driven = scenario.driven
+        assert driven is not None  # noqa: S101 - else there is no tally
+        steps = Steps(scenario.process.process, driven)
+        traces: list[float] = []
+        last = 0.0
+        while len(traces) < self.slots and not steps.settled:
+            last = float(np.trace(steps.next().covariance))
+            traces.append(last)
+        mean = (sum(traces) + (self.slots - len(traces)) * last) / max(1, self.slots)
+        errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
+        return {
+            "mean_trace_covariance": mean if self.slots else None,
+            "mean_squared_error": errors.pop(SENSOR, None),
+            "mean_true_squared_errors": errors,
+        }

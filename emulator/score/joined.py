@@ -1,0 +1,302 @@
+"""Truth, estimates and fates of the same slots, joined: what is scored, recorded and shown, live and in memory alike."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.live.network.access import CONTROLLER, ROUTER, SENSOR
+from evedrop.live.protocol.closed_loop import read_decisions
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
+from evedrop.model.digest import Blocks, Digests
+from evedrop.model.links.link import REASONS
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
+from evedrop.model.slot.account import Account
+
+Message = TypeVar("Message")
+
+
+@dataclass(frozen=True)
+class ReceiverSlots:
+    """One receiver over c slots."""
+
+    x_hat: Floats
+    """(c, n, R)."""
+    action: Codes
+    """(c, R)."""
+    P: Floats
+    """Believed covariance of the recorded trials, (c, n, n, recorded)."""
+    trace: Floats
+    """Sum over all trials of tr P and of its square, (c, 2)."""
+    delivered: Flags
+    """What the router says it passed on, (c, R)."""
+    lost: Mapping[str, NDArray[np.uint32]]
+    """Reason → packets the router says were lost for it, (c,)."""
+    late: NDArray[np.uint16] | None = None
+    """Packets of earlier slots that it took in each slot, (c, R); None of who can take none."""
+    late_used: NDArray[np.uint16] | None = None
+    """Those of them that it used, (c, R)."""
+    late_delivered: NDArray[np.uint16] | None = None
+    """The same as the router says, (c, R)."""
+    unsent: NDArray[np.uint32] | None = None
+    """Trials in which there was no packet, as the router says, (c,); None: none that it knows of."""
+
+
+@dataclass(frozen=True)
+class InputSlots:
+    """What the controller decided, over c slots."""
+
+    u: Floats
+    """As decided, (c, m, R); the plant may clip it."""
+    failed: Flags
+    """Whether the decision that holds failed, so that the inputs before are held, (c, R)."""
+
+
+@dataclass(frozen=True)
+class Slots:
+    """c consecutive slots of all trials, complete."""
+
+    first: int
+    x: Floats
+    """(c, n, R)."""
+    nu: Flags
+    """(c, R)."""
+    receivers: Mapping[str, ReceiverSlots]
+    sent: Flags | None = None
+    """Whether there was a packet, as the sensor says, (c, R); None: always."""
+    alarms: Flags | None = None
+    """As in `Truth`."""
+    inputs: InputSlots | None = None
+    """None without a controller."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters; None where they are x."""
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return len(self.x)
+
+    @property
+    def trials(self) -> int:
+        """Number of trials."""
+        return int(self.x.shape[2])
+
+    def copied(self) -> Slots:
+        """The same in arrays of its own."""
+        receivers = {
+            name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
+            for name, one in self.receivers.items()
+        }
+        sent = None if self.sent is None else self.sent.copy()
+        inputs = None if self.inputs is None else InputSlots(self.inputs.u.copy(), self.inputs.failed.copy())
+        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent, inputs=inputs)
+
+
+def concatenated(parts: Sequence[Slots]) -> Slots:
+    """Consecutive slots as one; the fates' reasons, which nobody asks for any more, are left out."""
+
+    def column(name: str, one: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part.receivers[name], one) for part in parts])
+
+    receivers = {
+        name: ReceiverSlots(**{one: column(name, one) for one in _ARRAYS}, lost={}) for name in parts[0].receivers
+    }
+    x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
+    sent = None if parts[0].sent is None else np.concatenate([_all(part.sent, part.nu) for part in parts])
+    inputs = None
+    if parts[0].inputs is not None:
+        of_parts = [part.inputs for part in parts if part.inputs is not None]
+        inputs = InputSlots(*(np.concatenate([getattr(one, name) for one in of_parts]) for name in ("u", "failed")))
+    return Slots(parts[0].first, x, nu, receivers, sent, inputs=inputs)
+
+
+def _all(flags: Flags | None, like: Flags) -> Flags:
+    """Flags that are all set where none are given."""
+    return np.ones_like(like) if flags is None else flags
+
+
+_ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
+
+
+class Joiner:
+    """Takes the messages of all processes as they come and gives back slots as soon as all have reported them. Final."""
+
+    def __init__(
+        self,
+        extent: Extent,
+        windows: Mapping[str, int],
+        blocks: Mapping[str, Blocks],
+        period: int | None = None,
+        check: Callable[[str, Report], None] = lambda _name, _report: None,
+    ) -> None:
+        """windows: receiver → slots by which a packet may be late for it; blocks: of the digests of receivers and controller.
+
+        period: a controller's; None without one. check: is given every receiver's report before anything is made of it.
+        """
+        self._check = check
+        self._extent, self._windows, self._blocks, self._period = extent, windows, blocks, period
+        self._decided = 0
+        self._truth = _Column[Truth]()
+        self._journal = _Column[Journal]()
+        self._reports = {name: _Column[Report]() for name in windows}
+        self._done = 0
+        self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
+        """Receiver, or controller → block, by its first slot → digests."""
+        if period is not None:
+            self.digests[CONTROLLER] = {}
+
+    @property
+    def done(self) -> int:
+        """The first slot that has not been given back."""
+        return self._done
+
+    @property
+    def sent(self) -> int:
+        """The first slot that the sensor has not reported."""
+        return self._truth.end
+
+    @property
+    def journaled(self) -> int:
+        """The first slot that the router has not journaled."""
+        return self._journal.end
+
+    def reported(self, name: str) -> int:
+        """The first slot that a receiver, or the controller, has not reported."""
+        return self._decided if name == CONTROLLER else self._reports[name].end
+
+    def places(self, reporters: Iterable[str]) -> dict[str, int]:
+        """Process → the first slot that it has not reported: sensor, router, and these."""
+        return {SENSOR: self.sent, ROUTER: self.journaled, **{name: self.reported(name) for name in reporters}}
+
+    def complete(self, slots: int) -> bool:
+        """Whether so many slots have been given back, and a controller has reported them."""
+        return self._done == slots and (self._period is None or self._decided == slots)
+
+    def decisions(self, telemetry: Reader) -> Floats:
+        """Take the controller's telemetry; what its decisions took."""
+        message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
+        self._decided += message.count
+        self.digests[CONTROLLER].update(message.digests)
+        return message.seconds
+
+    def truth(self, telemetry: Reader) -> None:
+        """Take the sensor's telemetry."""
+        message = read_truth(telemetry, self._truth.end, self._extent)
+        self._truth.add(message, message.count)
+
+    def report(self, name: str, telemetry: Reader) -> None:
+        """Take a receiver's telemetry."""
+        column = self._reports[name]
+        message = read_report(telemetry, column.end, self._extent, self._blocks[name], self._windows[name])
+        self._check(name, message)
+        column.add(message, message.count)
+        self.digests[name].update(message.digests)
+
+    def journal(self, journal: Reader) -> Mapping[str, Account]:
+        """Take the router's journal; the accounts in it."""
+        message = read_journal(journal, self._journal.end, self._windows, self._extent)
+        self._journal.add(message, message.count)
+        return message.links
+
+    def take(self) -> Slots | None:
+        """The next slots that all have reported, if there are any."""
+        count = min(self._truth.available, self._journal.available, *(c.available for c in self._reports.values()))
+        if count == 0:
+            return None
+        first, self._done = self._done, self._done + count
+        truth = self._truth.take(count)
+        journal = self._journal.take(count)
+        receivers = {}
+        for name, window in self._windows.items():
+            parts = self._reports[name].take(count)
+            receivers[name] = ReceiverSlots(
+                x_hat=_rows(parts, [part.x_hat for part, _ in parts]),
+                action=_rows(parts, [part.action for part, _ in parts]),
+                P=_rows(parts, [part.P for part, _ in parts]),
+                trace=_rows(parts, [part.trace for part, _ in parts]),
+                delivered=_rows(journal, [part.links[name].delivered for part, _ in journal]),
+                lost={
+                    reason: _rows(journal, [part.links[name].lost[reason] for part, _ in journal]) for reason in REASONS
+                },
+                late=_rows(parts, [_known(part.late, part.action) for part, _ in parts]) if window else None,
+                late_used=_rows(parts, [_known(part.late_used, part.action) for part, _ in parts]) if window else None,
+                late_delivered=_rows(
+                    journal, [_known(link.late, link.delivered) for link in (part.links[name] for part, _ in journal)]
+                )
+                if window
+                else None,
+                unsent=_counted([(part.links[name].unsent, part.count, rows) for part, rows in journal]),
+            )
+        x = _rows(truth, [part.x for part, _ in truth])
+        nu = _rows(truth, [part.nu for part, _ in truth])
+        sent, alarms = (
+            None
+            if getattr(truth[0][0], name) is None
+            else _rows(truth, [_all(getattr(part, name), part.nu) for part, _ in truth])
+            for name in ("sent", "alarms")
+        )
+        inputs = None
+        if self._extent.inputs:
+            u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
+            inputs = InputSlots(u, failed)
+        true = (
+            _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._extent.measures else None
+        )
+        return Slots(first, x, nu, receivers, sent, alarms, inputs, true)
+
+
+def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:
+    """Counts of some slots, from parts with their lengths and rows; None if there are none."""
+    if all(counts is None for counts, _, _ in parts):
+        return None
+    return np.concatenate(
+        [(np.zeros(count, np.uint32) if counts is None else counts)[rows] for counts, count, rows in parts]
+    )
+
+
+class _Column(Generic[Message]):
+    """Messages of one sender, some of whose slots were taken."""
+
+    def __init__(self) -> None:
+        self._messages: deque[tuple[Message, int]] = deque()
+        self._taken = 0  # slots of the first message that are gone
+        self.end = 0
+        self.available = 0
+
+    def add(self, message: Message, count: int) -> None:
+        self._messages.append((message, count))
+        self.end += count
+        self.available += count
+
+    def take(self, count: int) -> list[tuple[Message, slice]]:
+        """The next slots, as messages and which of their rows."""
+        self.available -= count
+        parts = []
+        while count:
+            message, length = self._messages[0]
+            rows = slice(self._taken, min(length, self._taken + count))
+            parts.append((message, rows))
+            count -= rows.stop - rows.start
+            self._taken = rows.stop
+            if self._taken == length:
+                self._messages.popleft()
+                self._taken = 0
+        return parts
+
+
+def _known(late: NDArray[np.uint16] | None, like: NDArray[Any]) -> NDArray[np.uint16]:
+    """Counts of late packets, 0 where none are given."""
+    return np.zeros(like.shape, np.uint16) if late is None else late
+
+
+def _rows(parts: list[tuple[Message, slice]], arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    """The rows of the parts' arrays, one after the other."""
+    chosen = [array[rows] for array, (_, rows) in zip(arrays, parts, strict=True)]
+    return chosen[0] if len(chosen) == 1 else np.concatenate(chosen)

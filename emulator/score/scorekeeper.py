@@ -1,0 +1,253 @@
+"""Keeps the score of a run, live or in memory: theory beside every slot, a tally per receiver, and the summary."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+
+from evedrop.expected.expectations import expectations_of
+from evedrop.live.network.access import CONTROLLER, LEGITIMATE
+from evedrop.model.digest import Digests, RunDigest, block_starts
+from evedrop.model.process import Floats
+from evedrop.plugins import sources_of
+from evedrop.recordings.disturbance_file import disturbances_text
+from evedrop.results.folder import write_private
+from evedrop.scenario import Scenario
+from evedrop.score.channel import channel_of
+from evedrop.score.closed_loop_tally import Acted
+from evedrop.score.expectations_held import Evidence
+from evedrop.score.filtering import true_errors
+from evedrop.score.histogram import LEVELS
+from evedrop.score.joined import Slots
+from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
+from evedrop.score.totals import Totals
+from evedrop.score.verdict import Secrecy, secrecy
+from evedrop.score.verified import verification_of
+
+_ENOUGH_TO_SURPRISE = 10  # trials
+DISTURBANCES = "disturbances.csv"
+"""Of a results folder whose scenario has some."""
+
+
+class Scored(NamedTuple):
+    """One receiver over c slots, scored."""
+
+    squared_error: Floats
+    """(c, R)."""
+    sums: SlotSums
+    expected: Floats
+    """Theory: trace of the expected actual error covariance, (c,)."""
+
+
+class Scorekeeper:
+    """Scores the slots of a batch of trials, in order. Final."""
+
+    def __init__(self, scenario: Scenario, trials: int) -> None:
+        self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
+        self.totals = Totals.of(scenario, trials)
+
+    def add(self, slots: Slots) -> dict[str, Scored]:
+        """Score the next slots: receiver → its errors, sums and theory."""
+        scored = {}
+        self._add_plant(slots)
+        for name, receiver in slots.receivers.items():
+            errors = squared_errors(slots.x, receiver.x_hat)
+            one = Scored(
+                errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
+            )
+            tally = self.totals.tallies[name]
+            tally.add(slots.first, *one)
+            tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
+            if slots.sent is not None:
+                tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)
+            late = None
+            if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
+                late = (receiver.late, receiver.late_used)
+                tally.account_late(receiver.late_delivered, *late)
+            tally.watched.add(slots.first, errors, receiver.action, one.sums.trace, late)
+            scored[name] = one
+        return scored
+
+    def _add_plant(self, slots: Slots) -> None:
+        """Take what slots say of alarms, of a controller, and of a sensor that filters."""
+        totals, estimates = self.totals, {name: one.x_hat for name, one in slots.receivers.items()}
+        if slots.alarms is not None and totals.detection is not None:
+            totals.detection.add(slots.first, slots.alarms)
+        if slots.true is not None and totals.filter is not None:
+            totals.filter.add(true_errors(slots.true, slots.x, estimates))
+        if slots.inputs is not None and totals.loop is not None:
+            true = slots.x if slots.true is None else slots.true
+            totals.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run went, to its end."""
+
+    wall_seconds: float
+    """Start command to last row on disk."""
+    how: str = "complete"
+    """`complete`, `interrupted`, or why it failed."""
+    replay: str | None = None
+    """The command that runs it once more, for whoever sees an expectation fail."""
+    mode: str = "live"
+    """Or that of a run in memory."""
+    events: Sequence[Mapping[str, Any]] = ()
+    """As the summary has them."""
+    outages: Sequence[Mapping[str, Any]] = ()
+    """The same."""
+    accused: tuple[str, ...] = ()
+    """The processes that the run has ended with because of what they did."""
+    misdelivered: Mapping[str, int] = field(default_factory=dict)
+    """Process → messages of other keys that it dropped."""
+
+
+def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
+    """The verdict on every eavesdropper."""
+    expected = expectations_of(scenario)
+    user = (tallies[LEGITIMATE], expected[LEGITIMATE])
+    return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
+
+
+def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> dict[str, Any]:
+    """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
+    tallies, detection, loop = totals.tallies, totals.detection, totals.loop
+    expected = expectations_of(scenario)
+    peers: dict[str, dict[str, Any]] = {
+        name: {
+            **(_figures(tally) if tally.offered else dict.fromkeys(tally.figures)),
+            "error_quantiles": _quantiles(tally),
+            "infinite_variance": expected[name].infinite_variance,
+            "digest": digests[name],
+        }
+        for name, tally in tallies.items()
+    }
+    if ending.mode == "covariance-only":
+        for peer in peers.values():
+            peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
+    household = None if loop is None or loop.household is None else loop.household.summary()
+    user = tallies[LEGITIMATE]
+    links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
+    secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
+    evidence = Evidence(scenario, peers, links, tallies, expected, secret, household)
+    return {
+        "scenario": scenario.title,
+        "mode": ending.mode,
+        "seed": scenario.seed,
+        "slots": user.done,
+        "trials": user.trials,
+        "first_trial": scenario.first_trial,
+        "wall_seconds": ending.wall_seconds,
+        "slots_per_second": user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
+        "ended": ending.how,
+        "peers": peers,
+        "links": links,
+        "events": list(ending.events),
+        "outages": list(ending.outages),
+        "verification": verification_of(scenario, ending.accused) if ending.mode == "live" else None,
+        "misdelivered": dict(ending.misdelivered),
+        "secrecy": {name: one.as_dict() for name, one in secret.items()},
+        "detection": None if detection is None else detection.summary(scenario),
+        "controller": None
+        if loop is None
+        else loop.summary(scenario, peers[LEGITIMATE], totals.solve_times, digests[CONTROLLER]),
+        "filter": None if totals.filter is None else totals.filter.summary(scenario),
+        "household": household,
+        "surprising": _surprising(scenario, tallies),
+        "expectations": evidence.judged(ending.replay),
+    }
+
+
+def _figures(tally: Tally) -> dict[str, float | None]:
+    """A receiver's figures; None for what there is no theory for."""
+    return {name: None if math.isnan(value) else value for name, value in tally.figures.items()}
+
+
+def _quantiles(tally: Tally) -> dict[str, float] | None:
+    """Quantiles over trials of a trial's mean error; None of a run cut short."""
+    if tally.done != tally.slots:
+        return None
+    return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
+
+
+def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, Any] | None:
+    """The trial whose mean error lies furthest from the median, in logarithms and median deviations, of any receiver."""
+    found: dict[str, Any] | None = None
+    furthest = 0.0
+    for name, tally in tallies.items():
+        means = trial_means(tally)
+        if tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE or not np.all(means > 0.0):
+            continue
+        logarithms = np.log(means)
+        median = float(np.median(logarithms))
+        deviation = np.abs(logarithms - median)
+        spread = float(np.median(deviation))
+        worst = int(np.argmax(deviation))
+        if spread > 0.0 and deviation[worst] / spread > furthest:
+            furthest = float(deviation[worst] / spread)
+            found = {
+                "trial": scenario.first_trial + worst,
+                "receiver": name,
+                "mean_error": float(means[worst]),
+                "median": float(np.exp(median)),
+            }
+    return found
+
+
+def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) -> str | None:
+    """A receiver's digest from all its blocks; None if the run was cut short."""
+    if sorted(blocks) != block_starts(scenario.slots, scenario.cuts(receiver)):
+        return None
+    digest = RunDigest()
+    digest.add(blocks)
+    return digest.hexadecimal
+
+
+def events_of(scenario: Scenario, done: int) -> list[dict[str, Any]]:
+    """What the scenario has happen before slot `done`, as the summary lists it."""
+    return [{"slot": act.at, "event": act.said, "by": "scenario"} for act in scenario.timeline.acts if act.at < done]
+
+
+def event_line(event: Mapping[str, Any]) -> str:
+    """An event of the summary as a line of the view."""
+    return event["event"] if event["by"] == "scenario" else f"{event['event']} (by the {event['by']})"
+
+
+def write_resolved(folder: Path, scenario: Scenario) -> None:
+    """Write the scenario.toml of a results folder, and the disturbances that it names, each whole at any moment."""
+    texts = {"scenario.toml": resolved(scenario)}
+    plant = scenario.plant
+    if plant is not None and plant.disturbance_values:
+        texts = {
+            DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values),
+            **texts,
+        }
+    for name, text in texts.items():
+        unfinished = folder / f"{name}.new"
+        write_private(unfinished, text)
+        os.replace(unfinished, folder / name)
+
+
+def resolved(scenario: Scenario) -> str:
+    """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
+    tables = scenario.model_dump(mode="json", exclude_none=True)
+    if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
+        tables["plant"]["disturbance_file"] = DISTURBANCES
+    if scenario.secret_file is not None:
+        tables["secret_file"] = str(Path(scenario.secret_file).absolute())
+    tables["made_with"] = {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
+        **sources_of(tables),
+    }
+    text: str = tomli_w.dumps(tables)
+    return text

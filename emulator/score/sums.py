@@ -1,0 +1,244 @@
+"""How well everybody did: sums over trials in every slot, over slots in every trial, and the summary made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.score.watched import Watched
+
+WINDOWS = 8
+"""The slots k ≥ 1 are judged in so many windows, of equal length up to one slot."""
+
+
+@dataclass
+class SlotSums:
+    """Sums over trials, slot by slot, (c,) each. Final."""
+
+    trials: Floats
+    error: Floats
+    """Squared error, or tr of the actual covariance in a study that simulates covariances alone."""
+    error_squared: Floats
+    trace: Floats
+    """Believed tr P."""
+    trace_squared: Floats
+    received: Floats
+    used: Floats
+
+    @classmethod
+    def zero(cls, slots: int) -> SlotSums:
+        """Sums of no trials, to add to."""
+        return cls(*(np.zeros(slots) for _ in fields(cls)))
+
+    def add(self, first: int, other: SlotSums) -> None:
+        """Add the sums of further trials over some slots from `first` on."""
+        rows = slice(first, first + len(other.error))
+        for one in fields(self):
+            getattr(self, one.name)[rows] += getattr(other, one.name)
+
+    def measured(self) -> SlotSums:
+        """The slots that any trial came to: all but the last ones of a run cut short."""
+        rows = slice(0, int(np.count_nonzero(self.trials)))
+        return SlotSums(*(getattr(self, one.name)[rows] for one in fields(self)))
+
+
+def squared_errors(x: Floats, x_hat: Floats) -> Floats:
+    """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""
+    error = x - x_hat
+    error *= error
+    squared: Floats = error.sum(axis=1)
+    return squared
+
+
+def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> SlotSums:
+    """The sums of some slots, from error (c, R), action (c, R), and the sums of tr P and of its square, (c, 2).
+
+    Without the latter the error is tr P itself.
+    """
+    count, trials = error.shape
+    errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
+    received = np.count_nonzero(action != Action.LOST, axis=1).astype(np.float64)
+    discarded = np.count_nonzero(action == Action.DISCARDED, axis=1)
+    return SlotSums(
+        trials=np.full(count, float(trials)),
+        error=errors,
+        error_squared=squares,
+        trace=errors if trace is None else trace[:, 0],
+        trace_squared=squares if trace is None else trace[:, 1],
+        received=received,
+        used=received - discarded,
+    )
+
+
+def window_of(k: NDArray[np.intp], slots: int) -> NDArray[np.intp]:
+    """The window each slot k ≥ 1 belongs to, of a run of `slots` slots; −1 for k = 0."""
+    return np.where(k == 0, -1, (k - 1) * WINDOWS // max(slots - 1, 1))
+
+
+@dataclass
+class Tally:
+    """One receiver's totals over a run. Final."""
+
+    slots: int
+    """Of the whole run."""
+    trials: int
+    watched: Watched = field(default_factory=lambda: Watched((), 0))
+    """What expectations ask of the receiver."""
+    done: int = 0
+    """Slots that all trials have."""
+    offered: int = 0
+    """Slots times trials: as many packets, but for those that were not sent."""
+    unsent: int = 0
+    error: float = 0.0
+    trace: float = 0.0
+    expected_trace: float = 0.0
+    received: int = 0
+    used: int = 0
+    unexplained: int = 0
+    """Packets whose fate in the journal is not the receiver's."""
+    late: int = 0
+    """Packets that arrived after their own slot, within the window; and those of them that were used."""
+    late_used: int = 0
+    late_sent: int = 0
+    """Packets that the router has let through but for another slot."""
+    lost: dict[str, int] = field(default_factory=dict)
+    window_errors: Floats = field(init=False)
+    """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
+    bursts: NDArray[np.int64] = field(init=False)
+    """As in `Account`."""
+    delays: NDArray[np.int64] = field(init=False)
+    """As in `Account`; of no length before anything is counted."""
+
+    def __post_init__(self) -> None:
+        self.window_errors = np.zeros((WINDOWS + 1, self.trials))
+        self.bursts = np.zeros(COUNTED_BURSTS, np.int64)
+        self.delays = np.zeros(0, np.int64)
+
+    def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
+        """Take c slots: their errors (c, R), sums, and expected trace (c,)."""
+        count = len(error)
+        self.done += count
+        self.offered += count * self.trials
+        self.error += float(sums.error.sum())
+        self.trace += float(sums.trace.sum())
+        self.expected_trace += float(expected.sum()) * self.trials
+        self.received += int(sums.received.sum())
+        self.used += int(sums.used.sum())
+        windows = window_of(np.arange(first, first + count), self.slots)
+        for window in range(-1, WINDOWS):
+            inside = np.flatnonzero(windows == window)
+            if inside.size:
+                self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
+
+    def account(
+        self,
+        delivered: Flags,
+        action: Codes,
+        lost: Mapping[str, NDArray[np.uint32]],
+        unsent: NDArray[np.uint32] | None = None,
+    ) -> None:
+        """Hold the journal, delivered (c, R) in time, reason → lost (c,), unsent (c,), against what the receiver did, (c, R)."""
+        self.unexplained += int(np.count_nonzero(delivered != (action != Action.LOST)))
+        count = delivered.size - int(np.count_nonzero(delivered))
+        for reason, counts in lost.items():
+            self.lost[reason] = self.lost.get(reason, 0) + int(counts.sum())
+            count -= int(counts.sum())
+        silent = 0 if unsent is None else int(unsent.sum())
+        self.unsent += silent
+        self.late_sent += count - silent
+
+    def account_sent(self, sent: Flags, delivered: Flags, unsent: NDArray[np.uint32] | None) -> None:
+        """Hold what the sensor says it sent, (c, R), against the journal's delivered (c, R) and unsent (c,)."""
+        silent = np.count_nonzero(~sent, axis=1)
+        self.unexplained += int(np.count_nonzero(delivered & ~sent))
+        self.unexplained += int(np.abs(silent - (0 if unsent is None else unsent.astype(np.int64))).sum())
+
+    def account_late(self, delivered: NDArray[np.uint16], taken: NDArray[np.uint16], used: NDArray[np.uint16]) -> None:
+        """Hold the late packets that the router delivered in each slot, (c, R), against those that the receiver took."""
+        self.late += int(taken.sum())
+        self.late_used += int(used.sum())
+        self.unexplained += int(np.count_nonzero(delivered != taken))
+
+    def count(self, account: Account) -> None:
+        """Take a link's bursts and delays."""
+        self.bursts += account.bursts
+        if self.delays.size < account.delays.size:
+            self.delays = np.zeros(account.delays.size, np.int64)
+        self.delays += account.delays
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The receiver's figures: means over slots and trials."""
+        offered = max(1, self.offered)
+        return {
+            "mean_squared_error": self.error / offered,
+            "mean_trace_covariance": self.trace / offered,
+            "expected_trace_covariance": self.expected_trace / offered,
+            "received_fraction": (self.received + self.late) / offered,
+            "used_fraction": (self.used + self.late_used) / offered,
+        }
+
+    @property
+    def link(self) -> dict[str, int]:
+        """The link's account: every packet offered is delivered or lost for a reason."""
+        # Of a run cut short some packets are still under way; of a whole one the router has said which.
+        lost = sum(self.lost.values()) + max(0, self.late_sent - self.late)
+        delivered = self.received + self.late
+        offered = self.offered - self.unsent
+        missing = abs(offered - delivered - lost)
+        return {
+            "offered": offered,
+            "delivered": delivered,
+            "late": self.late,
+            "lost": lost,
+            "unexplained": max(missing, self.unexplained),
+        }
+
+
+def window_means(tally: Tally) -> Floats:
+    """Mean squared error of each window and trial, (WINDOWS, R); NaN for windows without slots."""
+    lengths = np.bincount(window_of(np.arange(1, tally.slots), tally.slots), minlength=WINDOWS)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means: Floats = tally.window_errors[:WINDOWS] / lengths[:, None]
+    return means
+
+
+def trial_means(tally: Tally) -> Floats:
+    """Mean error of every trial over its slots, (R,)."""
+    means: Floats = tally.window_errors.sum(axis=0) / tally.slots
+    return means
+
+
+def merged(parts: Sequence[Tally]) -> Tally:
+    """One tally of several disjoint sets of trials, in their order."""
+    total = Tally(parts[0].slots, sum(part.trials for part in parts))
+    total.watched = Watched.of([part.watched for part in parts])
+    total.done = min(part.done for part in parts)
+    for part in parts:
+        for name in (
+            "offered",
+            "unsent",
+            "error",
+            "trace",
+            "expected_trace",
+            "received",
+            "used",
+            "unexplained",
+            "late",
+            "late_used",
+            "late_sent",
+        ):
+            setattr(total, name, getattr(total, name) + getattr(part, name))
+        for reason, count in part.lost.items():
+            total.lost[reason] = total.lost.get(reason, 0) + count
+        total.bursts += part.bursts
+        if part.delays.size:
+            total.delays = part.delays + (total.delays if total.delays.size else 0)
+    total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
+    return total

@@ -1,0 +1,56 @@
+"""All that is kept of a set of trials while their slots come, live or in memory, and of which the summary is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from evedrop.scenario import Scenario
+from evedrop.score.acknowledging import Detection
+from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
+from evedrop.score.filtering import FilterTally
+from evedrop.score.sums import Tally, merged
+from evedrop.score.watched import Watched, watches_of
+
+
+@dataclass(frozen=True)
+class Totals:
+    """Of some trials; what is not of receivers is None where there is no such thing, or its mode does not follow it."""
+
+    tallies: Mapping[str, Tally]
+    """By receiver."""
+    detection: Detection | None = None
+    loop: LoopTally | None = None
+    filter: FilterTally | None = None
+    solve_times: SolveTimes = field(default_factory=SolveTimes)
+
+    @classmethod
+    def nothing(cls, scenario: Scenario, trials: int) -> Totals:
+        """Of so many trials that come to no slot."""
+        watches = watches_of(scenario)
+        return cls({name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()})
+
+    @classmethod
+    def of(cls, scenario: Scenario, trials: int) -> Totals:
+        """Of so many trials that are about to begin, whose states are known."""
+        return cls(
+            cls.nothing(scenario, trials).tallies,
+            Detection(trials),
+            LoopTally.of(scenario, trials),
+            FilterTally.of(scenario),
+        )
+
+    @classmethod
+    def merged(cls, parts: Sequence[Totals]) -> Totals:
+        """Of disjoint sets of trials, in their order."""
+        times = SolveTimes()
+        for part in parts:
+            times.merge(part.solve_times)
+        detections = [part.detection for part in parts if part.detection is not None]
+        return cls(
+            {name: merged([part.tallies[name] for part in parts]) for name in parts[0].tallies},
+            Detection.merged(detections) if detections else None,
+            LoopTally.merged([part.loop for part in parts]),
+            FilterTally.merged([part.filter for part in parts]),
+            times,
+        )

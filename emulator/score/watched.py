@@ -1,0 +1,130 @@
+"""What expectations ask of a receiver beyond its totals: sums over some slots, and when it was in step, trial by trial.
+
+Memory: a number for each trial and expectation. A trial's numbers are added up slot by slot, so they are the same bits
+however its slots and the other trials were cut into parts, live and in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes
+from evedrop.scenario import ExpectTable, Scenario
+
+IN_STEP = "in_step"
+_NEVER = -1.0
+_TRACE = "mean_trace_covariance"
+_LATE = {"received_fraction": 0, "used_fraction": 1}
+
+Late = Sequence[NDArray[np.uint16]] | NDArray[np.uint16]
+
+
+class Watch(NamedTuple):
+    """What to keep of which slots, from first to before end."""
+
+    what: str
+    """A figure, or `in_step`."""
+    first: int
+    end: int
+
+
+def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, Watch] | None:
+    """Receiver, and what an expectation needs kept of it; None where the summary's figures, or theory, will do."""
+    if expect.in_step is not None:
+        return expect.in_step, Watch(IN_STEP, _since(scenario, expect), scenario.slots)
+    if expect.figure is None or (expect.slots is None and expect.quantile is None):
+        return None
+    receiver, _, figure = expect.figure.partition(".")
+    first, end = expect.slots or (0, scenario.slots)
+    return None if figure == "expected_trace_covariance" else (receiver, Watch(figure, first, end))
+
+
+def _since(scenario: Scenario, expect: ExpectTable) -> int:
+    """From where on a receiver must come into step: as said, or since the last event before that is over for it."""
+    if expect.since is not None:
+        return expect.since
+    by = scenario.slots if expect.by is None else expect.by
+    over = [act.at for act in scenario.timeline.acts if expect.in_step in act.names and act.at <= by]
+    return max(over, default=0)
+
+
+def watches_of(scenario: Scenario) -> dict[str, tuple[Watch, ...]]:
+    """Receiver → all that the scenario's expectations need kept of it."""
+    wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
+    return {name: tuple(dict.fromkeys(watch for one, watch in wanted if one == name)) for name in scenario.receivers}
+
+
+class Watched:
+    """What was kept of R trials. Final."""
+
+    def __init__(self, watches: Iterable[Watch], trials: int) -> None:
+        self._trials = trials
+        # Of the believed trace no trial's own is known in a live run: its entry is the sum over all trials.
+        self._kept = {
+            watch: np.zeros(1) if watch.what == _TRACE else np.full(trials, _NEVER if watch.what == IN_STEP else 0.0)
+            for watch in watches
+        }
+
+    def add(self, first: int, error: Floats, action: Codes, traces: Floats, late: Late | None = None) -> None:
+        """Take c slots from `first` on: error and action (c, R), and the sum over trials of tr P, (c,).
+
+        late: packets of earlier slots that arrived, and that were used, (c, R) each, of who can make use of them.
+        """
+        for watch, kept in self._kept.items():
+            rows = slice(max(watch.first - first, 0), min(watch.end - first, len(error)))
+            if rows.start >= rows.stop:
+                continue
+            if watch.what == IN_STEP:
+                states = action[rows] == Action.STATE
+                new = states.any(axis=0) & (kept == _NEVER)
+                kept[new] = first + rows.start + states.argmax(axis=0)[new]
+            else:
+                _add(kept, watch.what, error[rows], action[rows], traces[rows])
+                if late is not None and watch.what in _LATE:
+                    np.add(kept, late[_LATE[watch.what]][rows].sum(axis=0), out=kept)
+
+    def means(self, watch: Watch) -> Floats:
+        """A figure's mean over the slots, of each trial, (R,)."""
+        return self._kept[watch] / (watch.end - watch.first)
+
+    def mean(self, watch: Watch) -> float:
+        """A figure's mean over the slots and trials."""
+        return float(self.means(watch).sum()) / self._trials
+
+    def quantile(self, watch: Watch, level: float) -> float:
+        """A quantile over trials of a trial's mean over the slots."""
+        return float(np.quantile(self.means(watch), level))
+
+    def in_step(self, watch: Watch) -> int | None:
+        """The largest over trials of the first slot in which a packet was used as the state; None if a trial has none."""
+        kept = self._kept[watch]
+        return None if (kept == _NEVER).any() else int(kept.max())
+
+    @classmethod
+    def of(cls, parts: Sequence[Watched]) -> Watched:
+        """One of disjoint sets of trials, in their order."""
+        total = cls((), sum(part._trials for part in parts))
+        for watch in parts[0]._kept:
+            kept = [part._kept[watch] for part in parts]
+            total._kept[watch] = np.sum(kept, axis=0) if watch.what == _TRACE else np.concatenate(kept)
+        return total
+
+
+def _add(kept: Floats, figure: str, error: Floats, action: Codes, traces: Floats) -> None:
+    """Add some slots of a figure to what was kept of it."""
+    match figure:
+        case "mean_squared_error":
+            for row in error:
+                kept += row
+        case "mean_trace_covariance":
+            for trace in traces:
+                kept += trace
+        case "received_fraction":
+            kept += np.count_nonzero(action != Action.LOST, axis=0)
+        case "used_fraction":
+            kept += np.count_nonzero((action != Action.LOST) & (action != Action.DISCARDED), axis=0)

@@ -1,0 +1,72 @@
+"""The results of tests as JUnit XML, which every CI server reads.
+
+Source: docs/testing.md.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from evedrop.errors import UsageError
+from evedrop.studies.scenario_tests import Finding, Outcome
+
+_NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # no XML can hold it, escaped or not
+
+
+def write_junit(path: Path, tested: Sequence[Finding], started: float) -> None:
+    """Write a report; started: seconds since the epoch. Raises UsageError if it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(junit_of(tested, started))
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror}); give another --junit") from error
+
+
+def junit_of(tested: Sequence[Finding], started: float) -> bytes:
+    """The report: one test suite, a test case a scenario. An expectation that failed is a failure, all else an error."""
+    failures = sum(one.outcome is Outcome.FAILED for one in tested)
+    errors = sum(one.outcome in {Outcome.MISTAKES, Outcome.BROKEN} for one in tested)
+    counts = {
+        "name": "evedrop",
+        "tests": str(len(tested)),
+        "failures": str(failures),
+        "errors": str(errors),
+        "skipped": "0",
+        "time": f"{sum(one.seconds for one in tested):.3f}",
+    }
+    suites = ET.Element("testsuites", counts)
+    when = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(started))
+    suite = ET.SubElement(suites, "testsuite", {**counts, "timestamp": when})
+    for one in tested:
+        _add(suite, one)
+    ET.indent(suites, " ")
+    return bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True)) + b"\n"
+
+
+def _add(suite: ET.Element, tested: Finding) -> None:
+    path = Path(tested.scenario)
+    where = ".".join(path.with_suffix("").parts[:-1]) or "scenarios"
+    case = ET.SubElement(
+        suite,
+        "testcase",
+        {"classname": _text(where), "name": _text(path.stem), "time": f"{tested.seconds:.3f}"},
+    )
+    known = {"seed": tested.seed, "results": tested.folder}
+    if any(value is not None for value in known.values()):
+        properties = ET.SubElement(case, "properties")
+        for name, value in known.items():
+            if value is not None:
+                ET.SubElement(properties, "property", {"name": name, "value": _text(str(value))})
+    if tested.outcome is not Outcome.PASSED:
+        kind = "failure" if tested.outcome is Outcome.FAILED else "error"
+        message = tested.reasons[0] if tested.reasons else ""
+        said = ET.SubElement(case, kind, {"message": _text(message), "type": tested.outcome.name.lower()})
+        said.text = _text("\n".join(tested.reasons))
+
+
+def _text(text: str) -> str:
+    return _NO_XML.sub("\ufffd", text)

@@ -1,0 +1,247 @@
+"""Who meets whom in a comparison: of one scenario, a scenario for every scheme, and one more for each attack on it.
+
+An adversary is a strategy, under that name, or one that also meddles with acknowledgements and reads as the best reader
+of the scheme does.
+
+Source: docs/compare.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.loading.mistakes import lacking_streams
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.schemes import SCHEMES
+from evedrop.scenario import Scenario, checked
+from evedrop.scenario.words import listed, near
+
+ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}
+"""Adversary → its attack on acknowledgements."""
+
+_BEST_READER = {
+    "acknowledged": "reference",
+    "cipher": "constant",
+    "encrypted-schedule": "selective",
+    "innovation": "bayesian",
+    "twin-track": "tracker",
+}
+_ANY_READER = "naive"  # of every other scheme: whatever is sent is the state, or cannot be told from it
+
+_MEANT_FOR = {
+    "bayesian": ("innovation", "weighs states against innovations, and there are none: it is naive here"),
+    "genie": ("innovation", "uses what innovations leak, and there are none"),
+    "likelihood": ("innovation", "tests states against innovations, and there are none: it is naive here"),
+    "reference": ("acknowledged", "follows references, and there are none: it is naive here"),
+    "selective": (
+        "encrypted-schedule",
+        "heeds a header that says what is encrypted, and there is none: it is naive here",
+    ),
+    "tracker": ("twin-track", "goes half-way between two tracks, and there is one"),
+}
+_CHANCES = {"use_state": 0.8, "use_innovation": 0.2}  # of a suspicious one that the scenario says nothing of
+_WAY_BACK = {"link": {"quality": 1.0}}
+
+Tables = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Match:
+    """An adversary against a scheme: who it is in the scenario of its group, or why there is nothing to play."""
+
+    scheme: str
+    adversary: str
+    strategy: str | None = None
+    """How it reads; None if it is not defined."""
+    attack: str = "none"
+    not_defined: str | None = None
+
+    @property
+    def receiver(self) -> str:
+        """Its name in the scenario: that of its strategy, so that it meets the same losses whatever else it does."""
+        return str(self.strategy)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Matches that one simulation plays: a scheme, under one attack or none."""
+
+    scenario: Scenario
+    matches: tuple[Match, ...]
+
+    @property
+    def scheme(self) -> str:
+        """Of all its matches."""
+        return self.scenario.encoding.scheme
+
+    @property
+    def name(self) -> str:
+        """Of its scenario's file."""
+        attacker = next((match.adversary for match in self.matches if match.attack != "none"), None)
+        return self.scheme if attacker is None else f"{self.scheme}-{attacker}"
+
+
+@dataclass(frozen=True)
+class Matchups:
+    """Everything a comparison plays, and what it cannot."""
+
+    schemes: tuple[str, ...]
+    adversaries: tuple[str, ...]
+    groups: tuple[Group, ...]
+    """By scheme; of each scheme the one without an attack first."""
+    undefined: tuple[Match, ...]
+
+
+def adversaries_of() -> tuple[str, ...]:
+    """All that can be named."""
+    return (*STRATEGIES, *ATTACKERS)
+
+
+def matchups_of(
+    scenario: Scenario,
+    schemes: Sequence[str] | None = None,
+    adversaries: Sequence[str] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Matchups:
+    """Of schemes and adversaries by name, all of them unless said; parameters: SCHEME.PARAMETER → value.
+
+    Raises UsageError with every name that is none, ScenarioError where a scheme cannot be on this process and these links.
+    """
+    chosen = _chosen(schemes, adversaries, parameters or {})
+    groups: list[Group] = []
+    undefined: list[Match] = []
+    mistakes: dict[str, None] = {}
+    for scheme in chosen[0]:
+        matches = [_match(scenario, scheme, name) for name in chosen[1]]
+        undefined += [match for match in matches if match.not_defined is not None]
+        encoding = _encoding(scenario, scheme, parameters or {})
+        for attack in ("none", *ATTACKERS.values()):
+            some = tuple(one for one in matches if one.not_defined is None and one.attack == attack)
+            if not some and attack != "none":
+                continue
+            try:
+                groups.append(Group(_scenario(scenario, encoding, attack, some), some))
+            except ScenarioError as error:
+                mistakes.update(dict.fromkeys(f"with the scheme {scheme}: {line}" for line in error.mistakes))
+    if mistakes:
+        raise ScenarioError(scenario.title, list(mistakes))
+    return Matchups(*chosen, tuple(groups), tuple(undefined))
+
+
+def _chosen(
+    schemes: Sequence[str] | None, adversaries: Sequence[str] | None, parameters: Mapping[str, Any]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    found: list[str] = []
+    chosen = []
+    for what, names, known in (("scheme", schemes, tuple(SCHEMES)), ("adversary", adversaries, adversaries_of())):
+        wanted = known if names is None else tuple(dict.fromkeys(names))
+        found += _strange(what, wanted, known)
+        if not wanted:
+            found.append(f"no {what} is named; expected {listed(known)}")
+        chosen.append(wanted)
+    for key in parameters:
+        scheme, _, name = key.partition(".")
+        if scheme not in SCHEMES or name not in SCHEMES[scheme].parameters:
+            parts = [f"{one}.{entry}" for one in SCHEMES for entry in SCHEMES[one].parameters]
+            found.append(f"{key} is no parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
+    if found:
+        raise UsageError("\n  ".join(["nothing was compared:", *found]))
+    return chosen[0], chosen[1]
+
+
+def _strange(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:
+    return [
+        f"{name or 'nothing'} is no {what}; expected {listed(known)}{near(name, known)}"
+        for name in names
+        if name not in known
+    ]
+
+
+def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
+    attack = ATTACKERS.get(adversary, "none")
+    if attack != "none" and not SCHEMES[scheme].needs_acknowledgements:
+        return Match(scheme, adversary, not_defined="there are no acknowledgements to meddle with")
+    strategy = adversary if attack == "none" else _BEST_READER.get(scheme, _ANY_READER)
+    where, why = _MEANT_FOR.get(strategy, (scheme, ""))
+    if scheme != where:
+        return Match(scheme, adversary, not_defined=why)
+    table = _eavesdropper(scenario, scheme, strategy)
+    parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}
+    lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
+    if lacking:
+        return Match(scheme, adversary, not_defined=f"is told the {listed(lacking)}, and there is none")
+    return Match(scheme, adversary, strategy, attack)
+
+
+def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) -> Tables:
+    """The scenario's own parameters as far as the scheme has them, else the examples of docs/scenario.md."""
+    own = scenario.encoding.parameters
+    given = {name: parameters.get(f"{scheme}.{name}") for name in SCHEMES[scheme].parameters}
+    examples = SCHEMES[scheme].parameters
+    return {
+        "scheme": scheme,
+        **{name: own.get(name, examples[name]) if value is None else value for name, value in given.items()},
+    }
+
+
+def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequence[Match]) -> Scenario:
+    tables: Tables = scenario.model_dump(mode="json", exclude_none=True)
+    scheme = encoding["scheme"]
+    under = "" if attack == "none" else f", acknowledgements attacked: {attack}"
+    tables |= {
+        "title": f"{scenario.title} ({scheme}{under})",
+        "encoding": encoding,
+        "eavesdroppers": {one.receiver: _eavesdropper(scenario, scheme, one.receiver) for one in matches},
+        "event": [
+            table
+            for event, table in zip(scenario.event, tables["event"], strict=True)
+            if event.kind != "jam" and set(event.names) <= {LEGITIMATE}
+        ],
+        "expect": [],
+        "record_trials": 1,
+    }
+    tables[LEGITIMATE]["link"].pop("correlation", None)  # to an eavesdropper, who may not be there
+    way_back = tables.pop("acknowledgements", _WAY_BACK)
+    if SCHEMES[scheme].needs_acknowledgements:
+        way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer")}
+        jammer = {"jammer": matches[0].receiver} if attack == "critical" else {}
+        tables["acknowledgements"] = {**way_back, "attack": attack, **jammer}
+    return checked(tables, scenario.title)
+
+
+def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
+    """The scenario's first eavesdropper of that strategy, else one on the link of the scenario's first eavesdropper."""
+    tables: dict[str, Tables] = scenario.model_dump(mode="json", exclude_none=True)["eavesdroppers"]
+    own = next((table for table in tables.values() if table["strategy"] == strategy), None)
+    if own is not None and "reads_as" not in own:
+        return _alone(own)
+    donor = next((table for table in tables.values() if "link" in table), None)
+    if donor is None:
+        donor = scenario.legitimate.model_dump(mode="json", exclude_none=True)
+    link = donor["link"]
+    kind = STRATEGIES[strategy]
+    made: Tables = {"strategy": strategy, "window": donor["window"], **(own or {})}
+    if kind.pools_links:
+        made.setdefault("links", [{name: link[name] for name in ("quality", "loss") if name in link}] * 2)
+    else:
+        made.setdefault("link", link)
+    made |= {name: value for name, value in _CHANCES.items() if name in kind.parameters and name not in made}
+    if "reads_as" in kind.parameters:
+        # As each scheme is read best, whatever the scenario's own scheme is: what it says would mean nothing for most.
+        made = {name: value for name, value in made.items() if name not in _CHANCES}
+        made["reads_as"] = _BEST_READER.get(scheme, _ANY_READER)
+    if "learns_at" in kind.parameters:
+        made.setdefault("learns_at", scenario.slots // 2)
+    return _alone(made)
+
+
+def _alone(table: Tables) -> Tables:
+    """Without a tie to the losses of another eavesdropper, who may not be there."""
+    link = table.get("link", {})
+    if link.get("correlation", {}).get("with", LEGITIMATE) == LEGITIMATE:
+        return table
+    return {**table, "link": {name: value for name, value in link.items() if name != "correlation"}}

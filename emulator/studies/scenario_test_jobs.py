@@ -1,0 +1,98 @@
+"""Scenarios as tests, several at a time: each in a process of its own, which ends with whoever started it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from evedrop.errors import Interrupted
+from evedrop.live.network.launcher_watch import when_launcher_is_gone
+from evedrop.signals import stop_on_signals
+from evedrop.studies.scenario_tests import Finding, Manner, Outcome, carry_out
+
+_LOOK_SECONDS = 0.1
+_WORK = "from evedrop.studies.scenario_test_jobs import work; work()"
+
+
+def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Finding]:
+    """What became of each scenario, in their order. Raises Interrupted on Ctrl-C; no process is left then."""
+    if jobs == 1:
+        with stop_on_signals() as stop:
+            for scenario in scenarios:
+                if stop.is_set():
+                    raise Interrupted("interrupted; what was measured is in the results folders")
+                yield carry_out(scenario, manner)
+        return
+    crew = _Crew(replace(manner, workers=1))
+    with stop_on_signals() as stop, ThreadPoolExecutor(jobs) as threads:
+        waiting = [threads.submit(crew.carry_out, scenario) for scenario in scenarios]
+        try:
+            for one in waiting:
+                while not wait([one], _LOOK_SECONDS).done:
+                    if stop.is_set():
+                        raise Interrupted("interrupted; what was measured is in the results folders")
+                yield one.result()
+        finally:
+            crew.end(waiting)
+
+
+class _Crew:
+    """The processes under way. Final."""
+
+    def __init__(self, manner: Manner) -> None:
+        self._manner = manner
+        self._running: set[subprocess.Popen[str]] = set()
+        self._over = False
+
+    def carry_out(self, scenario: str) -> Finding:
+        """One scenario, by a process that a Ctrl-C in the terminal does not reach: we pass it on."""
+        task = json.dumps([scenario, asdict(self._manner)], default=str)
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", _WORK, task],
+            stdin=subprocess.PIPE,  # closed when we are gone
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        with process:
+            self._running.add(process)
+            if self._over:
+                process.terminate()
+            assert process.stdout is not None  # noqa: S101 - it was asked for
+            said = process.stdout.read()
+            status = process.wait()
+            self._running.discard(process)
+        if not said:
+            return Finding(scenario, Outcome.BROKEN, 0.0, (f"its process ended with status {status}",))
+        found = json.loads(said)
+        folder = None if found["folder"] is None else Path(found["folder"])
+        return Finding(
+            **{**found, "outcome": Outcome(found["outcome"]), "folder": folder, "reasons": (*found["reasons"],)}
+        )
+
+    def end(self, waiting: Sequence[Future[Finding]]) -> None:
+        """Start no more, and have those under way end."""
+        for one in waiting:
+            one.cancel()
+        self._over = True
+        for process in tuple(self._running):
+            process.terminate()
+
+
+def work() -> None:
+    """The life of one process: carry out what the argument says, and tell on standard output what became of it."""
+    when_launcher_is_gone(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    scenario, manner = json.loads(sys.argv[1])
+    out = None if manner["out"] is None else Path(manner["out"])
+    try:
+        tested = carry_out(scenario, Manner(**{**manner, "out": out}))
+    except Interrupted as error:
+        sys.exit(error.exit_status)
+    sys.stdout.write(json.dumps({**asdict(tested), "outcome": tested.outcome.value}, default=str))

@@ -1,0 +1,137 @@
+"""A scenario carried out as a test, for the pytest plugin and `evedrop test` alike.
+
+Source: docs/testing.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from evedrop.discovery import scenarios_in
+from evedrop.errors import RunError, ScenarioError, UsageError
+from evedrop.live.launch.launcher import launch
+from evedrop.memory.montecarlo import Plan, simulate
+from evedrop.results.folder import claimed, default_folder
+from evedrop.results.writer import load_results
+from evedrop.scenario import Scenario, load, shipped
+from evedrop.score.expectations_held import told
+
+
+class Outcome(Enum):
+    """What became of a test; its value is the exit status."""
+
+    PASSED = 0
+    FAILED = 1
+    """An expectation was not held, or the run could not tell."""
+    MISTAKES = 2
+    """The scenario has mistakes, or nothing could be started."""
+    BROKEN = 3
+    """The run itself failed."""
+
+    @property
+    def word(self) -> str:
+        """As it is printed."""
+        return self.name.lower() if self is Outcome.PASSED else self.name
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How tests are carried out."""
+
+    in_memory: bool = False
+    trials: int | None = None
+    """None: as many as the scenario says."""
+    out: Path | None = None
+    """The folder of all results folders; None: each is below runs/."""
+    workers: int | None = None
+    """Of a test in memory; None: as many as pay."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What became of one scenario."""
+
+    scenario: str
+    outcome: Outcome
+    seconds: float
+    reasons: tuple[str, ...] = ()
+    """Why it did not pass, a line each."""
+    seed: int | None = None
+    folder: Path | None = None
+    """The results."""
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What there is to say of one that did not pass."""
+        kept = () if self.folder is None or self.outcome is Outcome.PASSED else (f"results: {self.folder}",)
+        return (*self.reasons, *kept)
+
+
+def scenarios_of(places: Sequence[str]) -> list[str]:
+    """The scenarios that files, folders and shipped names stand for, each once. Raises UsageError if there is none."""
+    found: dict[Path, str] = {}
+    for place in places:
+        paths: Sequence[Path] = [Path(place)]
+        if place in shipped():
+            found.setdefault(shipped()[place].resolve(), place)
+            continue
+        if Path(place).is_dir():
+            paths = list(scenarios_in(Path(place)))
+        for path in paths:
+            found.setdefault(path.resolve(), str(path))
+    if not found:
+        raise UsageError(f"no scenario in {', '.join(places)}; a scenario is a TOML file with [process] and [encoding]")
+    return list(found.values())
+
+
+def carry_out(scenario: str, manner: Manner) -> Finding:
+    """Run a scenario, live and without a view or in memory, into a results folder of its own, which is kept.
+
+    Raises Interrupted on Ctrl-C.
+    """
+    started = time.monotonic()
+    changes = {} if manner.trials is None else {"trials": manner.trials}
+
+    def ended(outcome: Outcome, reasons: Sequence[str], **more: Any) -> Finding:
+        return Finding(scenario, outcome, time.monotonic() - started, tuple(reasons), **more)
+
+    try:
+        made = load(scenario, changes)
+        folder = claimed(default_folder(scenario) if manner.out is None else manner.out / Path(scenario).stem)
+    except ScenarioError as error:
+        return ended(Outcome.MISTAKES, error.mistakes)
+    except UsageError as error:
+        return ended(Outcome.MISTAKES, [str(error)])
+    try:
+        folder = _run(made, folder, manner)
+    except UsageError as error:
+        return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
+    except RunError as error:
+        return ended(Outcome.BROKEN, str(error).splitlines(), seed=made.seed, folder=folder)
+    reasons = list(_reasons(load_results(folder).summary))
+    return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, seed=made.seed, folder=folder)
+
+
+def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
+    """Run a scenario into a folder; where the results are."""
+    if manner.in_memory:
+        simulate(scenario, folder, _silent, Plan(workers=manner.workers))
+        return folder
+    return launch(scenario, folder, "off", None, _silent).folder
+
+
+def _silent(news: Mapping[str, Any]) -> None:
+    del news
+
+
+def _reasons(summary: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each expectation that did not hold, and for each that the run could not tell: a test must tell."""
+    for expectation in summary["expectations"]:
+        if expectation["held"] is not True:
+            replay = expectation.get("replay")
+            yield told(expectation) + (f"; see it again: {replay}" if replay is not None else "")

@@ -1,0 +1,206 @@
+"""Monte Carlo over a grid: any entries of the scenario, every combination of their values, one tidy table."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import math
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
+from evedrop.memory.montecarlo import Merger, Plan, check_mode, results_of, said_of, teller
+from evedrop.memory.trials import BatchResult, tasks_of
+from evedrop.memory.workers import connected
+from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
+from evedrop.scenario import FIGURES, Scenario, load, value_of
+from evedrop.scenario.household import FIGURES as HOUSE_FIGURES
+from evedrop.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
+from evedrop.score.scorekeeper import Ending
+from evedrop.signals import stop_on_signals
+
+Grid = Mapping[str, Sequence[Any]]
+Point = Mapping[str, Any]
+
+_MOST_POINTS = 10_000
+_WRITE_SECONDS = 3.0  # from one table of what is done to the next
+_RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and nothing that makes a list of it
+_WHOLE = re.compile(r"[+-]?\d+")
+
+
+def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
+    """The grid that `--over` options describe: KEY=first:last:step, both ends included, or KEY=a,b,c.
+
+    Raises UsageError for anything else, an empty range, or more than 10 000 points.
+    """
+    grid: dict[str, list[Any]] = {}
+    for text in texts:
+        key, equals, values = text.partition("=")
+        if not equals or not key or not values:
+            raise UsageError(f"--over {text}: expected KEY=first:last:step or KEY=a,b,c, such as slots=100,200")
+        if key in grid:
+            raise UsageError(f"--over {text}: {key} is there twice; give all its values in one")
+        grid[key] = _range(text, values) if _RANGE.fullmatch(values) else _listed(values)
+    if math.prod(len(values) for values in grid.values()) > _MOST_POINTS:
+        raise UsageError(f"--over asks for more than {_MOST_POINTS} points; take wider steps")
+    return grid
+
+
+def _listed(values: str) -> list[Any]:
+    """What stands between commas: TOML values, lists and quoted strings among them; else strings."""
+    whole = value_of(f"[{values}]")
+    return whole if isinstance(whole, list) else [value_of(value.strip()) for value in values.split(",")]
+
+
+def _range(text: str, values: str) -> list[Any]:
+    """Whole numbers if all three are; decimal steps give decimal values, 0.3 and not 0.30000000000000004."""
+    try:
+        first, last, step = (Decimal(value.strip()) for value in values.split(":"))
+    except (ValueError, InvalidOperation):
+        raise UsageError(f"--over {text}: expected three numbers first:last:step, such as 0.1:0.9:0.1") from None
+    if not all(number.is_finite() for number in (first, last, step)) or not step or (last - first) / step < 0:
+        raise UsageError(f"--over {text}: the range is empty; expected first:last:step with the step towards last")
+    if (last - first) / step >= _MOST_POINTS:
+        raise UsageError(f"--over {text} asks for more than {_MOST_POINTS} values; take a wider step")
+    found = [first + i * step for i in range(int((last - first) / step) + 1)]
+    whole = all(_WHOLE.fullmatch(value.strip()) for value in values.split(":"))
+    return [int(value) if whole else float(value) for value in found]
+
+
+def sweep_over(
+    source: str | Path,
+    changes: Mapping[str, Any],
+    grid: Grid,
+    folder: Path,
+    tell: Callable[[Mapping[str, Any]], None],
+    plan: Plan,
+) -> pa.Table:
+    """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot. The table: a row a point and peer.
+
+    Raises ScenarioError if any point is no scenario, before anything is run; Interrupted, or RunError if a worker fails,
+    with the points done so far in the folder.
+    """
+    scenarios = _checked(source, changes, grid, plan)
+    workers = max(plan.workers_for(scenario) for _, scenario in scenarios)
+    total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
+    each = workers if len(scenarios) < 4 * workers else 1  # many points need not be cut for the workers
+    tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
+    rows: list[dict[str, Any]] = []
+    failure: RunError | None = None
+    done = 0
+    description = {"scenario": str(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
+    with stop_on_signals() as stop, connected(plan.scheduler) as client:
+        new_folder(folder)
+        told = teller(tell, total)
+        everything = list(itertools.chain(*tasks))
+        with said_of(folder):
+            text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
+            write_private(folder / "sweep.json", text + "\n")
+            with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+                written = time.monotonic()
+                try:
+                    for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
+                        summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
+                        if summary is None:
+                            break
+                        rows += _rows(point, scenario, summary)
+                        done += 1
+                        if time.monotonic() - written > _WRITE_SECONDS:
+                            _write_table(folder, rows)
+                            written = time.monotonic()
+                except RunError as error:
+                    failure = error
+            if not rows:
+                shutil.rmtree(folder)
+                raise failure or Interrupted("interrupted before a point was done; nothing was kept")
+            table = _write_table(folder, rows)
+            _draw(folder, table, grid)
+    if failure is not None:
+        raise failure
+    if done < len(scenarios):
+        raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
+    return table
+
+
+def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
+    """Write the table of the points so far, whole at any moment."""
+    table = pa.Table.from_pylist(rows)
+    unfinished = folder / "sweep.parquet.new"
+    pq.write_table(table, private_file(unfinished))
+    os.replace(unfinished, folder / "sweep.parquet")
+    return table
+
+
+def _draw(folder: Path, table: pa.Table, grid: Grid) -> None:
+    from evedrop.view.sweep_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
+
+    draw(private_pictures(folder / "sweep"), table, tuple(grid))
+    if HOUSE_FIGURES[0] in table.column_names:
+        from evedrop.view.household_sweep_picture import draw as draw_household  # noqa: PLC0415 - as above
+
+        draw_household(private_pictures(folder / "household"), table, next(iter(grid)))
+
+
+def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:
+    """The summary of a point; None if it was cut short."""
+    started = time.monotonic()
+    merger = Merger(scenario, plan.mode)
+    for result in results:
+        merger.add(result)
+    return merger.summary(Ending(time.monotonic() - started)) if merger.complete else None
+
+
+def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: Plan) -> list[tuple[Point, Scenario]]:
+    """Every point's scenario; all mistakes of all points at once."""
+    points: list[Point] = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    found: list[tuple[Point, Scenario]] = []
+    mistakes: dict[str, None] = {}
+    for point in points:
+        try:
+            scenario = load(source, {**changes, **point}, beyond_horizon=plan.mode.value != "exact")
+        except ScenarioError as error:
+            mistakes.update(dict.fromkeys(error.mistakes))
+            continue
+        check_mode(scenario, plan.mode)
+        found.append((point, scenario))
+    if mistakes:
+        raise ScenarioError(str(source), list(mistakes))
+    return found
+
+
+def _of_household(house: Mapping[str, Any] | None, name: str) -> dict[str, float | None]:
+    """The figures of a house and of what one receiver can tell of it, if the plant is one."""
+    if house is None:
+        return {}
+    told = house["receivers"][name]
+    return {**{figure: house[figure] for figure in HOUSE_FIGURES}, **{one: told[one] for one in HOUSE_RECEIVER_FIGURES}}
+
+
+def _rows(point: Point, scenario: Scenario, summary: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """A row for each peer: the point, the figures, the verdict."""
+    for name, peer in summary["peers"].items():
+        verdict = summary["secrecy"].get(name, {})
+        yield {
+            **{key: json.dumps(value) if isinstance(value, (list, dict)) else value for key, value in point.items()},
+            "peer": name,
+            "slots": scenario.slots,
+            "trials": summary["trials"],
+            **{figure: peer[figure] for figure in FIGURES},
+            "mean_actual_trace_covariance": peer.get("mean_actual_trace_covariance"),
+            **{f"error_quantile_{level}": value for level, value in (peer["error_quantiles"] or {}).items()},
+            "infinite_variance": peer["infinite_variance"],
+            **_of_household(summary["household"], name),
+            "relative_secrecy": verdict.get("relative"),
+            "perfect_secrecy": verdict.get("perfect"),
+            "digest": peer["digest"],
+        }

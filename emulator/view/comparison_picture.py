@@ -1,0 +1,117 @@
+"""The picture of a comparison: a matrix of schemes and adversaries, with a mark, a colour and a ratio in every cell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.cli.comparison_report import MARKS
+from evedrop.studies.compare import Kept
+from evedrop.view.figure_style import panels
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from evedrop.studies.compare import Cell, Comparison, SchemeResult
+
+# Blue for what is kept and orange for what is not, the deeper the surer: apart for every kind of colour-blindness, and in grey.
+_GROUND = {Kept.PERFECT: "#1f6fb2", Kept.RELATIVE: "#a9cdea", Kept.UNDECIDED: "#f1efe8", Kept.BROKEN: "#e8833a"}
+_INK = {Kept.PERFECT: "white", Kept.RELATIVE: "#10202e", Kept.UNDECIDED: "#3c3c3c", Kept.BROKEN: "#2a1200"}
+_SAID = {
+    Kept.PERFECT: "perfect: its error grows without bound",
+    Kept.RELATIVE: "relative: it stays above the legitimate error",
+    Kept.UNDECIDED: "too few trials to tell",
+    Kept.BROKEN: "broken",
+}
+_NOTABLE = 1.1  # times: the share by which an attack must raise the user's error to be noted
+_FACTS = ("legitimate\nerror", "ACKs", "bits a\npacket", "secret bits\na slot (+ once)")
+_FACT_WIDTH = 1.25
+_LEAST_WIDTH = 9.0
+
+
+def draw(path: Path, found: Comparison) -> None:
+    """Draw `path`.png and `path`.pdf."""
+    schemes, adversaries = list(found.schemes.values()), found.adversaries
+    left = _FACT_WIDTH * len(_FACTS)
+    right = max(float(len(adversaries)) + 1.1, _LEAST_WIDTH)  # room for the legend
+    with panels(path, 1, 0.92 * (left + right + 2.0), 2.3 + 0.56 * len(schemes)) as (axes,):
+        axes.set_axis_off()
+        axes.set_xlim(-left - 2.0, right)
+        axes.set_ylim(len(schemes) + 1.6, -2.6)
+        for row, one in enumerate(schemes):
+            weight = "bold" if one.name in found.dominant else "normal"
+            axes.text(-left - 0.1, row, one.name, ha="right", va="center", fontsize=10.5, fontweight=weight)
+            for i, fact in enumerate(_facts(one)):
+                place = -left + _FACT_WIDTH * (i + 0.5)
+                axes.text(place, row, fact, ha="center", va="center", fontsize=9, color="#33383d")
+            for column, adversary in enumerate(adversaries):
+                _cell(axes, column, row, one, one.cells[adversary])
+        for i, head in enumerate(_FACTS):
+            axes.text(-left + _FACT_WIDTH * (i + 0.5), -0.62, head, ha="center", va="bottom", fontsize=9)
+        for column, adversary in enumerate(adversaries):
+            axes.text(column + 0.42, -0.62, adversary, ha="left", va="bottom", fontsize=9.5, rotation=38)
+        _legend(axes, found, left)
+
+
+def _facts(one: SchemeResult) -> Iterator[str]:
+    needs = one.needs
+    yield f"{_number(one.legitimate.typical)}"
+    yield "needed" if needs.acknowledgements else "–"
+    yield f"{needs.packet_bits}" + (f" × {needs.sent_fraction:.2f}" if needs.sent_fraction < 0.995 else "")
+    once = f" (+ {needs.initial_secret_bits})" if needs.initial_secret_bits else ""
+    yield f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–"
+
+
+def _cell(axes: Axes, column: int, row: int, one: SchemeResult, cell: Cell) -> None:
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - slow to import, and needed by this picture alone
+
+    box: Any = {"xy": (column + 0.03, row - 0.47), "width": 0.94, "height": 0.94, "linewidth": 0}
+    word = cell.verdict
+    if word is None or cell.ratio is None or cell.legitimate is None:
+        axes.add_patch(Rectangle(**box, facecolor="white"))
+        axes.text(column + 0.5, row, "·", ha="center", va="center", color="#9aa0a6", fontsize=9)
+        return
+    axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
+    axes.text(column + 0.5, row - 0.17, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=11)
+    user = cell.legitimate.typical / one.legitimate.typical if one.legitimate.typical else math.inf
+    raised = f"  u×{_number(user)}" if user > _NOTABLE else ""
+    size = 7.2 if raised else 8.4
+    axes.text(
+        column + 0.5,
+        row + 0.24,
+        f"{_number(cell.ratio)}×{raised}",
+        ha="center",
+        va="center",
+        color=_INK[word],
+        fontsize=size,
+    )
+
+
+def _legend(axes: Axes, found: Comparison, left: float) -> None:
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - as above
+
+    rows = len(found.schemes)
+    place = -left - 1.9
+    for word, said in _SAID.items():
+        axes.add_patch(Rectangle((place, rows - 0.12), 0.42, 0.44, facecolor=_GROUND[word], linewidth=0))
+        axes.text(place + 0.21, rows + 0.1, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=9.5)
+        axes.text(place + 0.52, rows + 0.1, said, ha="left", va="center", fontsize=8.8)
+        place += 1.0 + 0.092 * len(said)
+    notes = [
+        f"{found.title}: {found.slots:,} slots, {found.trials:,} trial{'s' if found.trials > 1 else ''}.",
+        "n×: the adversary's over the legitimate error. u×: an attack raises the legitimate error. ·: not defined."
+        + (f" Bold: dominates ({', '.join(found.dominant)})." if found.dominant else ""),
+    ]
+    axes.text(-left - 1.9, rows + 0.55, "\n".join(notes), ha="left", va="top", fontsize=8.8, linespacing=1.5)
+
+
+def _number(value: float) -> str:
+    """Short: 2.3, 57, 3.4e5."""
+    if not math.isfinite(value):
+        return "∞"
+    if 0.01 <= value < 1e4:
+        return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"

@@ -1,0 +1,163 @@
+"""A recording that is still being written, handed on to a viewer as it grows: through a pipe, or by HTTP to a browser.
+
+Only who has the address of a recording gets it: there is a secret in it. Nothing here can hold up a run: the run writes a
+file, and what reads it are threads of their own, each of which may wait for its viewer for ever.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import os
+import secrets
+import socket
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import IO, Any
+
+from evedrop.errors import UsageError
+
+_LOOK_SECONDS = 0.05  # how soon it is noticed that there is more
+_REQUEST_SECONDS = 10.0  # for a browser to say what it wants
+_MOST_READERS = 32  # at a time; another user who opens more is turned away, and so is everybody else meanwhile
+_PIECE = 2**18
+
+
+class Followed:
+    """A file that grows, from its beginning on; there may be none yet, and it may be moved. Final."""
+
+    def __init__(self, path: Path, complete: bool = False) -> None:
+        """complete: whether nothing is added any more."""
+        self._path = path
+        self._file: int | None = None
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        if complete:
+            self._over.set()
+
+    def complete(self) -> None:
+        """All that will be in the file is in it: pieces end with its end."""
+        with contextlib.suppress(OSError):
+            self._opened()
+        self._over.set()
+
+    def pieces(self) -> Iterator[bytes]:
+        """What is in the file and will be, as it comes."""
+        at = 0
+        while True:
+            over = self._over.is_set()  # asked first: what comes between the read and the question would be lost
+            piece = self._read(at)
+            if piece:
+                at += len(piece)
+                yield piece
+            elif over:
+                return
+            else:
+                self._over.wait(_LOOK_SECONDS)
+
+    def _read(self, at: int) -> bytes:
+        try:
+            return os.pread(self._opened(), _PIECE, at)
+        except OSError:
+            return b""
+
+    def _opened(self) -> int:
+        with self._lock:
+            if self._file is None:
+                self._file = os.open(self._path, os.O_RDONLY)
+            return self._file
+
+
+def feed(followed: Followed, pipe: IO[bytes]) -> None:
+    """Write a recording into a pipe, on a thread of its own, until its end or that of who reads the pipe."""
+
+    def write() -> None:
+        with contextlib.suppress(OSError), pipe:
+            for piece in followed.pieces():
+                pipe.write(piece)
+
+    threading.Thread(target=write, name="view", daemon=True).start()
+
+
+class Served:
+    """A recording at an address that cannot be guessed. Final.
+
+    Raises UsageError if the port cannot be had.
+    """
+
+    def __init__(self, followed: Followed, host: str, port: int) -> None:
+        self.path = f"/{secrets.token_urlsafe(24)}/recording.rrd"
+        try:
+            self._server = _Server(followed, self.path, host, port)
+        except OSError as error:
+            raise UsageError(f"{host}:{port} cannot be had ({error.strerror}) to show the run; give another") from error
+        self.port = int(self._server.server_address[1])
+        threading.Thread(target=self._server.serve_forever, args=(_LOOK_SECONDS,), name="view", daemon=True).start()
+
+    def stop(self) -> None:
+        """Take no more readers. Those under way are left to themselves."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, followed: Followed, path: str, host: str, port: int) -> None:
+        self.followed = followed
+        self.path = path.encode()
+        self._places = threading.BoundedSemaphore(_MOST_READERS)
+        super().__init__((host, port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """On a thread, if there is a place left."""
+        if self._places.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """One reader."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A reader that left, or never said what it wants, is no event."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    timeout = _REQUEST_SECONDS
+    server: _Server
+
+    def do_GET(self) -> None:
+        """The recording, for who knows its address."""
+        self.close_connection = True
+        if not hmac.compare_digest(self.path.encode(), self.server.path):
+            self.send_response(404)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
+        self.connection.settimeout(None)  # a browser whose user has paused it may wait as long as it likes
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self.send_response(200)
+        self.send_header("Content-Type", "application/octet-stream")
+        self.send_header("Access-Control-Allow-Origin", "*")  # the page is at another port; the address is the secret
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Transfer-Encoding", "chunked")
+        self.end_headers()
+        for piece in self.server.followed.pieces():
+            self.wfile.write(b"%x\r\n%b\r\n" % (len(piece), piece))
+        self.wfile.write(b"0\r\n\r\n")
+
+    def log_message(self, *_: Any) -> None:
+        """Nothing: the address is a secret."""
+
+    def version_string(self) -> str:
+        """What it is, and not of which version."""
+        return "evedrop"

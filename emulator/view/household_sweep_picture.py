@@ -1,0 +1,59 @@
+"""The plot of a sweep over a house: what is bought and sold, what perfect knowledge would change, and who can tell what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+
+_COLOURS = (BLUE, RED, ORANGE, GREEN, GREY)
+_MARKS = "osD^v"
+_LIMIT = 1.58  # per cent, which the paper says its grid power keeps below
+
+
+def draw(path: Path, table: pa.Table, key: str) -> None:
+    """Draw `path`.png and `path`.pdf against the values of one entry; of the other entries, only the first values are shown."""
+    rows = _of_one_line(table.to_pylist(), key)
+    peers = list(dict.fromkeys(row["peer"] for row in rows))
+    mine = {peer: [row for row in rows if row["peer"] == peer] for peer in peers}
+    house = mine[peers[0]]
+    numbers = all(isinstance(row[key], (int, float)) for row in house)
+    x = [float(row[key]) if numbers else float(i) for i, row in enumerate(house)]
+    with panels(path, 3, 12.6, 3.9) as (energies, shares, told):
+        for name, colour, mark in (("bought", BLUE, "o"), ("sold", GREEN, "s")):
+            energies.plot(x, [row[f"{name}_energy"] for row in house], f"{mark}-", color=colour, label=name)
+        energies.set_ylabel("energy (kWh)")
+        energies.set_ylim(bottom=0.0)
+        energies.set_title("(a) energy")
+        for name, colour, mark in (("net", BLUE, "o"), ("total", GREEN, "s"), ("summed", ORANGE, "D")):
+            found = [row[f"{name}_difference"] for row in house]
+            percent = [float("nan") if one is None or one <= 0.0 else 100.0 * one for one in found]
+            shares.plot(x, percent, f"{mark}-", color=colour, label=name)
+        shares.axhline(_LIMIT, color=GREY, linewidth=0.9, linestyle=":", label=f"the paper: {_LIMIT} %")
+        shares.set_yscale("log")
+        shares.set_ylabel("difference of grid power (%)")
+        shares.set_title("(b) from a controller that sees the truth")
+        for peer, colour, mark in zip(peers, _COLOURS * len(peers), _MARKS * len(peers), strict=False):
+            areas = [float("nan") if row["activity_area"] is None else row["activity_area"] for row in mine[peer]]
+            told.plot(x, areas, f"{mark}-", color=colour, label=peer)
+        told.axhline(0.5, color=GREY, linewidth=0.9, linestyle=":", label="a coin")
+        told.set_ylim(0.4, 1.02)
+        told.set_ylabel("area under the curve")
+        told.set_title("(c) who can tell when somebody is at it")
+        for axes in (energies, shares, told):
+            axes.set_xlabel(key)
+            axes.set_xlim(shares.get_xlim())
+            if not numbers:
+                axes.set_xticks(x, [str(row[key]) for row in house])
+            axes.legend()
+
+
+def _of_one_line(rows: list[dict[str, Any]], key: str) -> list[dict[str, Any]]:
+    """The rows of one peer after the other that differ in the entry, and the first of those that differ in others alone."""
+    first: dict[tuple[Any, Any], dict[str, Any]] = {}
+    for row in rows:
+        first.setdefault((row[key], row["peer"]), row)
+    return list(first.values())

@@ -1,0 +1,83 @@
+"""A run as the view takes it: what is known of it at the start, and its slots as they are scored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evedrop.live.network.access import LEGITIMATE
+from evedrop.scenario import Scenario
+from evedrop.score.joined import Slots
+from evedrop.score.scorekeeper import Scored
+
+if TYPE_CHECKING:
+    from evedrop.view.plant_slots import Showing
+    from evedrop.view.recording import Recording
+
+
+def showing_of(scenario: Scenario) -> Showing | None:
+    """Who follows the shown trial of a closed loop."""
+    from evedrop.view.plant_slots import Showing  # noqa: PLC0415 - only with a view
+
+    return Showing.of(scenario)
+
+
+def open_recording(scenario: Scenario, run: str, path: Path) -> Recording:
+    """The run's recording, on disk."""
+    from evedrop.view.plant_slots import driven_scene  # noqa: PLC0415 - only with a view
+    from evedrop.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
+    from evedrop.view.scene import Scene, Shown  # noqa: PLC0415 - the same
+
+    quality = scenario.quality
+    strategies = {name: table.strategy for name, table in scenario.eavesdroppers.items()}
+    receivers = [
+        Shown(
+            name,
+            "legitimate" if name == LEGITIMATE else "eavesdropper",
+            strategies.get(name, scenario.encoding.scheme),
+            quality[name],
+        )
+        for name in scenario.receivers
+    ]
+    scene = Scene(
+        title=scenario.title,
+        run=run,
+        slots=scenario.slots,
+        trials=scenario.trials,
+        n=len(scenario.process.A),
+        pace=scenario.pace,
+        receivers=tuple(receivers),
+        noise=float(np.trace(scenario.process.process.Q)),
+        **driven_scene(scenario),
+    )
+    return Recording(path, scene)
+
+
+def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
+    """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
+
+    around: the reference from which states are deviations, (n,); showing: of a closed loop, who follows the same trial.
+    """
+    from evedrop.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
+    from evedrop.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
+
+    peers = {
+        name: PeerSlots(
+            x_hat=receiver.x_hat[:, :, 0] + around,
+            P=receiver.P[:, :, :, 0],
+            action=receiver.action[:, 0],
+            squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
+            trace=receiver.trace[:, 0] / slots.trials,
+            expected_trace=scored[name].expected,
+        )
+        for name, receiver in slots.receivers.items()
+    }
+    moved = None
+    if showing is not None and slots.inputs is not None:
+        estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
+        moved = showing.take(slots.inputs.u[:, :, 0], estimates)
+    sent = None if slots.sent is None else slots.sent[:, 0]
+    return ShownSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)

@@ -1,0 +1,54 @@
+"""The plot of a sweep: the error of every peer against the first entry, a panel for each combination of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+
+_COLOURS = (BLUE, RED, ORANGE, GREEN, GREY, "#7b3294", "#00a6d6", "#8c564b")
+_MARKS = "osD^vPX*"
+_MOST_PANELS = 6
+
+
+def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
+    """Draw `path`.png and `path`.pdf: simulated errors as marks, theory as lines."""
+    rows = table.to_pylist()
+    others = list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))[:_MOST_PANELS]
+    peers = list(dict.fromkeys(row["peer"] for row in rows))
+    with panels(path, len(others), 1.2 + 4.2 * len(others), 3.9) as axes:
+        for one, values in zip(axes, others, strict=True):
+            for peer, colour, mark in zip(peers, _COLOURS * 8, _MARKS * 8, strict=False):
+                mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
+                x = _positions([row[keys[0]] for row in mine])
+                theory = [row["expected_trace_covariance"] for row in mine]
+                numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
+                one.plot(x, theory, "-" if numbers else "_", color=colour, linewidth=1.2, markersize=26)
+                one.plot(x, [_error(row) for row in mine], mark, color=colour, markerfacecolor="white", label=peer)
+                if not numbers:
+                    one.set_xticks(x, [str(row[keys[0]]) for row in mine])
+                    one.set_xlim(-0.5, len(x) - 0.5)
+            one.set_yscale("log")
+            one.set_xlabel(keys[0])
+            one.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
+        limits = [limit for one in axes for limit in one.get_ylim()]
+        for one in axes:
+            one.set_ylim(min(limits), max(limits))
+        axes[0].set_ylabel("mean error over slots (lines: theory)")
+        axes[0].legend()
+
+
+def _error(row: dict[str, Any]) -> float:
+    found = row["mean_squared_error"]
+    return float(row["mean_actual_trace_covariance"] if found is None else found)
+
+
+def _positions(values: list[Any]) -> list[float]:
+    """Numbers as they are; anything else side by side."""
+    if all(isinstance(value, (int, float)) for value in values):
+        return [float(value) for value in values]
+    return [float(i) for i in range(len(values))]

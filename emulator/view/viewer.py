@@ -1,0 +1,211 @@
+"""The viewer of a run: a window, or a page for browsers; each is fed with the recording, as it is written to disk.
+
+A recording holds the truth, so none goes to a port where anybody could fetch it: a window gets it through a pipe, a browser
+at an address that cannot be guessed. Neither Rerun nor Zenoh is imported here.
+
+Source: docs/view.md, who sees it.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import free_port
+from evedrop.view.growing_recording import Followed, Served, feed
+from evedrop.view.viewer_process import HOST, end, is_apart, spawn
+
+_ATTEMPTS = 3
+_WINDOW = ("--hide-welcome-screen",)
+_NOTHING = f"rerun+http://{HOST}:9/proxy"
+"""What the page would show by itself: with it Rerun serves the page alone, and opens no port for recordings."""
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened here."""
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def choose(mode: str) -> str:
+    """One of "native", "web" and "off", from these or "auto": native with a screen, else web.
+
+    Raises UsageError for any other word, and for "native" without a screen.
+    """
+    if mode == "auto":
+        return "native" if has_screen() else "web"
+    if mode not in {"native", "web", "off"}:
+        raise UsageError(f"--view {mode} is no way to view a run; give auto, native, web or off")
+    if mode == "native" and not has_screen():
+        raise UsageError(
+            "--view native needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; give --view web, and open "
+            "the address it prints in a browser"
+        )
+    return mode
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where browsers find a view: the page at a port, and what it shows at the next one."""
+
+    host: str
+    port: int
+
+    @classmethod
+    def of(cls, text: str) -> Stand:
+        """From HOST:PORT. Raises UsageError if it is none."""
+        host, _, port = text.rpartition(":")
+        try:
+            address, number = ipaddress.IPv4Address(host), int(port)
+        except ValueError:
+            number = 0
+        if not 0 < number < 2**16 - 1:
+            raise UsageError(f"--serve {text} is no address and port; give one such as 127.0.0.1:17450")
+        return cls(str(address), number)
+
+    @property
+    def seen(self) -> str:
+        """The address to type into a browser of this machine."""
+        return HOST if self.host == "0.0.0.0" else self.host  # noqa: S104 - what was asked for
+
+    def check_free(self) -> None:
+        """Raise UsageError if somebody else is there: he would be taken for the viewer."""
+        for port in (self.port, self.port + 1):
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind((self.host, port))
+                except OSError as error:
+                    raise UsageError(
+                        f"--serve {self.host}:{self.port}: {self.host}:{port} cannot be had ({error.strerror}); give another"
+                    ) from error
+
+
+class Viewer:
+    """A running viewer. Final; made by `start` or `serve`.
+
+    It listens on loopback only unless a stand says otherwise, in a session of its own so that Ctrl-C in the terminal does
+    not reach it, and on Linux it dies with the thread that started it, however that ends.
+    """
+
+    def __init__(
+        self, process: subprocess.Popen[bytes], followed: Followed, served: Served | None = None, page: str = ""
+    ) -> None:
+        self._process = process
+        self._followed = followed
+        self._served = served
+        self.address: str | None = None
+        """What to open in a browser; None for a window. Whoever has it sees the truth."""
+        self.warning: str | None = None
+        """What the user should know of who else can get at it."""
+        if served is None and not is_apart(process):
+            self.warning = (
+                "other users of this machine can find the window's port, steer the window and take pictures of what it "
+                "shows, for this system allows it no network of its own; --view web, whose address is a secret, or --view "
+                "off keep it from them (docs/view.md, who sees it)"
+            )
+        if served is not None:
+            host = page.partition(":")[0]
+            data = quote(f"http://{host}:{served.port}{served.path}", safe="")
+            self.address = f"http://{page}/?url={data}"
+
+    @classmethod
+    def start(cls, mode: str, logs: Path, recording: Path, complete: bool = False) -> Viewer | None:
+        """Start one and wait until it is there; None for "off". Its output goes to viewer.log in the folder `logs`.
+
+        mode: "native", "web", "off", or "auto". recording: what to show, from its beginning on and as it grows, be there a
+        file already or not; complete: it does not grow.
+
+        Raises UsageError if it cannot be started.
+        """
+        mode = choose(mode)
+        if mode == "off":
+            return None
+        followed = Followed(recording, complete)
+        for attempt in range(_ATTEMPTS):
+            port = free_port()
+            try:
+                if mode == "web":
+                    return cls._page(followed, HOST, HOST, port, free_port(), logs)
+                return cls._window(followed, port, logs)
+            except UsageError:
+                # Somebody may have taken a port between our look and the viewer's.
+                if attempt == _ATTEMPTS - 1:
+                    raise
+        return None
+
+    @classmethod
+    def serve(cls, stand: Stand, logs: Path, recording: Path, complete: bool = False) -> Viewer:
+        """Start one for browsers, at a place that is known beforehand; the rest as for `start`.
+
+        Raises UsageError if it cannot be started, for one because the place is taken.
+        """
+        stand.check_free()
+        followed = Followed(recording, complete)
+        return cls._page(followed, stand.host, stand.seen, stand.port, stand.port + 1, logs)
+
+    @classmethod
+    def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int, logs: Path) -> Viewer:
+        served = Served(followed, host, data_port)
+        try:
+            process = spawn(port, ["--serve-web", "--web-viewer-port", str(port), _NOTHING], logs, host=host)
+        except BaseException:
+            served.stop()
+            raise
+        return cls(process, followed, served, f"{seen}:{port}")
+
+    @classmethod
+    def _window(cls, followed: Followed, port: int, logs: Path) -> Viewer:
+        arguments = ["--port", str(port), *_WINDOW, "-"]
+        process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
+        assert process.stdin is not None  # noqa: S101 - it was asked for
+        feed(followed, process.stdin)
+        return cls(process, followed)
+
+    def alive(self) -> bool:
+        """Whether it still runs; a window may have been closed."""
+        return self._process.poll() is None
+
+    def wait(self) -> None:
+        """Return when it has ended by itself."""
+        self._process.wait()
+
+    def complete(self) -> None:
+        """The recording is finished; it stays in view."""
+        self._followed.complete()
+
+    def stop(self) -> None:
+        """End it, for certain within seconds. Harmless if it has ended."""
+        self._followed.complete()
+        if self._served is not None:
+            self._served.stop()
+            self._served = None
+        end(self._process)
+
+
+def _screen_is_remote() -> bool:
+    """Whether the screen is reached over the network, as that of `ssh -X` is, which a window apart could not."""
+    display = os.environ.get("DISPLAY", "")
+    return not os.environ.get("WAYLAND_DISPLAY") and not display.startswith((":", "/", "unix:"))
+
+
+def open_run(run: Path, mode: str, stand: Stand | None = None, recording: Path | None = None) -> Viewer:
+    """A viewer with the recording of a results folder, or another of the same run; for browsers, at a stand if there is one.
+
+    Raises UsageError if there is none, or no viewer can be started.
+    """
+    recording = run / "recording.rrd" if recording is None else recording
+    if not recording.is_file():
+        raise UsageError(f"{recording} does not exist; give the results folder of a run made without --view off")
+    if stand is not None:
+        return Viewer.serve(stand, run / "logs", recording, complete=True)
+    viewer = Viewer.start(mode, run / "logs", recording, complete=True)
+    if viewer is None:
+        raise UsageError("a finished run cannot be opened with --view off; give auto, native or web")
+    return viewer

@@ -1,0 +1,168 @@
+"""Rerun's command as a child process of ours. Neither Rerun nor Zenoh is imported here.
+
+Rerun's own ways to start a viewer listen on every interface; its command, told so, does not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+from evedrop.environment import viewer_environment
+from evedrop.errors import UsageError
+from evedrop.results.folder import make_private, private_opener
+
+HOST = "127.0.0.1"
+_START_SECONDS = 20.0
+_STOP_SECONDS = 3.0
+
+# Rerun's settings as we want them: it reports to nobody what is looked at, and writes nothing into the user's home.
+_CONFIG = Path(__file__).with_name("rerun_config")
+
+# A window listens on a port, for whoever would steer it or take pictures of it, and asks nobody who he is. In a network
+# of its own, which has nothing but a loopback, nobody else finds it. Where the system does not allow us one, it goes without.
+_APART = """
+def apart():
+    import fcntl, socket, struct
+    user, group = os.getuid(), os.getgid()
+    if ctypes.CDLL(None).unshare(0x10000000 | 0x40000000):  # CLONE_NEWUSER, CLONE_NEWNET
+        raise OSError
+    for name, text in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
+        with open(f"/proc/self/{name}", "w") as file:
+            file.write(text)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        flags = struct.unpack("16sh14x", fcntl.ioctl(any_socket, 0x8913, struct.pack("16sh14x", b"lo", 0)))[1]
+        fcntl.ioctl(any_socket, 0x8914, struct.pack("16sh14x", b"lo", flags | 1))  # up
+
+def allowed():
+    tried = os.fork()  # half a network would be worse than none
+    if tried == 0:
+        try:
+            apart()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    return os.waitpid(tried, 0)[1] == 0
+
+if allowed():
+    apart()
+"""
+# Ends the viewer together with us, even if we are killed: PR_SET_PDEATHSIG is 1, and survives exec.
+_GUARD = """
+import ctypes, os, signal, sys
+{first}
+ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+os.getppid() == int(sys.argv[1]) or sys.exit(1)
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
+def guarded(command: Sequence[str], apart: bool = False) -> list[str]:
+    """A command that ends with us, on Linux; apart: in a network of its own, if the system allows it."""
+    if sys.platform != "linux":
+        return [*command]
+    guard = _GUARD.format(first=_APART if apart else "")
+    return [sys.executable, "-I", "-S", "-c", guard, str(os.getpid()), *command]
+
+
+def is_apart(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a process has a network of its own, so that nobody can connect to it."""
+    with contextlib.suppress(OSError):
+        return os.readlink(f"/proc/{process.pid}/ns/net") != os.readlink("/proc/self/ns/net")
+    return False
+
+
+def spawn(
+    port: int,
+    arguments: Sequence[str],
+    logs: Path,
+    *,
+    host: str = HOST,
+    stdin: int = subprocess.DEVNULL,
+    apart: bool = False,
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.Popen[bytes]:
+    """Rerun's command with these arguments, on `host` alone; returns when it listens on `port`.
+
+    apart: in a network of its own, if the system allows it.
+
+    Raises UsageError, with the last lines of its log, if it ends before or does not get there in time.
+    """
+    with _log(logs) as log:
+        start = log.tell()
+        process = subprocess.Popen(
+            guarded([str(executable()), "--bind", host, *arguments], apart),
+            bufsize=0,
+            stdin=stdin,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
+        )
+        try:
+            if _listens(process, host, port):
+                return process
+        except BaseException:
+            end(process)
+            raise
+        found = f"ended with status {process.poll()}" if process.poll() is not None else "did not get ready"
+        end(process)
+        log.seek(start)
+        last = log.read().decode(errors="replace").strip().splitlines()[-5:]
+    raise UsageError("\n".join([f"the viewer {found}; give --view off to do without. Its last words:", *last]))
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Terminate a viewer, kill it if it does not listen, and wait for its end."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(_STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+    process.wait()
+
+
+def executable() -> Path:
+    """Rerun's command. Raises UsageError if rerun-sdk is not installed."""
+    found = importlib.util.find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise UsageError("the viewer is not installed; install rerun-sdk, or give --view off")
+    folder = Path(found.origin).parent
+    return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def _listens(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
+    deadline = time.monotonic() + _START_SECONDS
+    while process.poll() is None and time.monotonic() < deadline:
+        if _is_there(process, host, port):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def _is_there(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
+    if is_apart(process):
+        lines = [line.split() for line in Path(f"/proc/{process.pid}/net/tcp").read_text().splitlines()[1:]]
+        return any(local.endswith(f":{port:04X}") and state == "0A" for _, local, _, state, *_ in lines)
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((host, port)) == 0
+
+
+def _log(logs: Path) -> IO[bytes]:
+    """The log file, or a nameless one if a finished run's folder may not be written to."""
+    try:
+        make_private(logs)
+        return open(logs / "viewer.log", "a+b", opener=private_opener)
+    except OSError:
+        return tempfile.TemporaryFile()

@@ -1,0 +1,125 @@
+"""The loop's ends at sensor and legitimate estimator: what they tell the controller, and what they are told by it."""
+
+from __future__ import annotations
+
+from base64 import b64decode
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from evedrop.live.network.resending import Due, Kept
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.closed_loop import known, read_decided
+from evedrop.live.protocol.codec import Reader
+from evedrop.model.input_aware import Informed
+from evedrop.model.local_filter import LocalFilter
+from evedrop.model.plant import Drive, Plant
+from evedrop.model.process import Floats, Trajectory
+from evedrop.model.receiver import Belief, Flags, Receiver
+
+
+def disturbances_in(text: str, slots: int) -> Floats:
+    """The disturbances of a brief, (slots, q)."""
+    return np.frombuffer(b64decode(text), "<f8").reshape(slots, -1)
+
+
+def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> Kept:
+    """An outlet of what is said in decision slots: what is said in one may be needed until the next."""
+    return session.kept(key, brief.flow.window + 1 + period, back=period)
+
+
+class Decided:
+    """What the controller decides, as it comes in every period slots. Final."""
+
+    def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
+        self._period, self._shape = period, shape
+        self._key = session.keys.input
+        self._inbox = session.inbox(self._key)
+        self._due = Due(self._key, patience)
+        self._now: tuple[Floats, Flags]
+
+    def of(self, k: int) -> tuple[Floats, Flags]:
+        """The inputs (m, R) of slot k, and where their decision failed, (R,); slots come in order."""
+        if k % self._period == 0:
+            message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
+            self._now = read_decided(message, k, self._shape)
+        return self._now
+
+
+class Actuator:
+    """The plant at the sensor: what moves its state, and the inputs that it waits for after every slot. Final."""
+
+    def __init__(self, brief: Brief, session: Session) -> None:
+        plant, loop = Plant.of(brief.part["plant"]), brief.part["controller"]
+        self.inputs = 0 if loop is None else plant.inputs
+        """How many are decided."""
+        self._drive = Drive(plant, disturbances_in(brief.part["plant"]["disturbances"], brief.slots))
+        key = brief.stream_keys.get("measurement", b"")
+        measures = plant.output_matrix is not None
+        self._local = LocalFilter(brief.model.process, plant, key, brief.batch) if measures else None
+        self._decided: Decided | None = None
+        self._period = 1
+        self._put = None
+        if loop is not None:
+            self._period = loop["period"]
+            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.longest_outage)
+            self._put = (
+                kept_decisive(session, session.keys.state, brief, self._period) if loop["acts_on"] == "truth" else None
+            )
+
+    def pushed(self, k: int) -> Floats:
+        """What moves the state into slot k, as `Trajectory.advance` takes it."""
+        return self._drive.pushed(k)
+
+    def transmitted(self, k: int, x: Floats, trajectory: Trajectory) -> tuple[Floats, Floats]:
+        """What is transmitted as the state x (n, R) of slot k, and what its innovation is measured against, (n, R)."""
+        if self._local is None:
+            return x, trajectory.predicted
+        return self._local.take(k, x, self.pushed(k)), self._local.predicted
+
+    @property
+    def measures(self) -> bool:
+        """Whether the sensor filters what it measures."""
+        return self._local is not None
+
+    def wait(self, k: int, x: Floats) -> tuple[Floats, Flags] | None:
+        """The inputs of slot k, whose state is x (n, R), and where their decision failed; None without a controller."""
+        if self._decided is None:
+            return None
+        decides = k % self._period == 0
+        if decides and self._put is not None:
+            self._put(k, known("x", k, x))
+        steered = self._decided.of(k)
+        if decides:
+            self._drive.hold(steered[0])
+        return steered
+
+
+class Consultation:
+    """The loop's end at the legitimate estimator: it says its estimate, and may be told the inputs. Final."""
+
+    def __init__(self, brief: Brief, session: Session, receiver: Receiver) -> None:
+        loop: Mapping[str, Any] = brief.part["controller"]
+        self._period = loop["period"]
+        self._put = (
+            kept_decisive(session, session.keys.estimate, brief, self._period)
+            if loop["acts_on"] == "estimate"
+            else None
+        )
+        self._told: tuple[Informed, Decided] | None = None
+        if isinstance(receiver, Informed):
+            shape = (len(loop["plant"]["input_lower"]), brief.trials)
+            self._told = receiver, Decided(session, self._period, shape, brief.flow.longest_outage)
+
+    def before(self, k: int) -> None:
+        """Learn the inputs that led into slot k."""
+        if k > 0 and self._told is not None:
+            receiver, inputs = self._told
+            receiver.learn(k - 1, inputs.of(k - 1)[0])
+
+    def after(self, k: int, belief: Belief) -> None:
+        """Say what is believed after slot k."""
+        if self._put is not None and k % self._period == 0:
+            self._put(k, known("x_hat", k, belief.x_hat))
