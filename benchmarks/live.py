@@ -21,11 +21,11 @@ from processes import Usage, watch
 
 from evedrop.live.launch.briefs import Observation, briefs_of
 from evedrop.live.launch.ports import free_port
-from evedrop.live.network.access import LEGITIMATE, ROUTER, SENSOR
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.packets import uplink
+from evedrop.names import LEGITIMATE, ROUTER, SENSOR
 from evedrop.scenario import load
 
 RECEIVERS = 4

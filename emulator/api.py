@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.errors import UsageError
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import GENIE_SCHEMES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
+from evedrop.names import LEGITIMATE
 from evedrop.results.folder import results_folder
 from evedrop.results.writer import Results, load_results
 from evedrop.scenario import Scenario, checked, load

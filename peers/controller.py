@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 
-from evedrop.live.network.access import CONTROLLER
 from evedrop.live.network.reporting import DecisionReporter
 from evedrop.live.network.resending import Due
 from evedrop.live.network.session import Session
@@ -14,6 +13,7 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.controllers.controller import Assignment
 from evedrop.model.plant import Plant
+from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import disturbances_in, kept_decisive
 
 

@@ -6,7 +6,6 @@ import time
 from collections.abc import Collection
 
 from evedrop.errors import RunError
-from evedrop.live.network.access import OBSERVER, SENSOR
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import Due, Kept
@@ -21,6 +20,7 @@ from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Encoder, Packet, Scheme
+from evedrop.names import OBSERVER, SENSOR
 from evedrop.peers.closed_loop import Actuator
 
 _PROGRESS_BYTES = 16 * 2**20  # of one follower: far more than are ever under way

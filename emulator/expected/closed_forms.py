@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.acknowledgements import rates_of
 from evedrop.model.outcomes import closed_form
 from evedrop.model.process import Floats, Process
@@ -19,6 +18,7 @@ from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_forms import SensorChain, encrypted_schedule, reference_covariances, scheduled
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
 Split = tuple[float, float]

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from evedrop.expected.expectations import expectations_of
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.local_filter import settled
 from evedrop.model.theory.covariances import stability_bound
+from evedrop.names import LEGITIMATE
 from evedrop.plugins import sources_of
 from evedrop.scenario import Scenario
 from evedrop.scenario.filter_noise import is_singular

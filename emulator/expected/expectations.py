@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 
 from evedrop.expected.closed_forms import Closed, ClosedStream, closed_of
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model import modulated
 from evedrop.model.outcomes import GENIE_SCHEMES, eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Floats, Process
@@ -18,6 +17,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
 

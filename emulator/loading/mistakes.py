@@ -15,7 +15,6 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from evedrop.files import Unreadable, contents
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.outcomes import closed_form, eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Process
@@ -24,6 +23,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Course
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.horizon import horizon
+from evedrop.names import LEGITIMATE
 from evedrop.scenario.across import acknowledgement_mistakes, away_in, event_mistakes, link_mistakes
 from evedrop.scenario.closed_loop import loop_mistakes
 from evedrop.scenario.events import EventTable

@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from evedrop.live.launch.briefs import StreamKeys
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.digest import Digests, InputLog
 from evedrop.model.input_aware import Informed
 from evedrop.model.plant import Drive
 from evedrop.model.process import Floats, Trajectory
 from evedrop.model.receiver import Receiver
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
 from evedrop.score.closed_loop_tally import SolveTimes

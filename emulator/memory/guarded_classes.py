@@ -17,7 +17,6 @@ from evedrop.conformance.packets import expect_belief, expect_packet
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.rules import Broken, expect_array, expect_finite
 from evedrop.errors import EvedropError, RunError
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.links import LOSS_MODELS
@@ -26,6 +25,7 @@ from evedrop.model.registry import place_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Course, Fates
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.dry_run import foreign
 from evedrop.streams import Batch

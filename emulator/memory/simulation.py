@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.live.launch.briefs import StreamKeys
-from evedrop.live.network.access import CONTROLLER, LEGITIMATE
 from evedrop.memory.attendance import Attendance
 from evedrop.memory.closed_loop import Loop, Source, informed
 from evedrop.memory.guarded_classes import Guard
@@ -34,6 +33,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Encoder, Packet
 from evedrop.model.slot.link import Fates, Link
 from evedrop.model.theory.covariances import misled_covariances
+from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import look_in
 from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Acknowledging

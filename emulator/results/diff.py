@@ -9,8 +9,8 @@ from itertools import pairwise
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from evedrop.live.network.access import CONTROLLER
 from evedrop.model.digest import BLOCK_SLOTS
+from evedrop.names import CONTROLLER
 from evedrop.results.writer import Results
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")

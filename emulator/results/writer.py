@@ -16,13 +16,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from evedrop.live.network.access import CONTROLLER
 from evedrop.live.protocol.codec import packed_flags
 from evedrop.model.digest import Digests
 from evedrop.model.links.link import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.names import CONTROLLER
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish, write_figures
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.input_table import input_columns, inputs_schema

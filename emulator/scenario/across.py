@@ -11,8 +11,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.schemes import SCHEMES
+from evedrop.names import LEGITIMATE
 from evedrop.scenario.events import EventTable
 from evedrop.scenario.link_table import LinkTable, changed_link
 from evedrop.scenario.timeline import Act, acts_of

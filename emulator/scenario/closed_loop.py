@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from evedrop.kernels.elementary import semidefinite_factor
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.controllers import CONTROLLERS
+from evedrop.names import LEGITIMATE
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.table import numbers

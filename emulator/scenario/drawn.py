@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from evedrop.kernels.elementary import log
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER
+from evedrop.names import LEGITIMATE
 from evedrop.scenario.across import Sentences
 from evedrop.scenario.link_table import changed_link
 from evedrop.scenario.nemesis import FAULTS, NEMESIS, NemesisTable

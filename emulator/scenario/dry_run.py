@@ -15,7 +15,6 @@ from evedrop.conformance.links import DelayChecks, LossChecks
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.rules import how_broken
 from evedrop.conformance.schemes import SchemeChecks
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.answers import NoAnswer
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
@@ -23,6 +22,7 @@ from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
+from evedrop.names import LEGITIMATE
 from evedrop.plugins import names_in
 from evedrop.scenario.table import model_mistakes
 from evedrop.scenario.tables import EavesdropperTable, Scenario

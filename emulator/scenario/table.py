@@ -17,8 +17,8 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from evedrop.live.network.access import RESERVED
 from evedrop.model.registry import NotRegistered, Registry, asked
+from evedrop.names import RESERVED
 from evedrop.scenario.words import as_toml, listed, near
 
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")

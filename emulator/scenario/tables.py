@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, ConfigDict, Field
 
-from evedrop.live.network.access import CONTROLLER, LEGITIMATE
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import ANSWERS, READERS, STRATEGIES
@@ -20,6 +19,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.registry import asked, is_own
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link import Course
+from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
 from evedrop.scenario.events import EventTable
 from evedrop.scenario.expect import ExpectTable

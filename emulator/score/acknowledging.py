@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.acknowledgements import WayBack, rates_of
 from evedrop.model.numeric.detection import Chart, Watch, chart_for
 from evedrop.model.receiver import Flags
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.streams import Batch
 

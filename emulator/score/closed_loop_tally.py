@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.model.input_aware import Offset
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.score.household_tally import HouseholdTally
 from evedrop.score.joined import InputSlots

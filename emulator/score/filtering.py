@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.live.network.access import SENSOR
 from evedrop.model.local_filter import LocalFilter, Steps
 from evedrop.model.process import Floats
+from evedrop.names import SENSOR
 from evedrop.scenario import Scenario
 from evedrop.score.sums import squared_errors
 from evedrop.streams import Batch

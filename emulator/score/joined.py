@@ -10,7 +10,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.network.access import CONTROLLER, ROUTER, SENSOR
 from evedrop.live.protocol.closed_loop import read_decisions
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
@@ -19,6 +18,7 @@ from evedrop.model.links.link import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.slot.account import Account
+from evedrop.names import CONTROLLER, ROUTER, SENSOR
 
 Message = TypeVar("Message")
 

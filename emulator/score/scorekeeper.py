@@ -15,9 +15,9 @@ import numpy as np
 import tomli_w
 
 from evedrop.expected.expectations import expectations_of
-from evedrop.live.network.access import CONTROLLER, LEGITIMATE
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
+from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import sources_of
 from evedrop.recordings.disturbance_file import disturbances_text
 from evedrop.results.folder import write_private

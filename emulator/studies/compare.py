@@ -26,7 +26,6 @@ import pyarrow as pa
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.expected.expectations import Expectation, expectations_of
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.memory.montecarlo import Merger, News, Plan, results_of, said_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
@@ -34,6 +33,7 @@ from evedrop.model.process import MARGINAL, Floats
 from evedrop.model.schemes import scheme_of
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import state_covariances
+from evedrop.names import LEGITIMATE
 from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
 from evedrop.results.writer import plain
 from evedrop.scenario import Scenario

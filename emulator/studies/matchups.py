@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.live.network.access import LEGITIMATE
 from evedrop.loading.mistakes import lacking_streams
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario, checked
 from evedrop.scenario.words import listed, near
 

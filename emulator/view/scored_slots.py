@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evedrop.live.network.access import LEGITIMATE
+from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.score.joined import Slots
 from evedrop.score.scorekeeper import Scored

@@ -13,16 +13,6 @@ from evedrop.files import Unreadable, contents
 from evedrop.live.launch.closed_loop_briefs import LoopBriefs
 from evedrop.live.launch.ports import Places, places_at
 from evedrop.live.launch.routers import Routers, identities_of
-from evedrop.live.network.access import (
-    ACKNOWLEDGEMENTS,
-    CONTROLLER,
-    LEGITIMATE,
-    OBSERVER,
-    OPERATOR,
-    RELAY,
-    ROUTER,
-    SENSOR,
-)
 from evedrop.live.protocol.brief import Brief, Flow, Model
 from evedrop.live.protocol.message_limits import Sizes
 from evedrop.model.answers import NoAnswer
@@ -30,6 +20,7 @@ from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.account import COUNTED_BURSTS
 from evedrop.model.slot.link import Course, streams_of
+from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 from evedrop.plugins import named_in
 from evedrop.results.folder import new_folder
 from evedrop.scenario import Scenario

@@ -19,8 +19,8 @@ from typing import Any
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.network.access import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.live.protocol.brief import Brief
+from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
 from evedrop.signals import held_back

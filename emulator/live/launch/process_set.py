@@ -20,8 +20,8 @@ from evedrop.live.launch.briefs import Observation, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit, News
 from evedrop.live.launch.ports import Places
 from evedrop.live.launch.private_folder import private_folder
-from evedrop.live.network.access import OBSERVER
 from evedrop.live.network.control_file import remove_control
+from evedrop.names import OBSERVER
 from evedrop.results.folder import make_private, new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.live.launch.ports import Meeting, Places
-from evedrop.live.network.access import RELAY, ROUTER, SENSOR
 from evedrop.live.protocol.brief import Identity
+from evedrop.names import RELAY, ROUTER, SENSOR
 
 
 @dataclass(frozen=True)

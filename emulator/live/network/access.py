@@ -11,16 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-SENSOR = "sensor"
-LEGITIMATE = "legitimate"
-ROUTER = "router"
-OBSERVER = "observer"
-OPERATOR = "operator"
-CONTROLLER = "controller"
-ACKNOWLEDGEMENTS = "acknowledgements"
-"""No process: the name of their way back, whose random stream is `link/acknowledgements`."""
-RELAY = "relay"
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
+from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 
 
 @dataclass(frozen=True)

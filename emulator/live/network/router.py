@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.live.network.access import ACKNOWLEDGEMENTS, LEGITIMATE, Wiring, access_control, grants
+from evedrop.live.network.access import Wiring, access_control, grants
 from evedrop.live.network.delayed_sender import Postman
 from evedrop.live.network.linked_routers import at_router
 from evedrop.live.network.resending import Due
@@ -48,6 +48,7 @@ from evedrop.model.registry import NotRegistered
 from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
 from evedrop.model.slot.link import Change, Course, Fates, Link, streams_of
 from evedrop.model.slot.transit import Late, Transit
+from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE
 
 
 class Downlink:

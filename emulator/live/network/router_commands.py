@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 
 from evedrop.errors import EvedropError
-from evedrop.live.network.access import ROUTER
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader
+from evedrop.names import ROUTER
 
 
 class Anew(Exception):

@@ -22,7 +22,7 @@ from typing import Any, Protocol, Self
 import zenoh
 
 from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
-from evedrop.live.network.access import OBSERVER, ROUTER, Keys, reader_of
+from evedrop.live.network.access import Keys, reader_of
 from evedrop.live.network.connecting import Door, Waiting, connected, endpoint_of
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.container_heartbeat import Heartbeat
@@ -36,6 +36,7 @@ from evedrop.live.protocol.codec import Reader, over, refusal
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.whereabouts import Place
+from evedrop.names import OBSERVER, ROUTER
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004

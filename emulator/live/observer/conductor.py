@@ -9,11 +9,11 @@ from queue import Empty, SimpleQueue
 from typing import Any, NoReturn
 
 from evedrop.errors import Interrupted, RunError
-from evedrop.live.network.access import OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.live.network.declared import Question
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, control, is_over, progress, read_over
+from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 
 _AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
 _ABANDON_SECONDS = 2.0  # for who is told to go

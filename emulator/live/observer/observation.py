@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from evedrop.errors import EvedropError, Interrupted, MalformedMessage, RunError
 from evedrop.live.launch.shard_score import leave
-from evedrop.live.network.access import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
 from evedrop.live.network.operator import Answer, read_request
@@ -33,6 +32,7 @@ from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.answers import NoAnswer
 from evedrop.model.digest import Blocks
+from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.rows import DigestRows, write_rows
 from evedrop.results.summary_file import unwritten

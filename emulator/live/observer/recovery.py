@@ -14,10 +14,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from evedrop.live.network.access import OBSERVER, RELAY, ROUTER
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
+from evedrop.names import OBSERVER, RELAY, ROUTER
 
 _SOON_SECONDS = 0.5  # after which a round is repeated that had no effect, and twice as long each time
 _IDLE_SECONDS = 10.0  # for which a run may come to a stand without a reason before a round is tried

@@ -14,8 +14,9 @@ from collections.abc import Callable, Collection, Mapping
 from typing import final
 
 from evedrop.errors import Silence
-from evedrop.live.network.access import OBSERVER, writer_of
+from evedrop.live.network.access import writer_of
 from evedrop.live.protocol.whereabouts import Whereabouts
+from evedrop.names import OBSERVER
 
 _LEAST_SECONDS = 5.0  # a busy machine may not let a process work for some seconds
 _LOOK_SECONDS = 0.25

@@ -14,12 +14,12 @@ from collections.abc import Callable
 from typing import Any
 
 from evedrop.errors import RunError, ScenarioError
-from evedrop.live.network.access import ROUTER, SENSOR
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import Order, Step
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
+from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
 from evedrop.scenario.timeline import Act, acts_of
 

@@ -14,10 +14,10 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import Contradiction
-from evedrop.live.network.access import ROUTER, SENSOR
 from evedrop.live.protocol.telemetry import Extent, Report
 from evedrop.model.digest import Blocks, PartialDigests
 from evedrop.model.receiver import Action, Belief, trace_of
+from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
 from evedrop.score.joined import ReceiverSlots, Slots
 

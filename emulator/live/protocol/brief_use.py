@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from evedrop.errors import BriefError
-from evedrop.live.network.access import ACKNOWLEDGEMENTS
 from evedrop.live.protocol.brief import Brief
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS, Assignment
@@ -22,6 +21,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.registry import NotRegistered
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link import Course, Link, streams_of
+from evedrop.names import ACKNOWLEDGEMENTS
 
 _WRITE_AGAIN = "write it again with `evedrop brief`"
 
