@@ -16,7 +16,7 @@ from pathlib import Path
 
 from evedrop import compare
 from evedrop.expected.expectations import expectations_of
-from evedrop.live.launch.briefs import StreamKeys
+from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -24,7 +24,8 @@ from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Heard
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import Link
-from evedrop.scenario import Scenario, load
+from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import Batch
 
 MARGINAL = "bayesian"

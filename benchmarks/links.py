@@ -20,8 +20,8 @@ from typing import Any
 import tomli_w
 from processes import watch
 
+from evedrop.loading import shipped
 from evedrop.model.links import LOSS_MODELS, loss_of
-from evedrop.scenario import shipped
 from evedrop.streams import Batch, BlockReader, root_of_seed, stream_key
 
 WALK = [[0, 120.0, 0.0], [100_000, -60.0, 200.0]]

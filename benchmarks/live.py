@@ -20,13 +20,13 @@ import raw
 from processes import Usage, watch
 
 from evedrop.live.launch.briefs import Observation, briefs_of
-from evedrop.live.launch.ports import free_port
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.packets import uplink
+from evedrop.loading import load
 from evedrop.names import LEGITIMATE, ROUTER, SENSOR
-from evedrop.scenario import load
+from evedrop.ports import free_port
 
 RECEIVERS = 4
 

@@ -25,10 +25,11 @@ from unittest.mock import patch
 
 import numpy as np
 
+from evedrop.loading import checked
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.digest import DIGEST_BYTES, BeliefLog
-from evedrop.scenario import Scenario, checked
+from evedrop.scenario import Scenario
 from evedrop.streams import Batch, BlockReader
 from evedrop.studies.sweep import sweep_over
 

@@ -17,7 +17,7 @@ import msgpack
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from evedrop.live.launch.ports import free_port
+from evedrop.ports import free_port
 
 _KEY = "raw/uplink"
 

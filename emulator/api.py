@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.errors import UsageError
+from evedrop.loading import checked, load
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import GENIE_SCHEMES
 from evedrop.model.schemes import SCHEMES
@@ -16,7 +17,7 @@ from evedrop.model.slot.link_law import law_of
 from evedrop.names import LEGITIMATE
 from evedrop.results.folder import results_folder
 from evedrop.results.writer import Results, load_results
-from evedrop.scenario import Scenario, checked, load
+from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:

@@ -136,3 +136,19 @@ class Interrupted(EvedropError):
     """The user ended the run."""
 
     exit_status = 130
+
+
+class NoAnswer(Exception):
+    """A class raised an error when it was asked, answered what is no answer, or not at all; the text says which."""
+
+
+class NotRegistered(KeyError):
+    """A name that stands for no class. `why` goes on after `is "NAME"`; empty if it is no name of anybody's own."""
+
+    def __init__(self, name: str, why: str = "") -> None:
+        super().__init__(name)
+        self.name = name
+        self.why = why
+
+    def __str__(self) -> str:
+        return f"{self.name}{self.why or ' is no name of a class; look at docs/your-own.md'}"

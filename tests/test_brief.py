@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from evedrop.errors import BriefError
-from evedrop.live.launch.briefs import Observation, StreamKeys, briefs_of
+from evedrop.live.launch.briefs import Observation, briefs_of
 from evedrop.live.protocol.brief import Brief, Flow, Model, read_brief
 from evedrop.live.protocol.brief_use import expect_usable
-from evedrop.scenario import Scenario, load
+from evedrop.loading import load
+from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
 
 BRIEF = Brief(

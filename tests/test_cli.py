@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.loading import load, shipped
 from evedrop.results.writer import load_results
-from evedrop.scenario import load, shipped
 from tests.conftest import Done, Evedrop
 
 QUICK = ("--slots", "40", "--view", "off")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.discovery import is_scenario, scenarios_in
-from evedrop.scenario import shipped
+from evedrop.loading import shipped
 from evedrop.studies.scenario_tests import scenarios_of
 
 SCENARIO = shipped()["eavesdroppers"].read_text(encoding="utf-8")

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
+from evedrop.loading import checked
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import NEVER
-from evedrop.scenario import Scenario, checked
+from evedrop.scenario import Scenario
 
 
 def tables(*events: dict[str, Any], **more: Any) -> dict[str, Any]:

@@ -9,7 +9,8 @@ import pytest
 import tomli_w
 
 from evedrop.errors import ScenarioError
-from evedrop.scenario import Scenario, parse
+from evedrop.loading import parse
+from evedrop.scenario import Scenario
 
 GOOD: dict[str, Any] = {
     "title": "A vehicle",

@@ -25,10 +25,10 @@ from evedrop.fitting.delays import delay_candidates
 from evedrop.fitting.fit import fit
 from evedrop.fitting.hidden import TwoStates, _Chunks, log_likelihood
 from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
+from evedrop.loading import load
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.recordings.link_recording import Outcomes
-from evedrop.scenario import load
 from tests.conftest import Evedrop
 
 BERNOULLI = {"model": "bernoulli", "quality": 0.9}

@@ -18,10 +18,10 @@ import pytest
 
 from evedrop.errors import EvedropError, ScenarioError, UsageError
 from evedrop.files import Limit, Unreadable, contents, lines_of
+from evedrop.loading import load, parse
 from evedrop.model.process import MOST_STATES, Process
 from evedrop.model.theory.horizon import horizon
 from evedrop.results.folder import claimed, default_folder
-from evedrop.scenario import load, parse
 from tests.conftest import Evedrop
 
 BASE = """

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from evedrop.api import montecarlo, run
 from evedrop.errors import ScenarioError
+from evedrop.loading import checked, load
 from evedrop.model.slot.link import NEVER
-from evedrop.scenario import Scenario, checked, load
-from evedrop.score.scorekeeper import write_resolved
+from evedrop.results.resolved_scenario import write_resolved
+from evedrop.scenario import Scenario
 
 NEMESIS: dict[str, Any] = {"faults": ["kill", "pause", "cut"], "every": 20, "lasting": 8}
 LOOP: dict[str, Any] = {

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.scenario import Scenario, checked, load
+from evedrop.loading import checked, load
+from evedrop.results.resolved_scenario import write_resolved
+from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
-from evedrop.score.scorekeeper import write_resolved
 
 LOOP: dict[str, Any] = {
     "title": "Loop",

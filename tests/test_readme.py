@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.scenario import load, parse
+from evedrop.loading import load, parse
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

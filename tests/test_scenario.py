@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.expected.estimates import warnings_of
-from evedrop.scenario import Scenario, load, parse, shipped, value_of, write_new
-from evedrop.score.scorekeeper import resolved, write_resolved
+from evedrop.loading import load, parse, shipped, value_of, write_new
+from evedrop.results.resolved_scenario import resolved, write_resolved
+from evedrop.scenario import Scenario
 
 GOOD: dict[str, Any] = {
     "title": "A vehicle",

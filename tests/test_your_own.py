@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
+from evedrop.loading import load
 from evedrop.loading.amended import with_event
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.writer import load_results
-from evedrop.scenario import load
 from tests.conftest import Evedrop
 
 PAGE = Path(__file__).parents[1] / "docs" / "your-own.md"

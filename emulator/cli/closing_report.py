@@ -10,8 +10,8 @@ from pathlib import Path
 
 from evedrop.cli.report import print_summary
 from evedrop.errors import UsageError
+from evedrop.loading import load
 from evedrop.results.writer import load_results
-from evedrop.scenario import load
 
 
 def print_results(folder: Path, as_json: bool = False) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def _changes(options: argparse.Namespace) -> dict[str, Any]:
-    from evedrop.scenario import value_of
+    from evedrop.loading import value_of
 
     changes: dict[str, Any] = {}
     for change in options.changes:
@@ -45,7 +45,7 @@ def list_scenarios(_: argparse.Namespace) -> int:
     """A line for each shipped scenario, also for those that need an extra which is not there."""
     import tomllib
 
-    from evedrop.scenario import shipped
+    from evedrop.loading import shipped
 
     scenarios = shipped()
     width = max(map(len, scenarios)) + 2
@@ -56,7 +56,7 @@ def list_scenarios(_: argparse.Namespace) -> int:
 
 def new(options: argparse.Namespace) -> int:
     """Write the commented scenario."""
-    from evedrop.scenario import write_new
+    from evedrop.loading import write_new
 
     write_new(options.file)
     print(f"{options.file} written; change it, then: evedrop run {options.file}")
@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
 def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
     """The scenario of a command, with its changes; warnings are printed."""
     from evedrop.expected.estimates import warnings_of
-    from evedrop.scenario import load
+    from evedrop.loading import load
 
     scenario = load(options.scenario, _changes(options), beyond_horizon=beyond_horizon)
     for warning in warnings_of(scenario):
@@ -183,9 +183,9 @@ def compare(options: argparse.Namespace) -> int:
     from evedrop.api import compare as compare_all
     from evedrop.cli.comparison_report import print_comparison
     from evedrop.cli.report import ProgressLine
+    from evedrop.loading import value_of
     from evedrop.memory.montecarlo import Plan
     from evedrop.results.folder import results_folder
-    from evedrop.scenario import value_of
 
     changes = _changes(options)
     parameters = {}
@@ -330,7 +330,7 @@ def test(options: argparse.Namespace) -> int:
 def check(options: argparse.Namespace) -> int:
     """Validate scenarios, or classes."""
     from evedrop.expected.estimates import warnings_of
-    from evedrop.scenario import load
+    from evedrop.loading import load
 
     names = {kind: name for kind in ("scheme", "eavesdropper", "link", "delay") if (name := getattr(options, kind))}
     if bool(names) == bool(options.scenarios):

@@ -10,13 +10,11 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
-from evedrop.studies.compare import Kept
+from evedrop.score.kept import MARKS, Kept
 
 if TYPE_CHECKING:
     from evedrop.studies.compare import Cell, Comparison, Measured
 
-MARKS = {Kept.PERFECT: "●", Kept.RELATIVE: "◐", Kept.UNDECIDED: "?", Kept.BROKEN: "✕"}
-"""Verdicts as marks that can be told apart without colours."""
 WORDS = {Kept.PERFECT: "perfect", Kept.RELATIVE: "relative", Kept.UNDECIDED: "too few", Kept.BROKEN: "broken"}
 """And in a word each."""
 

@@ -60,8 +60,8 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: Brief, serve: str | None) -> int:
     """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    from evedrop.errors import NotRegistered
     from evedrop.live.protocol.brief_use import expect_usable
-    from evedrop.model.registry import NotRegistered
 
     if brief.identity is not None:
         from evedrop.live.network.certificates import check_identity

@@ -116,7 +116,7 @@ def _event(name: str, words: list[str]) -> dict[str, Any]:
 
 def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     """Put a value at a dotted key, of tables that are made on the way."""
-    from evedrop.scenario import value_of
+    from evedrop.loading import value_of
 
     *tables, last = dotted.split(".")
     inner = changes

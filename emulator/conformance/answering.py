@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.errors import NotRegistered
 from evedrop.model import eavesdroppers
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from evedrop.model.process import Process
-from evedrop.model.registry import NotRegistered, Registry, asked, place_of
+from evedrop.model.registry import Registry, asked, place_of
 from evedrop.plugins import look_in
 from evedrop.streams import Batch
 

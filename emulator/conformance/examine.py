@@ -14,11 +14,11 @@ from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
 from evedrop.conformance.links import DelayChecks, LossChecks
 from evedrop.conformance.rules import Broken, Verdict, calling
 from evedrop.conformance.schemes import scheme_verdicts
-from evedrop.errors import UsageError
+from evedrop.errors import NotRegistered, UsageError
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS
-from evedrop.model.registry import NotRegistered, Registry, asked
+from evedrop.model.registry import Registry, asked
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.plugins import look_in
 

@@ -1,1 +1,8 @@
-"""A scenario file, read and checked."""
+"""A scenario file, read and checked: all its mistakes are reported at once.
+
+Source: docs/scenario.md.
+"""
+
+from evedrop.loading.file import checked, load, parse, read, shipped, value_of, write_new
+
+__all__ = ["checked", "load", "parse", "read", "shipped", "value_of", "write_new"]

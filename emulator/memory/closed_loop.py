@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evedrop.live.launch.briefs import StreamKeys
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.digest import Digests, InputLog
 from evedrop.model.input_aware import Informed
@@ -20,9 +19,10 @@ from evedrop.model.receiver import Receiver
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.score.filtering import local_filter_of
-from evedrop.score.joined import InputSlots
+from evedrop.score.slots import InputSlots
 from evedrop.streams import Batch
 
 

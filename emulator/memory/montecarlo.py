@@ -27,12 +27,13 @@ from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes import scheme_of
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.histogram import SlotHistograms
-from evedrop.score.joined import concatenated
-from evedrop.score.scorekeeper import Ending, events_of, summary_of, write_resolved
+from evedrop.score.scorekeeper import Ending, events_of, summary_of
+from evedrop.score.slots import concatenated
 from evedrop.score.sums import SlotSums, squared_errors
 from evedrop.score.totals import Totals
 from evedrop.signals import stop_on_signals

@@ -18,7 +18,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.launch.briefs import StreamKeys
 from evedrop.memory.attendance import Attendance
 from evedrop.memory.closed_loop import Loop, Source, informed
 from evedrop.memory.guarded_classes import Guard
@@ -36,10 +35,11 @@ from evedrop.model.theory.covariances import misled_covariances
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import look_in
 from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.acknowledging import Acknowledging
 from evedrop.score.closed_loop_tally import Acted, SolveTimes
 from evedrop.score.filtering import true_errors
-from evedrop.score.joined import ReceiverSlots, Slots
+from evedrop.score.slots import ReceiverSlots, Slots
 from evedrop.score.sums import squared_errors
 from evedrop.streams import Batch
 

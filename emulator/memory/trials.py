@@ -20,7 +20,7 @@ from evedrop.model.process import Floats
 from evedrop.model.slot.account import Accountant
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import SlotHistograms
-from evedrop.score.joined import Slots
+from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums, slot_sums
 from evedrop.score.totals import Totals
 

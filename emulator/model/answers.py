@@ -24,15 +24,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from evedrop.errors import NoAnswer
+
 _SECONDS = 60.0  # for an answer; a class may import much
 _MOST_BYTES = 2**20  # of an answer
 _MODULE = "evedrop.conformance.answering"
 # Libraries that are not where the system looks for them; nothing else of our environment.
 _NEEDED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH", "PYTHONHOME")
-
-
-class NoAnswer(Exception):
-    """A class raised an error when it was asked, answered what is no answer, or not at all; the text says which."""
 
 
 class Answers:
@@ -54,7 +52,7 @@ class Answers:
 
         Raises NotRegistered if the name stands for no class, NoAnswer if it has no answer.
         """
-        from evedrop.model.registry import NotRegistered  # noqa: PLC0415 - the registries ask us
+        from evedrop.errors import NotRegistered  # noqa: PLC0415 - the registries ask us
 
         question = json.dumps([name, do, *given], default=str)
         with self._lock:

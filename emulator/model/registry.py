@@ -15,24 +15,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from evedrop.model.answers import NoAnswer
+from evedrop.errors import NoAnswer, NotRegistered
 
 T = TypeVar("T")
 
 _OWN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _NOT_IN_CHILDREN = "__main__"
-
-
-class NotRegistered(KeyError):
-    """A name that stands for no class. `why` goes on after `is "NAME"`; empty if it is no name of anybody's own."""
-
-    def __init__(self, name: str, why: str = "") -> None:
-        super().__init__(name)
-        self.name = name
-        self.why = why
-
-    def __str__(self) -> str:
-        return f"{self.name}{self.why or ' is no name of a class; look at docs/your-own.md'}"
 
 
 def is_own(name: object) -> bool:

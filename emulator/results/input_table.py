@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evedrop.files import opened
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
-from evedrop.score.joined import Slots
+from evedrop.score.slots import Slots
 
 
 def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:

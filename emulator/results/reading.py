@@ -165,7 +165,7 @@ def _cut_short(folder: Path) -> dict[str, Any]:
 def _no_figures(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
     # The others need neither theory nor scenario to read results.
-    from evedrop.scenario import load  # noqa: PLC0415
+    from evedrop.loading import load  # noqa: PLC0415
     from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
     from evedrop.score.totals import Totals  # noqa: PLC0415
 

@@ -8,8 +8,8 @@ from typing import final
 
 from evedrop.model.digest import Digests
 from evedrop.results.writer import ResultsWriter
-from evedrop.score.joined import Slots
 from evedrop.score.scorekeeper import Scored
+from evedrop.score.slots import Slots
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from evedrop.live.protocol.codec import packed_flags
 from evedrop.model.digest import Digests
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
@@ -32,7 +32,7 @@ from evedrop.results.tables import ACTIONS, DIGESTS, JOURNAL, NULLABLE, SENT, SL
 from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
 from evedrop.score.histogram import LEVELS
-from evedrop.score.joined import Slots
+from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums
 
 _ROUND_SECONDS = 3.0  # at the longest from one round to the next: what a killed writer loses

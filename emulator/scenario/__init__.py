@@ -1,9 +1,8 @@
-"""The scenario: its tables, its file, its mistakes. All mistakes are reported at once.
+"""The scenario: its tables and events, and the checks across them.
 
 Source: docs/scenario.md.
 """
 
-from evedrop.loading.file import checked, load, parse, read, shipped, value_of, write_new
 from evedrop.scenario.expect import FIGURES, ExpectTable, link_figure
 from evedrop.scenario.tables import SECRET_BYTES, Scenario
 
@@ -12,12 +11,5 @@ __all__ = [
     "SECRET_BYTES",
     "ExpectTable",
     "Scenario",
-    "checked",
     "link_figure",
-    "load",
-    "parse",
-    "read",
-    "shipped",
-    "value_of",
-    "write_new",
 ]

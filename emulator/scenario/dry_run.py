@@ -15,7 +15,7 @@ from evedrop.conformance.links import DelayChecks, LossChecks
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.rules import how_broken
 from evedrop.conformance.schemes import SchemeChecks
-from evedrop.model.answers import NoAnswer
+from evedrop.errors import NoAnswer
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS, loss_of

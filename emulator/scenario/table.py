@@ -17,7 +17,8 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from evedrop.model.registry import NotRegistered, Registry, asked
+from evedrop.errors import NotRegistered
+from evedrop.model.registry import Registry, asked
 from evedrop.names import RESERVED
 from evedrop.scenario.words import as_toml, listed, near
 

@@ -19,7 +19,7 @@ from evedrop.model.receiver import Codes
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.score.household_tally import HouseholdTally
-from evedrop.score.joined import InputSlots
+from evedrop.score.slots import InputSlots
 
 ESTIMATORS = ("ignoring_input", "knowing_input")
 

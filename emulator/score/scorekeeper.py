@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
-import os
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomli_w
 
 from evedrop.expected.expectations import expectations_of
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
-from evedrop.plugins import sources_of
-from evedrop.recordings.disturbance_file import disturbances_text
-from evedrop.results.folder import write_private
 from evedrop.scenario import Scenario
 from evedrop.score.channel import channel_of
 from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
-from evedrop.score.joined import Slots
+from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
 from evedrop.score.verified import verification_of
 
 _ENOUGH_TO_SURPRISE = 10  # trials
-DISTURBANCES = "disturbances.csv"
-"""Of a results folder whose scenario has some."""
 
 
 class Scored(NamedTuple):
@@ -220,34 +210,3 @@ def events_of(scenario: Scenario, done: int) -> list[dict[str, Any]]:
 def event_line(event: Mapping[str, Any]) -> str:
     """An event of the summary as a line of the view."""
     return event["event"] if event["by"] == "scenario" else f"{event['event']} (by the {event['by']})"
-
-
-def write_resolved(folder: Path, scenario: Scenario) -> None:
-    """Write the scenario.toml of a results folder, and the disturbances that it names, each whole at any moment."""
-    texts = {"scenario.toml": resolved(scenario)}
-    plant = scenario.plant
-    if plant is not None and plant.disturbance_values:
-        texts = {
-            DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values),
-            **texts,
-        }
-    for name, text in texts.items():
-        unfinished = folder / f"{name}.new"
-        write_private(unfinished, text)
-        os.replace(unfinished, folder / name)
-
-
-def resolved(scenario: Scenario) -> str:
-    """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
-    tables = scenario.model_dump(mode="json", exclude_none=True)
-    if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
-        tables["plant"]["disturbance_file"] = DISTURBANCES
-    if scenario.secret_file is not None:
-        tables["secret_file"] = str(Path(scenario.secret_file).absolute())
-    tables["made_with"] = {
-        "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
-        **sources_of(tables),
-    }
-    text: str = tomli_w.dumps(tables)
-    return text

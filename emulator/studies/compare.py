@@ -17,7 +17,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +34,12 @@ from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.names import LEGITIMATE
 from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
+from evedrop.results.resolved_scenario import resolved
 from evedrop.results.writer import plain
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
-from evedrop.score.scorekeeper import resolved, verdicts
+from evedrop.score.kept import Kept
+from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.signals import stop_on_signals
@@ -47,15 +48,6 @@ from evedrop.studies.matchups import Group, Match, Matchups
 _SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
 _WRITE_SECONDS, _WRITE_SHARE = 3.0, 50.0  # from one compare.json to the next, and as a multiple of what one takes
 _ALIKE = 1e-6  # share by which two errors of theory may differ and be called equal: rounding, and no more
-
-
-class Kept(StrEnum):
-    """What a scheme keeps secret from an adversary, in a word."""
-
-    PERFECT = "perfect"
-    RELATIVE = "relative"
-    UNDECIDED = "too few trials to tell"
-    BROKEN = "broken"
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.errors import ScenarioError, UsageError
+from evedrop.loading import checked
 from evedrop.loading.mistakes import lacking_streams
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
-from evedrop.scenario import Scenario, checked
+from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed, near
 
 ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}

@@ -15,10 +15,11 @@ from typing import Any
 from evedrop.discovery import scenarios_in
 from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.live.launch.launcher import launch
+from evedrop.loading import load, shipped
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.results.folder import claimed, default_folder
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario, load, shipped
+from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import told
 
 

@@ -19,11 +19,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
+from evedrop.loading import load, value_of
 from evedrop.memory.montecarlo import Merger, Plan, check_mode, results_of, said_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
-from evedrop.scenario import FIGURES, Scenario, load, value_of
+from evedrop.scenario import FIGURES, Scenario
 from evedrop.scenario.household import FIGURES as HOUSE_FIGURES
 from evedrop.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
 from evedrop.score.scorekeeper import Ending

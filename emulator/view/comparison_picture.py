@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.comparison_report import MARKS
-from evedrop.studies.compare import Kept
+from evedrop.score.kept import MARKS, Kept
 from evedrop.view.figure_style import panels
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from rerun.experimental import ViewerClient
 
 from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import free_port
+from evedrop.ports import free_port
 from evedrop.view.paths import TIMELINE
 from evedrop.view.viewer_process import end, guarded, spawn
 

@@ -10,10 +10,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
+from evedrop.loading import load
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Flags
 from evedrop.results.writer import Results, load_results
-from evedrop.scenario import load
 from evedrop.score.scorekeeper import event_line
 from evedrop.view.scene import PeerSlots, Slots
 from evedrop.view.scored_slots import open_recording, showing_of

@@ -10,8 +10,8 @@ import numpy as np
 
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
-from evedrop.score.joined import Slots
 from evedrop.score.scorekeeper import Scored
+from evedrop.score.slots import Slots
 
 if TYPE_CHECKING:
     from evedrop.view.plant_slots import Showing

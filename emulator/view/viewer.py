@@ -18,7 +18,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import free_port
+from evedrop.ports import free_port
 from evedrop.view.growing_recording import Followed, Served, feed
 from evedrop.view.viewer_process import HOST, end, is_apart, spawn
 

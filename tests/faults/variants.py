@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from evedrop.scenario import Scenario, load
+from evedrop.loading import load
+from evedrop.scenario import Scenario
 
 _RICH = """
 title = "Disturbed by the campaign"

@@ -31,15 +31,15 @@ from evedrop.live.launch.briefs import Observation, briefs_of
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_use import expect_usable
+from evedrop.loading import load, parse, shipped, value_of
 from evedrop.memory.montecarlo import simulate
 from evedrop.plugins import named_in
 from evedrop.recordings.disturbance_file import read_disturbances
 from evedrop.recordings.link_recording import Recording
 from evedrop.results.diff import difference
 from evedrop.results.reading import load_results
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
-from evedrop.scenario import load, parse, shipped, value_of
-from evedrop.score.scorekeeper import write_resolved
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from tests.fuzz.mutation import Mutator, words_of

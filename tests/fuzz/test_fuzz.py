@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
 from evedrop.expected.estimates import warnings_of
-from evedrop.scenario import parse, shipped
+from evedrop.loading import parse, shipped
 from tests.fuzz.fuzzing import CORPUS, broken_by, campaign
 from tests.fuzz.mutation import REALS
 from tests.fuzz.readers import FILES, MESSAGES, READERS

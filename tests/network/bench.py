@@ -18,11 +18,12 @@ import numpy as np
 import zenoh
 
 from evedrop.live.launch.briefs import Observation, briefs_of
-from evedrop.live.launch.ports import free_port, loopback_places
-from evedrop.live.network.access import Keys
+from evedrop.live.launch.ports import loopback_places
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import Brief, Flow
 from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.keys import Keys
+from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 
 LIMIT_SECONDS = 60.0

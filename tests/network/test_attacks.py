@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.launch.ports import free_port
 from evedrop.live.protocol.codec import Reader, read_refusal, refusal
-from evedrop.scenario import load
+from evedrop.loading import load
+from evedrop.ports import free_port
 from tests.by_hand import by_hand
 from tests.conftest import Evedrop, Live
 from tests.rogue import with_rogue

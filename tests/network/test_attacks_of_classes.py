@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.answers import Answers, NoAnswer
+from evedrop.errors import NoAnswer
+from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.stand_in import StandIns

@@ -22,7 +22,7 @@ from cryptography.x509.oid import NameOID
 from evedrop.errors import BriefError, RunError, UsageError
 from evedrop.live.launch.authority import Authority
 from evedrop.live.launch.briefs import Observation, briefs_of
-from evedrop.live.launch.ports import free_port, places_at
+from evedrop.live.launch.ports import places_at
 from evedrop.live.network.certificates import check_identity
 from evedrop.live.network.connecting import Door, connected
 from evedrop.live.network.control_file import Control, read_control
@@ -30,6 +30,7 @@ from evedrop.live.network.session import client_config, door_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import Brief, Identity, read_brief
+from evedrop.ports import free_port
 
 EVE, MALLORY = "eve", "mallory"
 NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)

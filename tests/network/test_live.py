@@ -19,14 +19,15 @@ import zenoh
 from bench import LIMIT_SECONDS, Ear, connect, until
 
 from evedrop import montecarlo
-from evedrop.live.launch.briefs import StreamKeys
-from evedrop.live.network.access import Keys
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import Brief, read_brief
 from evedrop.live.protocol.envelope import enclosed
+from evedrop.live.protocol.keys import Keys
+from evedrop.loading import load
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario, load
+from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import stream_key
 
 SCENARIO = """

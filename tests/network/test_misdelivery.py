@@ -16,8 +16,6 @@ from bench import LIMIT_SECONDS, scenario_of, until
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import Observation, briefs_of
-from evedrop.live.launch.ports import free_port
-from evedrop.live.network.access import Keys
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.declared import InboxClosedError, Question
 from evedrop.live.network.operator import Answer, Request, ask
@@ -26,6 +24,8 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import Reader, control, progress
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
+from evedrop.live.protocol.keys import Keys
+from evedrop.ports import free_port
 from tests.proxy import Cable, cable
 
 GOOD = progress(7)

@@ -15,12 +15,12 @@ import zenoh
 from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.network.access import Keys
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.operator import Answer, Request, ask, read_request
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.keys import Keys
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
 PATIENCE = 5.0

@@ -15,7 +15,7 @@ from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_places, places_at
-from evedrop.live.network.access import Grant, Keys, access_control, grants
+from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.network.health import is_there
 from evedrop.live.network.linked_routers import at_relay, at_router
 from evedrop.live.network.session import client_config
@@ -23,6 +23,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.envelope import enclosed
+from evedrop.live.protocol.keys import Keys
 from evedrop.names import RELAY
 
 EVE = "eve"

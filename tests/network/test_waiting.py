@@ -11,9 +11,9 @@ from bench import scenario_of
 
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import Observation, briefs_of
-from evedrop.live.launch.ports import free_port
 from evedrop.live.network import connecting
 from evedrop.live.network.session import Session
+from evedrop.ports import free_port
 
 
 def test_a_process_says_that_it_waits_for_its_router(

@@ -16,16 +16,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from evedrop.errors import EvedropError, Gap, MalformedMessage, RunError
-from evedrop.live.network.access import writer_of
+from evedrop.live.observer.joiner import Joiner
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.keys import writer_of
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Heard
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
-from evedrop.score.joined import Joiner
 from tests.network.readers import EXAMPLES, READERS, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)

@@ -14,16 +14,18 @@ import pytest
 from independent_legitimate import Estimator
 
 from evedrop import montecarlo
-from evedrop.live.launch.briefs import Observation, StreamKeys, briefs_of
-from evedrop.live.launch.ports import free_port
+from evedrop.live.launch.briefs import Observation, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
+from evedrop.loading import load
 from evedrop.model.digest import BeliefLog, Blocks, RunDigest
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Heard
 from evedrop.model.schemes import SCHEMES
+from evedrop.ports import free_port
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario, load
+from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import Batch
 from tests.conftest import LIMIT
 

@@ -18,12 +18,12 @@ import evedrop.peers.following
 import evedrop.peers.sensor
 from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.launch.briefs import Observation, briefs_of
-from evedrop.live.network.access import Keys
 from evedrop.live.network.reporting import is_due
 from evedrop.live.network.resending import Kept
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import Brief, Flow
+from evedrop.live.protocol.keys import Keys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks
 from evedrop.peers.eavesdropper import eavesdrop

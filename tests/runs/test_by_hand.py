@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import Meeting, free_port, meeting_at
+from evedrop.live.launch.ports import Meeting, meeting_at
+from evedrop.ports import free_port
 from evedrop.results.writer import load_results
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 

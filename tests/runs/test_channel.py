@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.live.launch.briefs import StreamKeys
 from evedrop.model.slot.account import Accountant
 from evedrop.model.slot.link import Link
 from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.channel import CONFIDENCE, channel_of, interval
 from evedrop.score.sums import Tally
 from evedrop.streams import Batch

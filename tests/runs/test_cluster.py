@@ -14,9 +14,9 @@ import pytest
 
 from evedrop.api import load_results, montecarlo
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import free_port
 from evedrop.memory import workers
 from evedrop.memory.montecarlo import Plan
+from evedrop.ports import free_port
 from tests.conftest import Evedrop, wait_until
 
 pytest.importorskip("distributed")

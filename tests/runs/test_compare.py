@@ -11,11 +11,12 @@ import pytest
 
 from evedrop import compare, montecarlo
 from evedrop.errors import ScenarioError, UsageError
+from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
-from evedrop.scenario import load
-from evedrop.studies.compare import Comparison, Kept
+from evedrop.score.kept import Kept
+from evedrop.studies.compare import Comparison
 from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
 from tests.conftest import Evedrop
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.network.access import Keys
 from evedrop.live.observer import conductor
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.protocol.codec import Reader, over
+from evedrop.live.protocol.keys import Keys
 
 RUN = "r"
 NAMES = ("router", "relay", "sensor", "legitimate", "smart")

@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.api import montecarlo, run
+from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.receiver import Action
 from evedrop.results.writer import Results, load_results
-from evedrop.scenario import load
 from evedrop.score.expectations_held import Evidence, told
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict

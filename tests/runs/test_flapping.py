@@ -13,13 +13,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from evedrop.live.launch.ports import free_port
-from evedrop.live.network.access import Keys
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.codec import control
 from evedrop.live.protocol.envelope import enclosed
-from evedrop.scenario import Scenario, load
+from evedrop.live.protocol.keys import Keys
+from evedrop.loading import load
+from evedrop.ports import free_port
+from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import wait_until
 from tests.proxy import cable

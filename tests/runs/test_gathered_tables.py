@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
 from evedrop.model.links.link import REASONS
 from evedrop.results.writer import ResultsWriter
-from evedrop.score.joined import ReceiverSlots, Slots
+from evedrop.score.slots import ReceiverSlots, Slots
 from evedrop.score.sums import slot_sums, squared_errors
 
 NAMES = ("legitimate", "smart", "naive")

@@ -14,11 +14,11 @@ import pytest
 from evedrop.api import montecarlo
 from evedrop.cli import main as cli
 from evedrop.errors import ScenarioError
+from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model import privacy
 from evedrop.model.controllers import mpc
 from evedrop.model.energy import Meter, energy
-from evedrop.scenario import checked, load
 from tests.conftest import Evedrop
 from tests.test_plant_tables import LOOP
 

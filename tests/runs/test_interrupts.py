@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.live.launch.ports import free_port
+from evedrop.loading import load
+from evedrop.ports import free_port
 from evedrop.results.growing_tables import UNFINISHED, last_round
 from evedrop.results.writer import load_results
-from evedrop.scenario import load
 from tests.by_hand import by_hand
 from tests.conftest import Done, Evedrop, Live, wait_until
 

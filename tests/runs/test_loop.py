@@ -14,11 +14,12 @@ import tomli_w
 
 from evedrop.api import run
 from evedrop.errors import UsageError
+from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.memory.simulation import Mode
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results
-from evedrop.scenario import Scenario, checked, load
+from evedrop.scenario import Scenario
 from tests.conftest import Evedrop
 
 TITLE = "A tank that is steered over a lossy network"
@@ -344,7 +345,7 @@ def test_a_results_folder_runs_again_to_the_same_digests(tmp_path: Path) -> None
     """With the disturbances that lie in it."""
     (tmp_path / "loop.toml").write_text(tomli_w.dumps(tables()))
     first = in_memory(tmp_path / "run")
-    from evedrop.scenario import load
+    from evedrop.loading import load
 
     simulate(load(tmp_path / "run"), tmp_path / "again", lambda _: None, Plan(workers=1))
     assert digests(load_results(tmp_path / "again")) == digests(first)

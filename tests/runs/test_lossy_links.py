@@ -13,9 +13,10 @@ import tomli_w
 from evedrop.api import design, montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.expected.estimates import warnings_of
+from evedrop.loading import load
 from evedrop.model.links import LOSS_MODELS
 from evedrop.results.writer import Results
-from evedrop.scenario import Scenario, load
+from evedrop.scenario import Scenario
 from tests.conftest import Evedrop
 
 LOSSES: dict[str, dict[str, Any]] = {

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from evedrop.api import montecarlo
+from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.results.writer import Results
-from evedrop.scenario import checked, load
 
 PAPER = 0.0158
 """The change of grid power flow that the paper keeps below, at μ_d = 0.1."""

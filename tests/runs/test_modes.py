@@ -16,12 +16,13 @@ from hypothesis import strategies as st
 from evedrop import streams
 from evedrop.api import montecarlo
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.live.launch.briefs import StreamKeys
+from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.results.writer import Results
-from evedrop.scenario import Scenario, checked, load
+from evedrop.scenario import Scenario
+from evedrop.scenario.stream_keys import StreamKeys
 
 SURE = 4.5
 COVARIANCES, ERRORS = Plan(Mode.COVARIANCE_ONLY, workers=1), Plan(Mode.ERROR_COORDINATES, workers=1)

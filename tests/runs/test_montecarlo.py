@@ -129,7 +129,7 @@ def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -
 
 def test_a_scenario_of_ones_own_runs_with_changes(tmp_path: Path) -> None:
     """From Python, a checked scenario with dotted changes is what the command runs with --set."""
-    from evedrop.scenario import load
+    from evedrop.loading import load
 
     ours = montecarlo(load("eavesdroppers"), trials=3, slots=20, legitimate__link__quality=0.5, out=tmp_path / "a")
     named = montecarlo("eavesdroppers", trials=3, slots=20, legitimate__link__quality=0.5, out=tmp_path / "b")

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
+from evedrop.loading import load
 from evedrop.results.folder import new_folder, private_file
-from evedrop.scenario import load
-from evedrop.score.scorekeeper import resolved
+from evedrop.results.resolved_scenario import resolved
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 

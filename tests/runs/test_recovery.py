@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.launch.ports import free_port
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.protocol.brief import Flow
-from evedrop.scenario import Scenario, load
+from evedrop.loading import load
+from evedrop.ports import free_port
+from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, wait_until
 from tests.proxy import Cable, cable

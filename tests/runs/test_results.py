@@ -12,10 +12,10 @@ from pydantic import BaseModel
 
 from evedrop import scenario
 from evedrop.api import montecarlo
+from evedrop.loading import parse
 from evedrop.results import growing_tables as growing
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish
 from evedrop.results.writer import ACTIONS, DIGESTS, JOURNAL, Results, load_results
-from evedrop.scenario import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLES = [

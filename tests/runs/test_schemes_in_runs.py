@@ -12,11 +12,12 @@ from evedrop import montecarlo, run
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.expected.expectations import expectations_of
 from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.loading import checked
 from evedrop.memory.montecarlo import check_mode
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.numeric.detection import Chart
 from evedrop.results.writer import Results
-from evedrop.scenario import Scenario, checked
+from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection, chart_of
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]

@@ -13,8 +13,8 @@ import pyarrow as pa
 import pytest
 
 from evedrop import montecarlo, run
+from evedrop.loading import load
 from evedrop.results.writer import Results
-from evedrop.scenario import load
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import Evedrop
 from tests.runs.test_microgrid import part_of_day

@@ -16,9 +16,9 @@ import pytest
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shards import OneProgress, shards_of
+from evedrop.loading import load
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results
-from evedrop.scenario import load
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 
 TRIALS = 7

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import pytest
 
 from evedrop.errors import Silence
-from evedrop.live.network.access import Keys
 from evedrop.live.observer import stall
 from evedrop.live.observer.stall import Stall, patience_of, silent_of
+from evedrop.live.protocol.keys import Keys
 from evedrop.live.protocol.whereabouts import Whereabouts
 
 KEYS = Keys("r")

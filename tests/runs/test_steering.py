@@ -10,7 +10,8 @@ import pytest
 from evedrop.live.network.operator import Answer, Request, read_answer
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
-from evedrop.scenario import Scenario, checked
+from evedrop.loading import checked
+from evedrop.scenario import Scenario
 
 SLOTS = 100
 TABLES: dict[str, Any] = {

@@ -15,8 +15,8 @@ import pytest
 
 from evedrop.cli import main as cli
 from evedrop.errors import RunError
+from evedrop.loading import shipped
 from evedrop.results.writer import load_results
-from evedrop.scenario import shipped
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome

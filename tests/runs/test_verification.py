@@ -19,7 +19,7 @@ from evedrop.model.digest import BeliefLog, Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.score.joined import ReceiverSlots, Slots
+from evedrop.score.slots import ReceiverSlots, Slots
 
 TRIALS, N, SLOTS, RECORDED = 4, 2, 600, 2
 CUTS = (300, 310)

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import RunError
+from evedrop.loading import load
 from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BLOCK_TRIALS, tasks_of
 from evedrop.memory.workers import in_processes
 from evedrop.results.writer import load_results
-from evedrop.scenario import load
 from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 
 ENDLESS = ("--slots", "400000", "--trials", "1000")

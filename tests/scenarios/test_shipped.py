@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from evedrop.api import load_results, montecarlo, run
+from evedrop.loading import load, shipped
 from evedrop.results.writer import Results
-from evedrop.scenario import load, shipped
 
 SLOTS = 300
 """Enough for a whole block of digests and a part of one."""

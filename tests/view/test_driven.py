@@ -9,7 +9,7 @@ from test_picture import filled
 
 from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
-from evedrop.scenario import checked, load
+from evedrop.loading import checked, load
 from evedrop.view.picture import opened
 from evedrop.view.plant_slots import Showing
 from evedrop.view.replay import replay

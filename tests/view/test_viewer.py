@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import free_port
+from evedrop.ports import free_port
 from evedrop.view.growing_recording import Followed, feed
 from evedrop.view.recording import Recording
 from evedrop.view.viewer import Stand, Viewer, choose, open_run

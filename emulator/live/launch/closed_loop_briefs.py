@@ -14,7 +14,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
 
 if TYPE_CHECKING:
-    from evedrop.live.launch.briefs import StreamKeys
+    from evedrop.scenario.stream_keys import StreamKeys
 
 
 class LoopBriefs:

@@ -23,14 +23,15 @@ import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
-from evedrop.live.launch.shard_score import left
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
+from evedrop.results.resolved_scenario import write_resolved
+from evedrop.results.shard_score import left
 from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
-from evedrop.score.scorekeeper import Ending, summary_of, write_resolved
+from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.totals import Totals
 
 if TYPE_CHECKING:

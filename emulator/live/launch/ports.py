@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import secrets
-import socket
 from dataclasses import dataclass
 
 from evedrop.errors import UsageError
 from evedrop.live.network.endpoint import Endpoint
+from evedrop.ports import free_port
 
 _EXAMPLE = "give one such as tls/router.lan:7447"
 
@@ -56,19 +55,6 @@ class Places:
             raise UsageError("--relay: both routers take certificates or none does; give both as tls/HOST:PORT")
         if self.relay is not None and str(self.relay.connect) == str(self.router.connect):
             raise UsageError(f"--relay {self.relay.connect} is where the first router is; give another port")
-
-
-def free_port() -> int:
-    """A free TCP port on loopback, below those that the system hands out for outgoing connections."""
-    for _ in range(200):
-        port = 10_000 + secrets.randbelow(22_000)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
-    raise UsageError("no free port between 10000 and 32000 on loopback; end some programs, or give --listen")
 
 
 def places_at(

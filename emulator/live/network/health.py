@@ -6,10 +6,10 @@ import json
 
 import zenoh
 
-from evedrop.live.network.access import Keys
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.keys import Keys
 
 _CONNECT_SECONDS = 3.0
 _ANSWER_SECONDS = 3.0

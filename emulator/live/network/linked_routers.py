@@ -9,7 +9,8 @@ Source: docs/protocol.md, two routers.
 
 from __future__ import annotations
 
-from evedrop.live.network.access import Grant, Keys
+from evedrop.live.network.access import Grant
+from evedrop.live.protocol.keys import Keys
 from evedrop.names import RELAY, ROUTER, SENSOR
 
 _NEAR = frozenset({SENSOR, ROUTER})

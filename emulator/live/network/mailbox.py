@@ -8,7 +8,7 @@ from queue import SimpleQueue
 from typing import final
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.network.access import writer_of
+from evedrop.live.protocol.keys import writer_of
 
 _OVERHEAD_BYTES = 200  # of a message in memory, besides its own
 _ROUNDS = 4  # in which all that is kept is sent again, before what came first is read

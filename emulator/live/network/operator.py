@@ -12,11 +12,11 @@ from typing import Any
 
 import zenoh
 
-from evedrop.live.network.access import Keys
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.keys import Keys
 from evedrop.names import OBSERVER
 
 DOES = ("link", "pause", "resume", "step", "status")

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.errors import NotRegistered
 from evedrop.live.network.access import Wiring, access_control, grants
 from evedrop.live.network.delayed_sender import Postman
 from evedrop.live.network.linked_routers import at_router
@@ -26,7 +27,7 @@ from evedrop.live.network.router_commands import Anew, Commands
 from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import Session, router_config
 from evedrop.live.protocol.brief import Brief
-from evedrop.live.protocol.codec import Reader, packed_flags, shown
+from evedrop.live.protocol.codec import Reader, shown
 from evedrop.live.protocol.packets import (
     Beside,
     acknowledgement,
@@ -42,9 +43,9 @@ from evedrop.live.protocol.packets import (
 )
 from evedrop.live.protocol.telemetry import Journal
 from evedrop.model.acknowledgements import WayBack
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
-from evedrop.model.registry import NotRegistered
 from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
 from evedrop.model.slot.link import Change, Course, Fates, Link, streams_of
 from evedrop.model.slot.transit import Late, Transit

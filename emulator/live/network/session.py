@@ -22,7 +22,6 @@ from typing import Any, Protocol, Self
 import zenoh
 
 from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
-from evedrop.live.network.access import Keys, reader_of
 from evedrop.live.network.connecting import Door, Waiting, connected, endpoint_of
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.container_heartbeat import Heartbeat
@@ -34,6 +33,7 @@ from evedrop.live.network.resending import Kept
 from evedrop.live.protocol.brief import Brief, Identity
 from evedrop.live.protocol.codec import Reader, over, refusal
 from evedrop.live.protocol.envelope import Dropped
+from evedrop.live.protocol.keys import Keys, reader_of
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.names import OBSERVER, ROUTER

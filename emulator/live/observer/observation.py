@@ -10,14 +10,14 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from evedrop.errors import EvedropError, Interrupted, MalformedMessage, RunError
-from evedrop.live.launch.shard_score import leave
+from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
 from evedrop.live.network.operator import Answer, read_request
 from evedrop.live.network.resending import Due
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Conductor, Stop
+from evedrop.live.observer.joiner import Joiner
 from evedrop.live.observer.news import tell
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.recovery import Recovery
@@ -30,17 +30,17 @@ from evedrop.live.protocol.brief import Brief, Identity
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
-from evedrop.model.answers import NoAnswer
 from evedrop.model.digest import Blocks
 from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.results.held_folder import HeldFolder
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.rows import DigestRows, write_rows
+from evedrop.results.shard_score import leave
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
-from evedrop.score.joined import Joiner
-from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of, write_resolved
+from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of
 from evedrop.view.scored_slots import open_recording, showing_of, shown
 from evedrop.view.viewer import Stand, Viewer
 

@@ -15,7 +15,7 @@ import traceback
 from dataclasses import replace
 from queue import SimpleQueue
 
-from evedrop.errors import EvedropError, Interrupted, RunError
+from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
 from evedrop.interrupts import heeded
 from evedrop.live.network.launcher_watch import launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
@@ -23,12 +23,11 @@ from evedrop.live.observer.conductor import Stop
 from evedrop.live.observer.news import set_news_apart, tell
 from evedrop.live.observer.observation import Observation, Report
 from evedrop.live.protocol.brief import Brief
-from evedrop.model.answers import NoAnswer
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.folder import new_folder
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.scenario import Scenario
-from evedrop.score.scorekeeper import write_resolved
 from evedrop.view.viewer import Stand
 
 _ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone

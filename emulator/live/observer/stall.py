@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import final
 
 from evedrop.errors import Silence
-from evedrop.live.network.access import writer_of
+from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.whereabouts import Whereabouts
 from evedrop.names import OBSERVER
 

@@ -19,7 +19,7 @@ from evedrop.model.digest import Blocks, PartialDigests
 from evedrop.model.receiver import Action, Belief, trace_of
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
-from evedrop.score.joined import ReceiverSlots, Slots
+from evedrop.score.slots import ReceiverSlots, Slots
 
 _ROUNDING = 1e-9  # sums of a thousand traces differ by less in whatever order they are added
 

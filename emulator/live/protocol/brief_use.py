@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.errors import BriefError
+from evedrop.errors import BriefError, NotRegistered
 from evedrop.live.protocol.brief import Brief
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.plant import Plant
-from evedrop.model.registry import NotRegistered
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link import Course, Link, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from evedrop.live.protocol.codec import Reader, pack, packed_flags
+from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.telemetry import Extent, read_digests, read_failed
 from evedrop.model.digest import Blocks, Digests
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.errors import Gap, MalformedMessage, Refusal
-from evedrop.live.network.access import reader_of, writer_of
+from evedrop.live.protocol.keys import reader_of, writer_of
+from evedrop.model.flag_bits import flags_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
@@ -28,16 +29,6 @@ def pack(fields: Mapping[str, Any]) -> bytes:
     """A message of these fields."""
     message: bytes = msgpack.packb(fields, use_bin_type=True)
     return message
-
-
-def packed_flags(flags: Flags) -> NDArray[np.uint8]:
-    """Flags (…, R) as bit masks (…, ⌈R/8⌉), trial 0 in the lowest bit of the first byte."""
-    return np.packbits(flags, axis=-1, bitorder="little")
-
-
-def flags_of(masks: NDArray[np.uint8], trials: int) -> Flags:
-    """The flags (…, R) of bit masks (…, ⌈R/8⌉)."""
-    return np.unpackbits(masks, axis=-1, count=trials, bitorder="little").view(np.bool_)
 
 
 class Reader:

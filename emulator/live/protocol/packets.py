@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.protocol.codec import Reader, pack, packed_flags
+from evedrop.live.protocol.codec import Reader, pack
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, Heard
 from evedrop.model.slot.transit import Arrival, Late

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.protocol.codec import Reader, pack, packed_flags, shown
+from evedrop.live.protocol.codec import Reader, pack, shown
 from evedrop.model.digest import DIGEST_BYTES, Blocks, Digests
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Codes, Flags

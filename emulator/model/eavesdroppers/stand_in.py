@@ -9,9 +9,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
-from evedrop.model.answers import Answers, NoAnswer
+from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
-from evedrop.model.registry import NotRegistered
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 _ROUNDING = 1e-9

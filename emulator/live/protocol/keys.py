@@ -1,0 +1,109 @@
+"""The keys of a run: who reads each, and who alone may write it.
+
+Source: docs/protocol.md, keys.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys of one run."""
+
+    run: str
+
+    def _under(self, path: str) -> str:
+        return f"evedrop/{self.run}/{path}"
+
+    @property
+    def uplink(self) -> str:
+        """Packets, sensor to router."""
+        return self._under("uplink")
+
+    @property
+    def journal(self) -> str:
+        """Fates, router to observer."""
+        return self._under("journal")
+
+    @property
+    def acknowledged(self) -> str:
+        """Acknowledgements, legitimate estimator to router."""
+        return self._under("ack/sent")
+
+    @property
+    def acknowledgements(self) -> str:
+        """Acknowledgements that were neither lost nor blocked, and those that are forged: router to sensor."""
+        return self._under("ack/delivered")
+
+    @property
+    def estimate(self) -> str:
+        """What the legitimate estimator believes, to the controller."""
+        return self._under("estimate")
+
+    @property
+    def state(self) -> str:
+        """The true state, sensor to controller, where that acts on the truth."""
+        return self._under("state")
+
+    @property
+    def input(self) -> str:
+        """What the controller decides, to the sensor, and to a legitimate estimator that is told it."""
+        return self._under("input")
+
+    def downlink(self, receiver: str) -> str:
+        """Deliveries, router to one receiver."""
+        return self._under(f"downlink/{receiver}")
+
+    def telemetry(self, process: str) -> str:
+        """What a process reports to the observer."""
+        return self._under(f"telemetry/{process}")
+
+    def progress(self, process: str) -> str:
+        """How far a receiver or the observer is, to the sensor."""
+        return self._under(f"progress/{process}")
+
+    def control(self, process: str) -> str:
+        """Commands to one process."""
+        return self._under(f"control/{process}")
+
+    def alive(self, process: str) -> str:
+        """Liveliness token of a process."""
+        return self._under(f"alive/{process}")
+
+
+def reader_of(key: str) -> str:
+    """The process that reads a key; of inputs, which the legitimate estimator may read too, the one that always does."""
+    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
+    if kind == "ack":
+        return ROUTER if name == "sent" else SENSOR
+    readers = {
+        "uplink": ROUTER,
+        "journal": OBSERVER,
+        "telemetry": OBSERVER,
+        "progress": SENSOR,
+        "estimate": CONTROLLER,
+        "state": CONTROLLER,
+        "input": SENSOR,
+    }
+    return readers.get(kind, name)
+
+
+def writer_of(key: str) -> str:
+    """The only process that may write a key; empty for what is no key of a run."""
+    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
+    if kind == "ack":
+        return LEGITIMATE if name == "sent" else ROUTER
+    writers = {
+        "uplink": SENSOR,
+        "downlink": ROUTER,
+        "journal": ROUTER,
+        "control": OPERATOR if name == OBSERVER else OBSERVER,
+        "estimate": LEGITIMATE,
+        "state": SENSOR,
+        "input": CONTROLLER,
+    }
+    return writers.get(kind, name)

@@ -1,0 +1,78 @@
+"""The keys of a scenario's random streams, those of the shared secret among them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import UsageError
+from evedrop.files import Unreadable, contents
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.slot.link import Course, streams_of
+from evedrop.names import ACKNOWLEDGEMENTS
+from evedrop.scenario import Scenario
+from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
+from evedrop.streams import root_of_seed, stream_key
+
+
+@dataclass(frozen=True)
+class StreamKeys:
+    """The keys of all streams of a scenario: those of the seed, and the two of the secret."""
+
+    seed_root: bytes
+    secret_root: bytes
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> StreamKeys:
+        """From the seed; the secret from its own file if the scenario names one. Raises UsageError if it cannot be read."""
+        root = root_of_seed(scenario.seed)
+        if scenario.secret_file is None:
+            return cls(root, stream_key(root, "secret"))
+        try:
+            secret = contents(Path(scenario.secret_file), MOST_SECRET_BYTES)
+        except Unreadable as error:
+            raise UsageError(
+                f"--secret {scenario.secret_file} cannot be read ({error}); give a file of {SECRET_BYTES} or more bytes"
+            ) from error
+        if len(secret) < SECRET_BYTES:
+            raise UsageError(
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more, random ones"
+            )
+        return cls(root, stream_key(secret, "secret"))
+
+    def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
+        """Keys of the shared secret's streams."""
+        return {name: stream_key(self.secret_root, name) for name in names}
+
+    @property
+    def process(self) -> bytes:
+        """Of the sensor's process noise."""
+        return stream_key(self.seed_root, "process")
+
+    def link(self, receiver: str, course: Course) -> dict[str, bytes]:
+        """Of all that a receiver's link draws from."""
+        return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
+
+    def links(self, courses: Mapping[str, Course]) -> dict[str, bytes]:
+        """Of all links."""
+        return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
+
+    @property
+    def measurement(self) -> bytes:
+        """Of the noise of what the sensor measures."""
+        return stream_key(self.seed_root, "measurement")
+
+    @property
+    def way_back(self) -> bytes:
+        """Of the losses of acknowledgements."""
+        return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
+
+    def eavesdropper(self, name: str, strategy: str, parameters: Mapping[str, Any]) -> dict[str, bytes]:
+        """What an eavesdropper's strategy must be given: the schedule's key, its own coin's, or nothing."""
+        keys = {}
+        for stream in STRATEGIES[strategy].streams(parameters):
+            own = stream_key(self.seed_root, f"coin/{name}")
+            keys[stream] = own if stream == "coin" else stream_key(self.secret_root, stream)
+        return keys

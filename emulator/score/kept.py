@@ -1,0 +1,22 @@
+"""What a scheme keeps secret from an adversary."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    pass
+
+
+class Kept(StrEnum):
+    """What a scheme keeps secret from an adversary, in a word."""
+
+    PERFECT = "perfect"
+    RELATIVE = "relative"
+    UNDECIDED = "too few trials to tell"
+    BROKEN = "broken"
+
+
+MARKS = {Kept.PERFECT: "●", Kept.RELATIVE: "◐", Kept.UNDECIDED: "?", Kept.BROKEN: "✕"}
+"""Verdicts as marks that can be told apart without colours."""

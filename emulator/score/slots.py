@@ -1,0 +1,115 @@
+"""Truth, estimates and fates of the same slots, joined: what is scored, recorded and shown, live and in memory alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
+
+
+@dataclass(frozen=True)
+class ReceiverSlots:
+    """One receiver over c slots."""
+
+    x_hat: Floats
+    """(c, n, R)."""
+    action: Codes
+    """(c, R)."""
+    P: Floats
+    """Believed covariance of the recorded trials, (c, n, n, recorded)."""
+    trace: Floats
+    """Sum over all trials of tr P and of its square, (c, 2)."""
+    delivered: Flags
+    """What the router says it passed on, (c, R)."""
+    lost: Mapping[str, NDArray[np.uint32]]
+    """Reason → packets the router says were lost for it, (c,)."""
+    late: NDArray[np.uint16] | None = None
+    """Packets of earlier slots that it took in each slot, (c, R); None of who can take none."""
+    late_used: NDArray[np.uint16] | None = None
+    """Those of them that it used, (c, R)."""
+    late_delivered: NDArray[np.uint16] | None = None
+    """The same as the router says, (c, R)."""
+    unsent: NDArray[np.uint32] | None = None
+    """Trials in which there was no packet, as the router says, (c,); None: none that it knows of."""
+
+
+@dataclass(frozen=True)
+class InputSlots:
+    """What the controller decided, over c slots."""
+
+    u: Floats
+    """As decided, (c, m, R); the plant may clip it."""
+    failed: Flags
+    """Whether the decision that holds failed, so that the inputs before are held, (c, R)."""
+
+
+@dataclass(frozen=True)
+class Slots:
+    """c consecutive slots of all trials, complete."""
+
+    first: int
+    x: Floats
+    """(c, n, R)."""
+    nu: Flags
+    """(c, R)."""
+    receivers: Mapping[str, ReceiverSlots]
+    sent: Flags | None = None
+    """Whether there was a packet, as the sensor says, (c, R); None: always."""
+    alarms: Flags | None = None
+    """As in `Truth`."""
+    inputs: InputSlots | None = None
+    """None without a controller."""
+    true: Floats | None = None
+    """The true states, (c, n, R), of a sensor that filters; None where they are x."""
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return len(self.x)
+
+    @property
+    def trials(self) -> int:
+        """Number of trials."""
+        return int(self.x.shape[2])
+
+    def copied(self) -> Slots:
+        """The same in arrays of its own."""
+        receivers = {
+            name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
+            for name, one in self.receivers.items()
+        }
+        sent = None if self.sent is None else self.sent.copy()
+        inputs = None if self.inputs is None else InputSlots(self.inputs.u.copy(), self.inputs.failed.copy())
+        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent, inputs=inputs)
+
+
+def concatenated(parts: Sequence[Slots]) -> Slots:
+    """Consecutive slots as one; the fates' reasons, which nobody asks for any more, are left out."""
+
+    def column(name: str, one: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part.receivers[name], one) for part in parts])
+
+    receivers = {
+        name: ReceiverSlots(**{one: column(name, one) for one in _ARRAYS}, lost={}) for name in parts[0].receivers
+    }
+    x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
+    sent = None if parts[0].sent is None else np.concatenate([all_set(part.sent, part.nu) for part in parts])
+    inputs = None
+    if parts[0].inputs is not None:
+        of_parts = [part.inputs for part in parts if part.inputs is not None]
+        inputs = InputSlots(*(np.concatenate([getattr(one, name) for one in of_parts]) for name in ("u", "failed")))
+    return Slots(parts[0].first, x, nu, receivers, sent, inputs=inputs)
+
+
+def all_set(flags: Flags | None, like: Flags) -> Flags:
+    """Flags that are all set where none are given."""
+    return np.ones_like(like) if flags is None else flags
+
+
+_ARRAYS = ("x_hat", "action", "P", "trace", "delivered")
