@@ -43,7 +43,7 @@ from evedrop.results.writer import ResultsWriter
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from tests.fuzz.mutation import Mutator, words_of
-from tests.network import test_protocol
+from tests.live.network import test_protocol
 
 Change = Callable[[Mutator, bytes], bytes]
 _EXAMPLES = Path(__file__).with_name("examples")

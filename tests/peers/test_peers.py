@@ -26,6 +26,7 @@ from evedrop.live.protocol.brief import Brief, Flow
 from evedrop.live.protocol.keys import Keys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks
+from evedrop.model.flag_bits import packed_flags
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
@@ -175,7 +176,7 @@ def deliveries(count: int = SLOTS) -> list[bytes]:
     made = []
     for k in range(count):
         gamma = np.arange(3) != k % 3
-        made.append(packets.delivery(k, wire.packed_flags(gamma).tobytes(), np.full((2, 2), float(k)).tobytes()))
+        made.append(packets.delivery(k, packed_flags(gamma).tobytes(), np.full((2, 2), float(k)).tobytes()))
     return made
 
 
@@ -296,7 +297,7 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
     def delivered(k: int) -> bytes:
         gamma = np.arange(3) != k % 3
         header = np.full((1, 2), -1).astype("<i8").tobytes()
-        return packets.delivery(k, wire.packed_flags(gamma).tobytes(), bytes(32), header=header)
+        return packets.delivery(k, packed_flags(gamma).tobytes(), bytes(32), header=header)
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
     stage.fill(Keys("r").downlink("legitimate"), [delivered(k) for k in slots])

@@ -23,9 +23,9 @@ from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import wait_until
+from tests.live.test_recovery import ACKNOWLEDGED, INNOVATION, LOOP
 from tests.proxy import cable
 from tests.resets import reset_connections
-from tests.runs.test_recovery import ACKNOWLEDGED, INNOVATION, LOOP
 
 SEEDS = 50
 GAPS = (0.0, 0.01, 0.03, 0.1)

@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.cli import main as cli
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))
 
 

@@ -15,10 +15,10 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.loading import load
 from evedrop.results.writer import Results
+from tests.applications.test_microgrid import part_of_day
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import Evedrop
-from tests.runs.test_microgrid import part_of_day
-from tests.runs.test_shards import child, close, in_order
+from tests.live.test_shards import child, close, in_order
 
 TIMED = {"decisions", "mean_solve_seconds", "longest_solve_seconds"}
 """Of the controller, what says how its own process did."""

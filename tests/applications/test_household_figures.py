@@ -20,7 +20,7 @@ from evedrop.model import privacy
 from evedrop.model.controllers import mpc
 from evedrop.model.energy import Meter, energy
 from tests.conftest import Evedrop
-from tests.test_plant_tables import LOOP
+from tests.scenario.test_plant_tables import LOOP
 
 SLOTS = 3600
 

@@ -17,16 +17,16 @@ from hypothesis.extra.numpy import arrays
 
 from evedrop.errors import EvedropError, Gap, MalformedMessage, RunError
 from evedrop.live.observer.joiner import Joiner
-from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.keys import writer_of
 from evedrop.model.digest import Blocks
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Heard
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
-from tests.network.readers import EXAMPLES, READERS, fields_of
+from tests.live.network.readers import EXAMPLES, READERS, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)
@@ -52,7 +52,7 @@ def test_delivery(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A receiver gets γ, and z of exactly the trials that received; of the others not a bit is in the message."""
     z = data.draw(arrays(float, (n, trials), elements=FINITE))
     gamma = data.draw(arrays(bool, trials))
-    raw = packets.delivery(k, wire.packed_flags(gamma).tobytes(), z[:, gamma].tobytes())
+    raw = packets.delivery(k, packed_flags(gamma).tobytes(), z[:, gamma].tobytes())
     heard, late = packets.read_delivery(Reader("d", raw), k, (n, trials))
     assert np.array_equal(heard.gamma, gamma)
     assert heard.z.tobytes() == np.where(gamma, z, 0.0).tobytes()

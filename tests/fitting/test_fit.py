@@ -296,7 +296,7 @@ def test_the_command_prints_what_can_be_pasted(evedrop: Evedrop) -> None:
 
 def test_the_documents_example_is_what_comes_out(evedrop: Evedrop) -> None:
     """The recording that docs/links.md makes gives the lines that it shows, every number within 2 %."""
-    text = (Path(__file__).parents[1] / "docs" / "links.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "links.md").read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     ((command, shown),) = re.findall(r"```text\n\$ evedrop (links fit [^\n]*)\n(.*?)```", text, re.DOTALL)
     subprocess.run([sys.executable, "-c", source], cwd=evedrop.folder, check=True)

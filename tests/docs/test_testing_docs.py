@@ -14,7 +14,7 @@ import yaml
 from evedrop.cli import main as cli
 from evedrop.studies.scenario_tests import Manner, Outcome, carry_out
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "testing.md").read_text(encoding="utf-8")
 JOBS: list[dict[str, Any]] = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
 

@@ -7,7 +7,7 @@ import pytest
 
 from evedrop.loading import load, parse
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 

@@ -18,7 +18,7 @@ from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.writer import load_results
 from tests.conftest import Evedrop
 
-PAGE = Path(__file__).parents[1] / "docs" / "your-own.md"
+PAGE = Path(__file__).parents[2] / "docs" / "your-own.md"
 BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 SCENARIO = """

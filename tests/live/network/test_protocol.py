@@ -22,12 +22,13 @@ from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.keys import Keys
 from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import BeliefLog, Blocks, RunDigest
+from evedrop.model.flag_bits import packed_flags
 from evedrop.model.receiver import Belief, Heard
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
 from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
-TEXT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
 GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))
 MESSAGES = [name for name in GOLDEN if "\nbytes " in GOLDEN[name]]
 KEY = "evedrop/golden"
@@ -70,7 +71,7 @@ def extent_of(shape: dict[str, Any]) -> telemetry.Extent:
 
 def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
-    mask = wire.packed_flags(flags(value["gamma"])).tobytes()
+    mask = packed_flags(flags(value["gamma"])).tobytes()
     late = tuple(Late(one["k"], heard_of(shape, one["gamma"], one["z"])) for one in value.get("late", ()))
     return packets.delivery(value["k"], mask, np.array(value["z"], float).tobytes(), late)
 
