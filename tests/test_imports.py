@@ -1,4 +1,4 @@
-"""Who may import what: what a fresh process has loaded after each import."""
+"""What a fresh process has loaded after each import. `make lint` checks which room may import which."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ from pathlib import Path
 
 import pytest
 
-HOUSE = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[1]
+ROOMS = {"peers": ROOT / "peers"}
+SCIPY = ("evedrop.model.theory.", "evedrop.model.energy")
 
 
-def modules_of(folder: str) -> list[str]:
-    """The modules under a folder."""
-    paths = sorted((HOUSE / folder).rglob("*.py"))
-    return [".".join(path.relative_to(HOUSE).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+def modules_of(room: str) -> list[str]:
+    """The modules of a room. Raises AssertionError if there is no such room, so that no check becomes void."""
+    folder = ROOMS.get(room, ROOT / "emulator" / room.replace(".", "/"))
+    paths = sorted(folder.rglob("*.py"))
+    assert paths, f"there is no room {room}"
+    names = (path.relative_to(folder).with_suffix("").parts for path in paths)
+    return [".".join(["evedrop", room, *name]).removesuffix(".__init__") for name in names]
 
 
 def loaded_by(*modules: str) -> dict[str, set[str]]:
@@ -30,14 +35,14 @@ for name in {modules!r}:
     found[name] = [one for one in sys.modules if one not in bare]
 print(json.dumps(found))
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=HOUSE)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return {module: set(names) for module, names in json.loads(ended.stdout).items()}
 
 
 @cache
 def installed() -> frozenset[str]:
     """The importable names of everything installed that is not ours."""
-    return frozenset(packages_distributions()) - {"emulator", "peers", "scenarios"}
+    return frozenset(packages_distributions()) - {"evedrop"}
 
 
 def packages(names: set[str]) -> set[str]:
@@ -46,41 +51,39 @@ def packages(names: set[str]) -> set[str]:
 
 
 def ours(names: set[str]) -> set[str]:
-    """Our own parts among modules: such as evedrop.runs."""
-    return {".".join(name.split(".")[:2]) for name in names if name.startswith(("emulator.", "peers."))}
+    """Our own rooms among modules: such as evedrop.live."""
+    return {".".join(name.split(".")[:2]) for name in names if name.startswith("evedrop.")}
 
 
 def test_peers_and_network_stay_light() -> None:
-    """Peers and network load zenoh, msgpack, numpy, cryptography, and neither view nor results nor scenarios."""
-    for module, names in loaded_by(*modules_of("peers"), *modules_of("emulator/network")).items():
+    """Peers, network and protocol load zenoh, msgpack, numpy, cryptography, and neither view nor results nor scenarios."""
+    modules = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
+    for module, names in loaded_by(*modules).items():
         assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "_cffi_backend"}, module
-        assert not ours(names) & {"evedrop.view", "evedrop.runs", "evedrop.scenario", "evedrop.api"}, module
+        assert not ours(names) & {"evedrop.view", "evedrop.results", "evedrop.score", "evedrop.scenario", "evedrop.api"}
 
 
-def test_a_solver_is_loaded_by_who_uses_it_alone() -> None:
-    """The strategy that needs one is part of the model, and registered in it, but loads it with its first controller."""
+def test_a_solver_is_loaded_only_when_a_controller_is_made() -> None:
+    """The strategy that needs a solver is registered with the others, and loads it with its first controller."""
     names = loaded_by("evedrop.model.controllers")["evedrop.model.controllers"]
     assert "evedrop.model.controllers.mpc" in names
     assert not packages(names) & {"osqp", "scipy"}
 
 
-THEORY = ("design", "markov", "theory")
-
-
 def test_model_is_mathematics() -> None:
-    """The model loads numpy, and cryptography for its streams: no network, no view, no scipy but in theory and design."""
-    model = [name for name in modules_of("emulator/model") if name.rpartition(".")[2] not in THEORY]
+    """The model loads numpy, and cryptography for its streams: no network, no view, no scipy outside theory."""
+    model = [name for name in modules_of("model") if not name.startswith(SCIPY)]
     assert len(model) > 15
     for module, names in loaded_by(*model).items():
         assert packages(names) <= {"numpy", "cryptography", "_cffi_backend"}, module
-        assert ours(names) <= {"evedrop.model", "evedrop.streams"}, module
+        assert ours(names) <= {"evedrop.model", "evedrop.streams", "evedrop.kernels", "evedrop.errors"}, module
 
 
 def test_theory_may_use_scipy_and_no_more() -> None:
-    """Theory and design load scipy besides, and still neither network nor view nor results."""
-    for module, names in loaded_by(*(f"evedrop.model.{name}" for name in THEORY)).items():
+    """Theory loads scipy besides, and still neither network nor view nor results."""
+    for module, names in loaded_by(*modules_of("model.theory")).items():
         assert packages(names) <= {"numpy", "scipy", "cryptography", "_cffi_backend"}, module
-        assert ours(names) <= {"evedrop.model", "evedrop.streams", "evedrop.errors"}, module
+        assert ours(names) <= {"evedrop.model", "evedrop.streams", "evedrop.kernels", "evedrop.errors"}, module
 
 
 @pytest.mark.parametrize("module", ["evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api"])
@@ -89,25 +92,21 @@ def test_launcher_and_memory_load_neither_zenoh_nor_rerun(module: str) -> None:
     assert not packages(loaded_by(module)[module]) & {"zenoh", "rerun", "matplotlib"}
 
 
-def test_the_command_line_loads_nothing_to_say_help() -> None:
-    """What `evedrop --help` loads is Python's own and ours."""
+def test_the_command_line_loads_nothing_to_print_help() -> None:
+    """`evedrop --help` loads only Python's own modules and ours."""
     assert packages(loaded_by("evedrop.cli.main")["evedrop.cli.main"]) == set()
 
 
 def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
-    """It is loaded in every project of an environment that has Evedrop in it."""
+    """The plugin is loaded in every project whose environment contains Evedrop."""
     found = loaded_by("pytest", "evedrop.pytest_plugin")
     more = found["evedrop.pytest_plugin"] - found["pytest"]
     assert packages(more) == set()
-    assert ours(more) == {"evedrop.pytest_plugin", "evedrop.discovery", "evedrop.files"}
+    assert ours(more) == {"evedrop.pytest_plugin", "evedrop.discovery"}
 
 
-def test_only_the_view_loads_rerun_and_matplotlib() -> None:
-    """No module outside the view loads either when it is imported."""
-    outside = [
-        name
-        for folder in ("emulator/model", "emulator/network", "emulator/run", "peers")
-        for name in modules_of(folder)
-    ]
-    for module, names in loaded_by(*outside).items():
+@pytest.mark.parametrize("room", ["model", "live", "memory", "scenario", "score", "results", "expected", "peers"])
+def test_only_view_and_paper_load_rerun_and_matplotlib(room: str) -> None:
+    """No module of the other rooms loads Rerun or matplotlib when it is imported."""
+    for module, names in loaded_by(*modules_of(room)).items():
         assert not packages(names) & {"rerun", "matplotlib"}, module
