@@ -21,7 +21,7 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Trajectory
-from evedrop.model.receiver import Heard
+from evedrop.model.receiver import Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import Link
 from evedrop.scenario import Scenario
@@ -57,7 +57,7 @@ def steps(trials: int, slots: int, rounds: int) -> None:
     print(f"reading packets, {trials} trials of {slots} slots: {each}; bayesian is {ratio:.1f} times smart")
 
 
-def packets(scenario: Scenario, batch: Batch) -> list[Heard]:
+def packets(scenario: Scenario, batch: Batch) -> list[Reception]:
     """What arrives at an eavesdropper in every slot."""
     keys, process = StreamKeys.of(scenario), scenario.process.process
     scheme = scheme_of(process, scenario.encoding.spec)
@@ -68,11 +68,11 @@ def packets(scenario: Scenario, batch: Batch) -> list[Heard]:
     found = []
     for k in range(batch.slots):
         x = trajectory.advance()
-        found.append(Heard(fates[k], encoder.encode(k, x, trajectory.predicted).z))
+        found.append(Reception(fates[k], encoder.encode(k, x, trajectory.predicted).z))
     return found
 
 
-def read(scenario: Scenario, strategy: str, batch: Batch, heard: list[Heard]) -> float:
+def read(scenario: Scenario, strategy: str, batch: Batch, heard: list[Reception]) -> float:
     """Microseconds of the processor a slot."""
     keys = StreamKeys.of(scenario).eavesdropper(strategy, strategy, {})
     receiver = STRATEGIES[strategy](Knowledge(scenario.process.process, scenario.encoding.mu_d, {}, keys), batch)

@@ -19,7 +19,7 @@ from pathlib import Path
 import raw
 from processes import Usage, watch
 
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import progress
@@ -75,7 +75,7 @@ def _routed_latency(slots: int, rate: float) -> tuple[float, float]:
     """A real router process from a real brief, with senders and receivers that only look at the clock."""
     scenario = load("eavesdroppers", {"slots": slots, "pace": 1.0 / rate})
     with tempfile.TemporaryDirectory() as folder:
-        observation = Observation(Path(folder), False)
+        observation = ObserverTask(Path(folder), False)
         briefs = briefs_of(scenario, f"tcp/127.0.0.1:{free_port()}", observation, ends_with_stdin=False)
         paths = {name: str(brief.write(Path(folder))) for name, brief in briefs.items()}
         router = subprocess.Popen([sys.executable, "-m", "evedrop", "router", paths[ROUTER]])

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.live.network.resending import Due, Kept
+from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.closed_loop import known, read_decided
 from evedrop.live.protocol.codec import Reader
-from evedrop.model.input_aware import Informed
+from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Floats, Trajectory
@@ -25,7 +25,7 @@ def disturbances_in(text: str, slots: int) -> Floats:
     return np.frombuffer(b64decode(text), "<f8").reshape(slots, -1)
 
 
-def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> Kept:
+def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> ReplayBuffer:
     """An outlet of what is said in decision slots: what is said in one may be needed until the next."""
     return session.kept(key, brief.flow.window + 1 + period, back=period)
 
@@ -37,7 +37,7 @@ class Decided:
         self._period, self._shape = period, shape
         self._key = session.keys.input
         self._inbox = session.inbox(self._key)
-        self._due = Due(self._key, patience)
+        self._due = GapDetector(self._key, patience)
         self._now: tuple[Floats, Flags]
 
     def of(self, k: int) -> tuple[Floats, Flags]:
@@ -108,8 +108,8 @@ class Consultation:
             if loop["acts_on"] == "estimate"
             else None
         )
-        self._told: tuple[Informed, Decided] | None = None
-        if isinstance(receiver, Informed):
+        self._told: tuple[InputAwareEstimator, Decided] | None = None
+        if isinstance(receiver, InputAwareEstimator):
             shape = (len(loop["plant"]["input_lower"]), brief.trials)
             self._told = receiver, Decided(session, self._period, shape, brief.flow.longest_outage)
 

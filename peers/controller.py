@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from evedrop.live.network.reporting import DecisionReporter
-from evedrop.live.network.resending import Due
+from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.closed_loop import decided, read_known
@@ -31,7 +31,7 @@ def steer(brief: Brief) -> None:
         # Slots are joined without its reports, so all that is kept is sent again.
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
-        due = Due(key, brief.flow.longest_outage)
+        due = GapDetector(key, brief.flow.longest_outage)
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):

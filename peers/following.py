@@ -11,11 +11,11 @@ import numpy as np
 
 from evedrop.live.network.declared import Inbox
 from evedrop.live.network.reporting import BeliefReporter
-from evedrop.live.network.resending import Due
+from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.packets import acknowledgement, is_hold, read_acknowledgement, read_delivery
+from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_delivery
 from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Receiver
 from evedrop.model.slot.intermittent_receiver import Follower
@@ -45,16 +45,16 @@ def follow(
         put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in outages.items() for slot in (start, stop)]
         put_progress = session.kept(session.keys.progress(name), 0)
-        answers = Answers(brief, session, acknowledges, None if consult is None else consult(session))
+        answers = ReceiverReplies(brief, session, acknowledges, None if consult is None else consult(session))
         reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
-        due = Due(downlink, brief.flow.longest_outage)
+        due = GapDetector(downlink, brief.flow.longest_outage)
         session.ready()
         k = brief.first
         while k < brief.slots:
             session.place.slot = k
             message = Reader(downlink, deliveries.recv())
             found = message.integer("k")
-            if is_hold(message):
+            if is_barrier(message):
                 if found != k:
                     due.missed(k, found)
                     continue
@@ -86,7 +86,7 @@ def follow(
         session.wait_for("end")
 
 
-class Answers:
+class ReceiverReplies:
     """What a receiver says to others than the observer: acknowledgements, and its estimate to a controller. Final."""
 
     def __init__(self, brief: Brief, session: Session, acknowledges: bool, consultation: Consultation | None) -> None:
@@ -119,7 +119,7 @@ class Answers:
     def _go_on(self, deliveries: Inbox, key: str) -> None:
         for delivery in deliveries:
             message = Reader(key, delivery)
-            if not is_hold(message):
+            if not is_barrier(message):
                 self.had(message.integer("k"), message)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from evedrop.live.protocol.brief import Brief
-from evedrop.model.input_aware import Informed
+from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.plant import Plant
 from evedrop.model.schemes import scheme_of
 from evedrop.peers.closed_loop import Consultation
@@ -17,6 +17,6 @@ def estimate(brief: Brief) -> None:
     scheme = scheme_of(brief.model.process, brief.part["scheme"])
     receiver, loop = scheme.estimator(brief.stream_keys, brief.batch), brief.part["controller"]
     if loop is not None and loop["plant"] is not None:
-        receiver = Informed(receiver, Plant.of(loop["plant"]), brief.part["window"])
+        receiver = InputAwareEstimator(receiver, Plant.of(loop["plant"]), brief.part["window"])
     consult = partial(Consultation, brief, receiver=receiver) if loop is not None else None
     follow(brief, receiver, scheme.needs_acknowledgements, consult)

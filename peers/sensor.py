@@ -8,13 +8,13 @@ from collections.abc import Collection
 from evedrop.errors import RunError
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.reporting import TruthReporter
-from evedrop.live.network.resending import Due, Kept
+from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import Reader, read_progress, shown
-from evedrop.live.protocol.packets import Beside, hold, once_more, read_acknowledgement, uplink
+from evedrop.live.protocol.packets import PacketExtras, barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
-from evedrop.model.numeric.detection import Chart, Watch
+from evedrop.model.numeric.detection import Chart, CusumBatch
 from evedrop.model.plant import Plant
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Flags
@@ -33,7 +33,7 @@ class Window:
     sent: what it sent, which is forgotten as they go on.
     """
 
-    def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: Kept) -> None:
+    def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: ReplayBuffer) -> None:
         self._window, self._sent, self._place = window, sent, session.place
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
@@ -76,14 +76,14 @@ class Window:
         self._sent.forget(done)
 
 
-class Holds:
+class Barriers:
     """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
 
     def __init__(
         self, brief: Brief, session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
     ) -> None:
         self._session, self._window = session, window
-        self._holds = set(brief.part["holds"])
+        self._barriers = set(brief.part["holds"])
         self._telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
         watches = brief.part["chart"] is not None
         inputs, measures = (0, False) if actuator is None else (actuator.inputs, actuator.measures)
@@ -93,10 +93,10 @@ class Holds:
         """Whether to stop before slot k."""
         while (command := self._session.commanded()) is not None:
             if command.text("do") == "hold":
-                self._holds.add(k)
-        return k in self._holds
+                self._barriers.add(k)
+        return k in self._barriers
 
-    def hold(self, k: int) -> None:
+    def wait_at(self, k: int) -> None:
         """Report all slots below k, and wait until the conductor says go."""
         self.reporter.flush(k)
         self._telemetry(k, held(k))
@@ -108,9 +108,9 @@ class Holds:
         if not set(absent) <= set(self._window.followers):
             raise command.malformed(f"absent = {shown(absent)}", f"some of {', '.join(self._window.followers)}")
         self._window.go_on(k, absent)
-        self._holds = {slot for slot in self._holds if slot > k}
+        self._barriers = {slot for slot in self._barriers if slot > k}
         if command.has("until"):
-            self._holds.add(command.integer("until"))
+            self._barriers.add(command.integer("until"))
 
 
 class Acknowledgements:
@@ -120,9 +120,9 @@ class Acknowledgements:
         self._encoder, self._trials = encoder, brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
-        self._due = Due(self._key, brief.flow.longest_outage)
+        self._due = GapDetector(self._key, brief.flow.longest_outage)
         chart = brief.part["chart"]
-        self._watch = Watch(Chart(**chart), brief.trials) if chart is not None else None
+        self._watch = CusumBatch(Chart(**chart), brief.trials) if chart is not None else None
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
@@ -143,11 +143,11 @@ def sense(brief: Brief) -> None:
     betrayed = set(brief.part["leaks"].values())
     pace = float(brief.part["pace"])
     with Session(brief) as session:
-        send = session.kept(session.keys.uplink, head=once_more, back=brief.part["history"])
+        send = session.kept(session.keys.uplink, head=resend, back=brief.part["history"])
         window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window, send)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
         actuator = Actuator(brief, session) if plant is not None else None
-        holds = Holds(brief, session, window, scheme, actuator)
+        barriers = Barriers(brief, session, window, scheme, actuator)
         session.ready()
         session.wait_for("start")
         start = time.monotonic()
@@ -155,12 +155,12 @@ def sense(brief: Brief) -> None:
             session.place.slot = k
             window.wait(k)
             # In real time a hold may be asked for at any moment before the slot is due; of one slot there is one at most.
-            while not (wanted := holds.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:
+            while not (wanted := barriers.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:
                 time.sleep(min(left, _LOOK_SECONDS))
             if wanted:
-                send(k, hold(k))
+                send(k, barrier(k))
                 began = time.monotonic()
-                holds.hold(k)
+                barriers.wait_at(k)
                 start += time.monotonic() - began
                 time.sleep(max(0.0, start + k * pace - time.monotonic()) if pace else 0.0)
             true = trajectory.advance(None if actuator is None else actuator.pushed(k))
@@ -173,9 +173,9 @@ def sense(brief: Brief) -> None:
                 raise RunError(
                     f"slot {k}: encode of the scheme {name} gave z of shape {found}; expected {x.shape}; mend the class"
                 )
-            beside = Beside(packet.header, packet.sent, x if k in betrayed else None)
+            beside = PacketExtras(packet.header, packet.sent, x if k in betrayed else None)
             send(k, uplink(k, packet.z, **beside.given))
             alarms = back.wait(k, packet) if back is not None else None
             steered = actuator.wait(k, true) if actuator is not None else None
-            holds.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
+            barriers.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
         session.wait_for("end")

@@ -260,9 +260,9 @@ def view(options: argparse.Namespace) -> int:
         return 0
     from evedrop.results.writer import load_results
     from evedrop.signals import raise_on_signals
-    from evedrop.view.viewer import Stand, open_run
+    from evedrop.view.viewer import WebAddress, open_run
 
-    stand = None if options.serve is None else Stand.of(options.serve)
+    stand = None if options.serve is None else WebAddress.of(options.serve)
     results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
     if results is not None:
         print(f"evedrop: {results.remark}", file=sys.stderr)

@@ -10,12 +10,17 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
-from evedrop.score.kept import MARKS, Kept
+from evedrop.score.kept import MARKS, SecrecyKept
 
 if TYPE_CHECKING:
-    from evedrop.studies.compare import Cell, Comparison, Measured
+    from evedrop.studies.compare import Cell, Comparison, SimulatedError
 
-WORDS = {Kept.PERFECT: "perfect", Kept.RELATIVE: "relative", Kept.UNDECIDED: "too few", Kept.BROKEN: "broken"}
+WORDS = {
+    SecrecyKept.PERFECT: "perfect",
+    SecrecyKept.RELATIVE: "relative",
+    SecrecyKept.UNDECIDED: "too few",
+    SecrecyKept.BROKEN: "broken",
+}
 """And in a word each."""
 
 
@@ -85,14 +90,14 @@ def _table(first: str, numbers: tuple[str, ...]) -> Table:
     return table
 
 
-def simulated(of: Measured) -> str:
+def simulated(of: SimulatedError) -> str:
     """The mean over trials with its standard error, or where that is no measure the median."""
     if of.infinite_variance:
         return f"{of.typical:.3g} med"
     return f"{of.mean:.3g}" if of.standard_error is None else f"{of.mean:.3g} ± {of.standard_error:.1g}"
 
 
-def theory(of: Measured) -> str:
+def theory(of: SimulatedError) -> str:
     """Over the same slots; ≥ before what is only a bound."""
     return "–" if of.theory is None else f"{'≥ ' if of.theory.bound else ''}{of.theory.mean:.3g}"
 

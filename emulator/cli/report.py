@@ -24,7 +24,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from evedrop.score.expectations_held import told
+from evedrop.score.expectations_held import format_expectation
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -185,7 +185,7 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
     for line in household_lines(summary["household"]):
         console.print(line)
     for expectation in summary["expectations"]:
-        console.print(told(expectation))
+        console.print(format_expectation(expectation))
         if "replay" in expectation:
             console.print(f"    see it again: {expectation['replay']}")
     surprising = summary["surprising"]

@@ -17,9 +17,9 @@ from evedrop.conformance.problems import Problem, large, small
 from evedrop.conformance.receivers import Step, expect_actions, expect_expected, expect_pure
 from evedrop.conformance.rules import (
     Broken,
-    Keys,
+    NamedKeys,
     Row,
-    Verdict,
+    RuleVerdict,
     calling,
     expect_bool,
     expect_names,
@@ -55,7 +55,7 @@ class Listening:
         with calling("streams()", self.kind):
             streams = self.kind.streams(self.parameters)
         mu_d = made(self.scheme_of, problem, self.scheme).state_probability
-        knowledge = Knowledge(problem.process, mu_d, self.parameters, Keys.of(streams))
+        knowledge = Knowledge(problem.process, mu_d, self.parameters, NamedKeys.of(streams))
         with calling(f"{self.kind.__name__}(knowledge, batch)", self.kind):
             return self.kind(knowledge, problem.batch)
 
@@ -84,7 +84,7 @@ class Listening:
             belief = after
 
 
-def eavesdropper_verdicts(listening: Listening) -> list[Verdict]:
+def eavesdropper_verdicts(listening: Listening) -> list[RuleVerdict]:
     """Every rule for eavesdroppers, on small problems."""
     checks = EavesdropperChecks(listening)
     at = listening.betrayed

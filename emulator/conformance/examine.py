@@ -12,7 +12,7 @@ from typing import Any
 
 from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
 from evedrop.conformance.links import DelayChecks, LossChecks
-from evedrop.conformance.rules import Broken, Verdict, calling
+from evedrop.conformance.rules import Broken, RuleVerdict, calling
 from evedrop.conformance.schemes import scheme_verdicts
 from evedrop.errors import NotRegistered, UsageError
 from evedrop.model.delays import DELAY_MODELS
@@ -36,7 +36,7 @@ class Examined:
     """One class, and what became of each rule."""
 
     title: str
-    verdicts: list[Verdict]
+    verdicts: list[RuleVerdict]
 
 
 @dataclass(frozen=True)
@@ -95,14 +95,14 @@ def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
     return examples | {entry: value for entry, value in parameters.items() if entry in kind.parameters}
 
 
-def _verdicts(option: str, one: _Named) -> list[Verdict]:
+def _verdicts(option: str, one: _Named) -> list[RuleVerdict]:
     if option == "scheme":
         return scheme_verdicts(lambda process: scheme_of(process, {"scheme": one.name, **one.parameters}), one.kind)
     checks = LossChecks if option == "link" else DelayChecks
     return checks(lambda: one.kind(**one.parameters), one.kind).verdicts()
 
 
-def _listened(one: _Named, beside: _Named) -> list[Verdict]:
+def _listened(one: _Named, beside: _Named) -> list[RuleVerdict]:
     lacking = sorted({*_streams(one)} - {*beside.kind.secret_streams})
     if lacking:
         raise UsageError(
@@ -114,7 +114,7 @@ def _listened(one: _Named, beside: _Named) -> list[Verdict]:
     try:
         return eavesdropper_verdicts(listening)
     except Broken as error:
-        return [Verdict("what it says of itself", str(error))]
+        return [RuleVerdict("what it says of itself", str(error))]
 
 
 def _streams(one: _Named) -> list[str]:

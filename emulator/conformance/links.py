@@ -16,7 +16,7 @@ from evedrop.conformance.problems import Problem, large, small
 from evedrop.conformance.receivers import SIGMAS
 from evedrop.conformance.rules import (
     Broken,
-    Verdict,
+    RuleVerdict,
     calling,
     expect_array,
     expect_finite,
@@ -44,7 +44,7 @@ class LossChecks:
     def __init__(self, model: Callable[[], LossModel], kind: type[LossModel]) -> None:
         self._model, self._kind = model, kind
 
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[RuleVerdict]:
         """Every rule, on small problems."""
         exact = [
             ("shapes and types", self.shapes),
@@ -173,7 +173,7 @@ class DelayChecks:
     def __init__(self, model: Callable[[], DelayModel], kind: type[DelayModel]) -> None:
         self._model, self._kind = model, kind
 
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[RuleVerdict]:
         """Every rule, on small problems."""
         exact = [
             ("shapes and types", self.shapes),

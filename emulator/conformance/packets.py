@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from evedrop.conformance.problems import Problem
-from evedrop.conformance.rules import Broken, Keys, Row, calling, expect_array, expect_finite, frozen, key
+from evedrop.conformance.rules import Broken, NamedKeys, Row, calling, expect_array, expect_finite, frozen, key
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Belief, Heard, Receiver
+from evedrop.model.receiver import Belief, Receiver, Reception
 from evedrop.model.schemes.scheme import Encoder, Packet, Scheme
 
 _TRIALS = "one for each of the R trials"
@@ -27,7 +27,7 @@ class Slot:
     x: Any
     """The state, (n, R)."""
     packet: Packet
-    heard: Heard
+    heard: Reception
     before: Belief
     after: Belief
 
@@ -72,7 +72,7 @@ def played(
     scheme, batch, n = made(scheme_of, problem, kind), problem.batch, problem.process.n
     encoder, estimator = _sides(scheme, problem, kind, apart)
     with calling("initial_state()", kind):
-        initial = scheme.initial_state(Keys.of(scheme.secret_streams), batch)
+        initial = scheme.initial_state(NamedKeys.of(scheme.secret_streams), batch)
     if initial is not None:
         expect_array("initial_state()", initial, np.float64, (n, batch.trials), "n states, R trials")
     trajectory = Trajectory(problem.process, key("process"), batch, initial)
@@ -98,7 +98,7 @@ def played(
 
 
 def _sides(scheme: Scheme, problem: Problem, kind: type[Scheme], apart: bool) -> tuple[Encoder, Receiver]:
-    secret, held = Keys.of(scheme.secret_streams), Keys.of(scheme.estimator_streams)
+    secret, held = NamedKeys.of(scheme.secret_streams), NamedKeys.of(scheme.estimator_streams)
     if apart:
         with calling("encoder()", kind):
             encoder = scheme.encoder(secret, problem.batch)
@@ -117,11 +117,11 @@ def _sides(scheme: Scheme, problem: Problem, kind: type[Scheme], apart: bool) ->
     return encoder, estimator
 
 
-def heard_of(packet: Packet, gamma: Any, rubbish: float) -> Heard:
+def heard_of(packet: Packet, gamma: Any, rubbish: float) -> Reception:
     """What a receiver hears of a packet, that cannot be changed."""
     gamma = gamma if packet.sent is None else gamma & packet.sent
     header = None if packet.header is None else frozen(np.where(gamma, packet.header, np.int64(min(rubbish, 2.0**40))))
-    return Heard(frozen(gamma), frozen(np.where(gamma, packet.z, rubbish)), header)
+    return Reception(frozen(gamma), frozen(np.where(gamma, packet.z, rubbish)), header)
 
 
 def expect_packet(k: int, packet: Any, scheme: Scheme, problem: Problem) -> None:

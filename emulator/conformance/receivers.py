@@ -11,14 +11,14 @@ from evedrop.conformance.problems import QUALITY, Problem
 from evedrop.conformance.rules import Broken, calling, expect_array, expect_same
 from evedrop.model import update
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Heard, Receiver
+from evedrop.model.receiver import Action, Belief, Receiver, Reception
 from evedrop.model.theory.covariances import ExpectedCovariance, OutcomesAt
 
 SIGMAS = 6.0
 """Standard deviations that chance is allowed."""
 _SLACK = 0.02
 
-Step = tuple[Belief, Heard, Belief]
+Step = tuple[Belief, Reception, Belief]
 """Before a slot, what was heard in it, after it."""
 
 

@@ -30,7 +30,7 @@ class _NotAskedFor(Exception):
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RuleVerdict:
     """What became of one rule."""
 
     rule: str
@@ -38,11 +38,11 @@ class Verdict:
     """How; None if it is kept on all problems."""
 
 
-class Keys(dict[str, bytes]):
-    """Keys of the streams that a class has named; reaching for any other is an error. Final."""
+class NamedKeys(dict[str, bytes]):
+    """NamedKeys of the streams that a class has named; reaching for any other is an error. Final."""
 
     @classmethod
-    def of(cls, streams: Sequence[str]) -> Keys:
+    def of(cls, streams: Sequence[str]) -> NamedKeys:
         """Of these streams."""
         return cls({name: stream_key(_ROOT, f"secret/{name}") for name in streams})
 
@@ -171,13 +171,13 @@ Rule = tuple[str, Callable[[Any], None]]
 """A title, and a check of one problem that raises Broken."""
 
 
-def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[Verdict]:
+def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[RuleVerdict]:
     """Every rule on every problem of its group, until one breaks it; once the very first is broken, no other is asked."""
-    verdicts: list[Verdict] = []
+    verdicts: list[RuleVerdict] = []
     for rules, problems in groups:
         for title, check in rules:
             broken = next((how for problem in problems if (how := _how_broken(check, problem)) is not None), None)
-            verdicts.append(Verdict(title, broken))
+            verdicts.append(RuleVerdict(title, broken))
             if verdicts[0].broken is not None:
                 return verdicts
     return verdicts

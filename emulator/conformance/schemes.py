@@ -12,8 +12,8 @@ from evedrop.conformance.problems import Problem, large, small
 from evedrop.conformance.receivers import SIGMAS, expect_actions, expect_expected, expect_pure
 from evedrop.conformance.rules import (
     Broken,
-    Keys,
-    Verdict,
+    NamedKeys,
+    RuleVerdict,
     calling,
     expect_bool,
     expect_names,
@@ -33,7 +33,7 @@ _QUALITIES = (0.0, 0.5, 1.0)
 _STATE = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
 
 
-def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[Verdict]:
+def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict]:
     """Every rule for schemes, on small problems; scheme_of makes the scheme of a process."""
     checks = SchemeChecks(scheme_of, kind)
     exact = [
@@ -117,7 +117,7 @@ class SchemeChecks:
         slots = self._slots(problem)
         scheme = made(self._scheme_of, problem, self._kind)
         with calling("estimator()", self._kind):
-            estimator = scheme.estimator(Keys.of(scheme.estimator_streams), problem.batch)
+            estimator = scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
         expect_pure(estimator, [(one.before, one.heard, one.after) for one in slots], problem, self._kind)
 
     def lost(self, problem: Problem) -> None:
@@ -141,7 +141,7 @@ class SchemeChecks:
         if scheme.reads_packets:
             return
         with calling("estimator()", self._kind):
-            estimator = scheme.estimator(Keys.of(scheme.estimator_streams), problem.batch)
+            estimator = scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
         steps = [(one.before, one.heard, one.after) for one in self._slots(problem)]
         expect_actions(estimator, steps, problem, self._kind, "set reads_packets = True if it depends on more than γ")
 

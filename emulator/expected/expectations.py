@@ -21,7 +21,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
 
-class Stream(Protocol):
+class ExpectedTraceStream(Protocol):
     """Expected traces, the next slots at a time."""
 
     def next_traces(self, slots: int) -> Floats:
@@ -75,7 +75,7 @@ class Expectation:
             return None
         return Expectation(self.process, self.law, self.bound_at)
 
-    def stream(self) -> Stream:
+    def stream(self) -> ExpectedTraceStream:
         """The expected traces from slot 0 on; NaN where there is no theory."""
         if self.closed is not None:
             return ClosedStream(self.closed)

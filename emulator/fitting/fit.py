@@ -15,7 +15,7 @@ from evedrop.fitting.candidate import Candidate, wilson
 from evedrop.fitting.delays import delay_candidates
 from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
 from evedrop.model.links.checks import toml_of
-from evedrop.recordings.link_recording import Outcomes, Recording
+from evedrop.recordings.link_recording import LinkRecording, Outcomes
 
 FEWEST = 100
 """Outcomes from which something can be estimated."""
@@ -25,7 +25,7 @@ DELAY = "delay"
 
 
 @dataclass(frozen=True)
-class Runs:
+class RunLengths:
     """Bursts, or gaps: runs of lost, or delivered, packets that begin and end within the recording."""
 
     count: int
@@ -45,8 +45,8 @@ class Fit:
     count: int
     lost: int
     candidates: Sequence[Candidate]
-    bursts: Runs
-    gaps: Runs
+    bursts: RunLengths
+    gaps: RunLengths
     delays: int
     """Packets whose delay was measured."""
     delay_candidates: Sequence[Candidate]
@@ -115,7 +115,7 @@ def fit(path: Path, column: str | None = None, delay_column: str | None = None) 
 
     Raises TraceError if the file is no recording, or nothing can be estimated from it.
     """
-    recording = Recording(path)
+    recording = LinkRecording(path)
     names = recording.columns()
     if column is None and len(names) == 2 and DELAY in names:
         column = next(name for name in names if name != DELAY)
@@ -159,10 +159,10 @@ def _check(path: Path, outcomes: Outcomes) -> None:
         )
 
 
-def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> Runs:
+def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
     lengths = lengths_of(outcomes == 0 if lost else outcomes == 1)
     law = RunLaw.of(chosen.spec, lost)
-    return Runs(
+    return RunLengths(
         len(lengths),
         float(lengths.mean()) if len(lengths) else None,
         law.mean,

@@ -20,7 +20,7 @@ from evedrop.model.outcomes import closed_form, eavesdropper_outcomes, legitimat
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.link import Course
+from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
@@ -215,7 +215,7 @@ def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) 
             closed = closed_form(encoding["scheme"], table.strategy) is not None
             if not closed and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
                 return f"no closed form is known for the strategy {table.strategy} of {name}"
-        if law_of(Course(link.settings(1.0), int(receiver.get("window", 0)))) is None:
+        if law_of(LinkSchedule(link.settings(1.0), int(receiver.get("window", 0)))) is None:
             return f"there is no theory for {name}'s link"
         if sound is None:
             return None

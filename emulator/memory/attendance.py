@@ -18,7 +18,7 @@ from evedrop.model.slot.transit import Transit
 from evedrop.scenario.timeline import Away
 
 
-class Attendance:
+class IntermittentReceiver:
     """Follows the slots from 0 on. Final."""
 
     def __init__(self, receiver: Receiver, window: int, outages: Sequence[Away]) -> None:

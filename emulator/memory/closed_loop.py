@@ -12,7 +12,7 @@ import numpy as np
 
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.digest import Digests, InputLog
-from evedrop.model.input_aware import Informed
+from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.plant import Drive
 from evedrop.model.process import Floats, Trajectory
 from evedrop.model.receiver import Receiver
@@ -30,7 +30,7 @@ def informed(scenario: Scenario, estimator: Receiver) -> Receiver:
     """The legitimate estimator of a scenario, told the inputs if it is to be."""
     if scenario.driven is None or not scenario.legitimate.knows_input:
         return estimator
-    return Informed(estimator, scenario.driven, scenario.window(LEGITIMATE))
+    return InputAwareEstimator(estimator, scenario.driven, scenario.window(LEGITIMATE))
 
 
 class Made(NamedTuple):
@@ -114,7 +114,7 @@ class Loop:
             self._u = self._controller.decide(k, known, self._disturbances[k])
             self._times.add([time.perf_counter() - began])
             self._drive.hold(self._u)
-        if isinstance(self._estimator, Informed):
+        if isinstance(self._estimator, InputAwareEstimator):
             self._estimator.learn(k, self._u)
         self._rows.u[row], self._rows.failed[row] = self._u, self._controller.failed
         digests = self._log.add(k, self._u, self._controller.failed)

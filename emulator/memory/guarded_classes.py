@@ -24,7 +24,7 @@ from evedrop.model.links.link import Fate
 from evedrop.model.registry import place_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.link import Course, Fates
+from evedrop.model.slot.link import Fates, LinkSchedule
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.dry_run import foreign
@@ -132,7 +132,7 @@ class Guard:
 _EACH = "one for each of the R trials"
 
 
-def _models_of(course: Course) -> Iterator[str]:
+def _models_of(course: LinkSchedule) -> Iterator[str]:
     """The names of the models of a link, at first and after changes, that are not built in."""
     for settings in (course.settings, *(change.settings or {} for change in course.changes)):
         yield from _names_in(settings)

@@ -81,7 +81,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
 
     with stop_on_signals() as stop, connected(plan.scheduler) as client:
         tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
-        with contextlib.closing(HeldFolder(new_folder(folder))) as held, said_of(folder):
+        with contextlib.closing(HeldFolder(new_folder(folder))) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
                 ResultsWriter.of(folder, scenario) as writer,
@@ -112,7 +112,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
 
 
 @contextlib.contextmanager
-def said_of(folder: Path) -> Iterator[None]:
+def disk_errors(folder: Path) -> Iterator[None]:
     """Make a full disk, or whatever else keeps results from being written, an error that says so: RunError."""
     try:
         yield

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.memory.attendance import Attendance
+from evedrop.memory.attendance import IntermittentReceiver
 from evedrop.memory.closed_loop import Loop, Source, informed
 from evedrop.memory.guarded_classes import Guard
 from evedrop.model import update
@@ -55,7 +55,7 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True)
-class Measured:
+class ReceiverChunk:
     """One receiver over c slots of R trials."""
 
     error: Floats
@@ -75,7 +75,7 @@ class Chunk:
     """Some slots, measured; its arrays are overwritten when the next one is made."""
 
     first: int
-    receivers: Mapping[str, Measured]
+    receivers: Mapping[str, ReceiverChunk]
     recorded: Slots | None
     """The recorded trials in full; exact mode only."""
     alarms: Flags | None = None
@@ -155,7 +155,7 @@ class Simulation:
         back = Acknowledging.of(self._scenario, self._keys.way_back, self._batch)
         windows = {name: self._scenario.window(name) for name in self._receivers}
         present = {
-            name: Attendance(receiver, windows[name], self._scenario.timeline.outages[name])
+            name: IntermittentReceiver(receiver, windows[name], self._scenario.timeline.outages[name])
             for name, receiver in self._receivers.items()
         }
         logs = {name: BeliefLog(n, trials, slots, self._scenario.cuts(name)) for name in self._receivers}
@@ -201,7 +201,7 @@ class Simulation:
                         loop.act(k, row, true[row], belief.x_hat)
             rows = {name: log.rows(chunk.start, chunk.stop) for name, log in logs.items()}
             measured = {
-                name: Measured(
+                name: ReceiverChunk(
                     squared_errors(x, one.x_hat),
                     trace_of(one.P.transpose(1, 2, 0, 3)),
                     one.action,
@@ -300,7 +300,7 @@ class Simulation:
             measured = {}
             for name, place in places.items():
                 trace = traces[:, place]
-                measured[name] = Measured(errors.get(name, trace), trace, actions[:, place], fates[name])
+                measured[name] = ReceiverChunk(errors.get(name, trace), trace, actions[:, place], fates[name])
             return Chunk(chunk.start, measured, None)
 
         return play
@@ -349,16 +349,16 @@ class Simulation:
                 found.add(name)
         return found
 
-    def _blank(self, chunk: range, fates: Mapping[str, Fates]) -> dict[str, Measured]:
+    def _blank(self, chunk: range, fates: Mapping[str, Fates]) -> dict[str, ReceiverChunk]:
         shape = (len(chunk), self._batch.trials)
         return {
-            name: Measured(np.empty(shape), np.empty(shape), np.empty(shape, np.uint8), codes)
+            name: ReceiverChunk(np.empty(shape), np.empty(shape), np.empty(shape, np.uint8), codes)
             for name, codes in fates.items()
         }
 
     def _acts(
-        self, k: int, row: int, measured: Mapping[str, Measured], delivered: Mapping[str, Flags]
-    ) -> Iterator[tuple[str, Codes, Measured]]:
+        self, k: int, row: int, measured: Mapping[str, ReceiverChunk], delivered: Mapping[str, Flags]
+    ) -> Iterator[tuple[str, Codes, ReceiverChunk]]:
         """Every receiver's action in slot k, which is one row of delivered (c, R)."""
         for name, one in measured.items():
             action = self._act(name, self._receivers[name], k, delivered[name][row])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.expected.expectations import expected_traces_of
-from evedrop.memory.simulation import Chunk, Measured, Mode, Simulation
+from evedrop.memory.simulation import Chunk, Mode, ReceiverChunk, Simulation
 from evedrop.model.digest import Digests
 from evedrop.model.process import Floats
 from evedrop.model.slot.account import Accountant
@@ -40,7 +40,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Block:
+class TrialBlock:
     """What one block of trials came to: everything by receiver."""
 
     start: int
@@ -56,7 +56,7 @@ class BatchResult:
     """What a task came to."""
 
     start: int
-    blocks: list[Block]
+    blocks: list[TrialBlock]
     errors: dict[str, SlotHistograms]
     traces: dict[str, SlotHistograms]
     recorded: list[Slots] = field(default_factory=list)
@@ -106,11 +106,11 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     return result
 
 
-def _empty_block(scenario: Scenario, task: Task, start: int) -> Block:
+def _empty_block(scenario: Scenario, task: Task, start: int) -> TrialBlock:
     names = scenario.receivers
     trials = min(BLOCK_TRIALS, task.stop - start)
     totals = Totals.of if task.mode is Mode.EXACT else Totals.nothing
-    return Block(
+    return TrialBlock(
         start,
         trials,
         {name: SlotSums.zero(scenario.slots) for name in names},
@@ -156,13 +156,13 @@ def _add_plant(result: BatchResult, chunk: Chunk) -> None:
             totals.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
 
 
-def _parts(blocks: list[Block], start: int, measured: Measured) -> Iterator[tuple[Block, Measured]]:
+def _parts(blocks: list[TrialBlock], start: int, measured: ReceiverChunk) -> Iterator[tuple[TrialBlock, ReceiverChunk]]:
     """What was measured, block by block."""
     for block in blocks:
         rows = slice(block.start - start, block.start - start + block.trials)
         yield (
             block,
-            Measured(
+            ReceiverChunk(
                 measured.error[:, rows],
                 measured.trace[:, rows],
                 measured.action[:, rows],

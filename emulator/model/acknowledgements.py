@@ -42,7 +42,7 @@ ATTACKS: Mapping[str, Attack] = {
 """critical blocks where γ = 1 and γᵉ = 0; forge sends one, in the user's name, where γ = 0."""
 
 
-class WayBack:
+class AckChannel:
     """Acknowledgements from user to sensor: each arrives with probability `quality`, if it is on the air. Final.
 
     spans: slots [from, to) in which the attack is on; None is always.

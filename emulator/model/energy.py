@@ -16,7 +16,7 @@ _HOUR = 3600.0
 
 
 @dataclass(frozen=True)
-class Difference:
+class EnergyDifference:
     """By how much a run's grid power differs from another's, as shares of the other's, per trial (…)."""
 
     net: Floats
@@ -72,12 +72,12 @@ class Meter:
         return self.bought, self.sold, self.other_bought, self.other_sold, self.apart
 
     @property
-    def difference(self) -> Difference:
+    def difference(self) -> EnergyDifference:
         """The three measures. Where the other's sum is 0 a share of it is infinite, or NaN if both are 0."""
         net, other_net = self.bought - self.sold, self.other_bought - self.other_sold
         total, other_total = self.bought + self.sold, self.other_bought + self.other_sold
         with np.errstate(divide="ignore", invalid="ignore"):
-            return Difference(
+            return EnergyDifference(
                 np.abs(net - other_net) / np.abs(other_net),
                 np.abs(total - other_total) / other_total,
                 self.apart / other_total,

@@ -11,7 +11,7 @@ import numpy as np
 
 from evedrop.model.plant import Plant
 from evedrop.model.process import Dynamics, Floats, Process
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 
 
 def guessed(action: Codes) -> Flags:
@@ -20,7 +20,7 @@ def guessed(action: Codes) -> Flags:
     return unread
 
 
-class Informed(Receiver):
+class InputAwareEstimator(Receiver):
     """A receiver that is told the inputs. Final.
 
     window: slots by which a packet may be late, and so the inputs of as many slots are wanted once more.
@@ -44,7 +44,7 @@ class Informed(Receiver):
         """The receiver's."""
         return self._receiver.act(k, gamma)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """The receiver's, and B u_{k−1} where no packet was read."""
         after = self._receiver.step(k, belief, heard)
         if k == 0:

@@ -24,7 +24,7 @@ level, and a copy that is told all of a wrong guess would confirm it for ever.""
 
 
 @dataclass(frozen=True)
-class House:
+class HousePlaces:
     """Where a house's quantities are in its plant: places of a state and of disturbances."""
 
     battery: int
@@ -38,7 +38,7 @@ class LoadGuess:
     controller: a copy of the house's, fresh; sun: known power in every slot, (slots,).
     """
 
-    def __init__(self, assignment: Assignment, controller: Controller, house: House, sun: Floats) -> None:
+    def __init__(self, assignment: Assignment, controller: Controller, house: HousePlaces, sun: Floats) -> None:
         self._assignment, self._controller, self._house, self._sun = assignment, controller, house, sun
         self._power, self._driven = held(assignment)
         self._disturbed = held(assignment, assignment.plant.disturbance_matrix)[1]

@@ -29,7 +29,7 @@ _NEARER = (
 )
 
 
-class Step(NamedTuple):
+class FilterStep(NamedTuple):
     """The filter in one slot."""
 
     gain: Floats
@@ -49,10 +49,10 @@ class Steps:
         self._A, self._W = process.A, plant.noise
         self._C, self._V = plant.output_matrix, plant.measurement_noise
         self._predicted = process.initial_covariance
-        self._last: Step | None = None
+        self._last: FilterStep | None = None
         self.settled = False
 
-    def next(self) -> Step:
+    def next(self) -> FilterStep:
         """The next slot's. Raises ValueError where measurements have no noise and tell nothing new."""
         if self.settled and self._last is not None:
             return self._last
@@ -66,13 +66,13 @@ class Steps:
         after = 0.5 * (after + after.T)
         predicted = product(product(self._A, after), _transposed(self._A)) + self._W
         innovation = product(product(K, S), _transposed(K))
-        step = Step(K, after, 0.5 * (innovation + innovation.T))
+        step = FilterStep(K, after, 0.5 * (innovation + innovation.T))
         self.settled = bool(np.abs(predicted - P).max() <= _SETTLED * np.abs(predicted).max())
         self._predicted, self._last = predicted, step
         return step
 
 
-def settled(process: Process, plant: Plant) -> Step:
+def settled(process: Process, plant: Plant) -> FilterStep:
     """The filter in the end. Raises ValueError if it never settles, or is of no use: it trusts no measurement any more."""
     steps = Steps(process, plant)
     marks = []

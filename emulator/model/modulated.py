@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.links.link import Chain
-from evedrop.model.modulated_block import BLOCK, PARTS, Block
+from evedrop.model.modulated_block import BLOCK, PARTS, LinearBlock
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_law import LinkLaw, Segment
 from evedrop.model.theory.covariances import (
@@ -50,7 +50,7 @@ class ModulatedCovariance:
         self._window: deque[_Slot] = deque(maxlen=law.window)
         self._before: Floats | None = None
         self._traces: Floats = np.empty(0)
-        self._blocks: dict[int, Block] = {}
+        self._blocks: dict[int, LinearBlock] = {}
 
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,); inf once it overflows."""
@@ -74,7 +74,7 @@ class ModulatedCovariance:
             return traces
         return self._slot_by_slot(segment, 1 if k == segment.start else min(until - k, BLOCK))
 
-    def _block_of(self, segment: Segment) -> Block | None:
+    def _block_of(self, segment: Segment) -> LinearBlock | None:
         """The operator of the segment's blocks; None where its slots are not alike, or too large to be worth it."""
         if self._law.window or self._remaining is not None or segment.quality_at is not None:
             return None
@@ -83,10 +83,10 @@ class ModulatedCovariance:
         if segment.start not in self._blocks:
             odds = self._odds(segment.quality(range(segment.start, segment.start + 1))[0])
             with np.errstate(over="ignore", invalid="ignore"):
-                self._blocks[segment.start] = Block.of(self._process, segment.chain, odds)
+                self._blocks[segment.start] = LinearBlock.of(self._process, segment.chain, odds)
         return self._blocks[segment.start]
 
-    def _in_a_block(self, block: Block) -> Floats | None:
+    def _in_a_block(self, block: LinearBlock) -> Floats | None:
         """The traces of a block; None, and nothing is changed, if something in it is beyond double precision."""
         assert self._settled is not None  # noqa: S101 - a block does not begin with slot 0
         assert self._before is not None  # noqa: S101 - the same

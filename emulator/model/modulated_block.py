@@ -23,7 +23,7 @@ PARTS = ("kept", "predicted", "misled", "leaked", "initial")
 
 
 @dataclass(frozen=True)
-class Block:
+class LinearBlock:
     """Final."""
 
     traces: Floats
@@ -34,7 +34,7 @@ class Block:
     """Whether v has Σ: only an error that may grow with it is told of it, for Σ may be beyond double precision."""
 
     @classmethod
-    def of(cls, process: Process, chain: Chain, odds: Mapping[str, Floats]) -> Block:
+    def of(cls, process: Process, chain: Chain, odds: Mapping[str, Floats]) -> LinearBlock:
         """Of a chain with the outcomes' probabilities in its states, (S,) each; nothing may leak."""
         n, states = process.n, len(chain.law)
         size = n * n

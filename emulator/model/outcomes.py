@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
-from evedrop.model.eavesdroppers.constant import Constant
+from evedrop.model.eavesdroppers.constant import ConstantEstimate
 from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.scheme import Scheme
@@ -48,7 +48,7 @@ def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str
     if kind.outcomes(parameters, scheme.state_probability) is None:
         return None
     reader = READERS[parameters["reads_as"]] if "reads_as" in kind.parameters else kind
-    if type(scheme) is Innovation or reader is Constant:
+    if type(scheme) is Innovation or reader is ConstantEstimate:
         return kind.outcomes(parameters, scheme.state_probability)
     if not issubclass(reader, PacketTaker):
         return None

@@ -7,7 +7,7 @@ from abc import abstractmethod
 import numpy as np
 
 from evedrop.model import update
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 
 _ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)
 
@@ -28,7 +28,7 @@ class PacketUser(Receiver):
         used = gamma if uses is None else gamma & uses
         return _ACTIONS[gamma.view(np.uint8) + used.view(np.uint8)]
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is used."""
         action = self.act(k, heard.gamma)
         return Belief(

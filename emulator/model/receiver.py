@@ -29,7 +29,7 @@ class Action(IntEnum):
     """The packet was received and not used."""
 
 
-class Heard(NamedTuple):
+class Reception(NamedTuple):
     """What a receiver got in a slot, for R trials."""
 
     gamma: Flags
@@ -108,5 +108,5 @@ class Receiver(ABC):
         """`Action` of slot k in every trial, (R,), from γ (R,) alone: no scheme of this kind looks at the packet first."""
 
     @abstractmethod
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Belief after slot k, from the one before it and what was heard in it. Any slot may be asked for again."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evedrop.kernels.elementary import inverse
 from evedrop.model.process import Dynamics, Floats, Process, product
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Heard, Receiver, trace_of
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception, trace_of
 from evedrop.model.theory.covariances import radius
 from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 
@@ -110,7 +110,7 @@ class ReferenceReceiver(Receiver):
         """Not to be told: it depends on the packet's header."""
         raise NotImplementedError("what becomes of a slot depends on the header; only packets themselves can tell")
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if nothing is read; else (z, 0), or z and what is known of the reference.
 
         A packet without a header has no reference: it is taken for the state.

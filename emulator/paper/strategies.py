@@ -14,7 +14,7 @@ import numpy as np
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process, Trajectory
-from evedrop.model.receiver import Heard, Receiver
+from evedrop.model.receiver import Receiver, Reception
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.link import link_of
 from evedrop.model.theory.covariances import Outcomes, expected_traces
@@ -50,7 +50,7 @@ def outcomes() -> dict[str, Outcomes]:
 
 
 @dataclass(frozen=True)
-class Runs:
+class SimulatedRuns:
     """Means over trials and their standard errors, (slots,), by receiver: squared error, and trace of its own P."""
 
     squared_error: dict[str, tuple[Floats, Floats]]
@@ -58,20 +58,20 @@ class Runs:
     trials: int
 
 
-def simulate(trials: int, progress: Callable[[str], None]) -> Runs:
+def simulate(trials: int, progress: Callable[[str], None]) -> SimulatedRuns:
     """The scheme, its links and its receivers as they run in the emulator, over many trials."""
     sums = {name: np.zeros((4, SLOTS)) for name in _LOOKS}
     for first in range(0, trials, _BATCH):
         progress(f"strategies: trial {first} of {trials}")
         _simulate_batch(Batch(SLOTS, min(_BATCH, trials - first), first), sums)
-    return Runs(
+    return SimulatedRuns(
         {name: _mean_and_error(total[0], total[1], trials) for name, total in sums.items()},
         {name: _mean_and_error(total[2], total[3], trials) for name, total in sums.items()},
         trials,
     )
 
 
-def draw(path: Path, runs: Runs) -> str:
+def draw(path: Path, runs: SimulatedRuns) -> str:
     """Draw the figure; its caption."""
     k = np.arange(SLOTS)
     with panels(path, 2, 9.6, 4.2) as (actual, believed):
@@ -117,7 +117,7 @@ def _simulate_batch(batch: Batch, sums: dict[str, Floats]) -> None:
         x = trajectory.advance()
         z = encoder.encode(k, x, trajectory.predicted).z
         for name, receiver in receivers.items():
-            beliefs[name] = receiver.step(k, beliefs[name], Heard(gammas[name != "legitimate"], z))
+            beliefs[name] = receiver.step(k, beliefs[name], Reception(gammas[name != "legitimate"], z))
             squared_error = np.sum((x - beliefs[name].x_hat) ** 2, axis=0)
             trace = np.trace(beliefs[name].P)
             for row, value in enumerate((squared_error, squared_error**2, trace, trace**2)):

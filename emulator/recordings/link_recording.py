@@ -32,7 +32,7 @@ _LONGEST_VALUE = 100  # characters of a text that stands where a number should
 _MOST_NAMES = 20  # columns that a message names
 
 
-class Recording:
+class LinkRecording:
     """A recording in a file, read whenever it is asked. Final.
 
     Raises TraceError for what is no file.

@@ -18,21 +18,21 @@ _INPUTS = ("u", "d", "failed")
 
 
 @dataclass(frozen=True)
-class Difference:
+class RunDifference:
     """The first difference, and whether there is one at all."""
 
     same: bool
     text: str
 
 
-def difference(a: Results, b: Results) -> Difference:
+def difference(a: Results, b: Results) -> RunDifference:
     """Compare what every receiver received and believed, trial by trial, over the trials and receivers both have."""
     blocks_a, blocks_b = _blocks(a), _blocks(b)
     ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
     common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]
     first = _first(a, b)
     if not common and first is None:
-        return Difference(
+        return RunDifference(
             False, "the runs have no whole block of a trial and receiver in common; compare runs of one scenario"
         )
     unequal = sorted(
@@ -41,14 +41,14 @@ def difference(a: Results, b: Results) -> Difference:
     only = len(blocks_a) + len(blocks_b) - 2 * len(common)
     rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
     if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
-        return Difference(False, first.text + rest)
+        return RunDifference(False, first.text + rest)
     if not unequal:
         peers = ", ".join(sorted({peer for peer, _, _ in common}))
-        return Difference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
+        return RunDifference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
     block, trial, peer = unequal[0]
     slots = f"slots {block} to {ends_a[peer, block] - 1}"
     remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
-    return Difference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
+    return RunDifference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
 
 
 def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:

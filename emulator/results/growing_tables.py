@@ -39,7 +39,7 @@ _TAIL_BYTES = 65_536  # more than the longest line of the rounds
 
 
 @final
-class Stream:
+class TableStream:
     """An Arrow IPC stream that grows: one table of a run. Rows are held back until the next round."""
 
     def __init__(self, path: Path, schema: pa.Schema, names: Mapping[str, tuple[str, ...]]) -> None:
@@ -136,7 +136,7 @@ class _Sink:
 
 
 @dataclass(frozen=True)
-class Round:
+class TableRound:
     """What an unfinished results folder has on disk."""
 
     at: str = ""
@@ -159,7 +159,7 @@ class Unfinished:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
 
-    def round(self, at: str, slots: int, streams: Mapping[str, Stream]) -> None:
+    def round(self, at: str, slots: int, streams: Mapping[str, TableStream]) -> None:
         """Write what every stream holds back, then the line that makes it count. Raises OSError if that fails."""
         for stream in streams.values():
             stream.write()
@@ -196,20 +196,20 @@ def goes_on(folder: Path) -> bool:
     return False
 
 
-def last_round(folder: Path) -> Round:
+def last_round(folder: Path) -> TableRound:
     """What a results folder has in streams: the last round that was written whole; nothing if there was none."""
     try:
         with (folder / UNFINISHED / _ROUNDS).open("rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
             lines = file.read().rpartition(b"\n")[0].splitlines()
     except OSError:
-        return Round()
+        return TableRound()
     for line in reversed(lines):
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
             found = json.loads(line)
             tables = {str(name): (Path(str(file)).name, int(rows)) for name, (file, rows) in found["tables"].items()}
-            return Round(str(found["at"]), int(found["slots"]), tables)
-    return Round()
+            return TableRound(str(found["at"]), int(found["slots"]), tables)
+    return TableRound()
 
 
 def write_figures(folder: Path, text: str) -> None:

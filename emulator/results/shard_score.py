@@ -15,7 +15,7 @@ from evedrop.score.totals import Totals
 _NAME = "score"
 
 
-def leave(totals: Totals, folder: Path) -> None:
+def dump_score(totals: Totals, folder: Path) -> None:
     """Write them into a results folder, whole at any moment and for nobody else to read or change."""
     unfinished = folder / f"{_NAME}.new"
     with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
@@ -23,7 +23,7 @@ def leave(totals: Totals, folder: Path) -> None:
     os.replace(unfinished, folder / _NAME)
 
 
-def left(folder: Path, scenario: Scenario) -> Totals:
+def load_score(folder: Path, scenario: Scenario) -> Totals:
     """Those in a results folder; of nothing, where whoever should have left them was killed before."""
     try:
         with (folder / _NAME).open("rb") as file:

@@ -23,7 +23,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.names import CONTROLLER
-from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish, write_figures
+from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_figures
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.input_table import input_columns, inputs_schema
 from evedrop.results.reading import Results, load_results
@@ -82,16 +82,16 @@ class ResultsWriter:
             plant, disturbances = loop
             self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1]), {})
         self._streams = {name: self._stream(name, 0) for name in self._kinds}
-        self._outdated: list[Stream] = []
+        self._outdated: list[TableStream] = []
         self._restarts = self._bytes = self._on_disk = self._slots = 0
         self._at = "slot 0"
         self._broken = self._figures_before = False
         self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
         self._round()
 
-    def _stream(self, name: str, number: int) -> Stream:
+    def _stream(self, name: str, number: int) -> TableStream:
         schema, names = self._kinds[name]
-        return Stream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
+        return TableStream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
 
     @classmethod
     def of(cls, folder: Path, scenario: Scenario) -> Self:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from evedrop.kernels.elementary import semidefinite_factor
-from evedrop.model.local_filter import MOST_STATES, Step, settled
+from evedrop.model.local_filter import MOST_STATES, FilterStep, settled
 from evedrop.model.process import Floats, Process
 from evedrop.scenario.plant import PlantTable, plant_of
 from evedrop.scenario.process import ProcessTable
@@ -46,7 +46,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
     return []
 
 
-def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> Step:
+def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterStep:
     """The filter of tables in the end. Raises ValidationError or ValueError where they have none."""
     made = ProcessTable.model_validate({**process, "Q": np.eye(len(process["A"])).tolist(), "singular_noise": False})
     table = PlantTable.model_validate(without_disturbances(plant))

@@ -13,7 +13,7 @@ import numpy as np
 
 from evedrop.errors import TraceError
 from evedrop.model.delays.trace import MOST_DELAYS
-from evedrop.recordings.link_recording import Recording
+from evedrop.recordings.link_recording import LinkRecording
 from evedrop.scenario.words import as_toml
 
 _STAND_IN = "1"  # for a recording that cannot be read: it is complained of once
@@ -81,7 +81,7 @@ def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
     if wrong:
         return wrong
     try:
-        recording = Recording(Path(file))
+        recording = LinkRecording(Path(file))
         if entry == "outcomes":
             trace[entry] = (recording.outcomes(column) + ord("0")).tobytes().decode()
         else:

@@ -10,7 +10,7 @@ from typing import Any
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, contents
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.slot.link import Course, streams_of
+from evedrop.model.slot.link import LinkSchedule, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
 from evedrop.scenario import Scenario
 from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
@@ -51,11 +51,11 @@ class StreamKeys:
         """Of the sensor's process noise."""
         return stream_key(self.seed_root, "process")
 
-    def link(self, receiver: str, course: Course) -> dict[str, bytes]:
+    def link(self, receiver: str, course: LinkSchedule) -> dict[str, bytes]:
         """Of all that a receiver's link draws from."""
         return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
 
-    def links(self, courses: Mapping[str, Course]) -> dict[str, bytes]:
+    def links(self, courses: Mapping[str, LinkSchedule]) -> dict[str, bytes]:
         """Of all links."""
         return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
 

@@ -18,7 +18,7 @@ from evedrop.model.eavesdroppers import ANSWERS, READERS, STRATEGIES
 from evedrop.model.plant import Plant
 from evedrop.model.registry import asked, is_own
 from evedrop.model.schemes import SCHEMES
-from evedrop.model.slot.link import Course
+from evedrop.model.slot.link import LinkSchedule
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
 from evedrop.scenario.events import EventTable
@@ -315,10 +315,10 @@ class Scenario(Table):
         """A link's settings with some entries changed; those of an earlier event are among them already."""
         return changed_link(self.link(receiver), changes).settings(self.slot_seconds)
 
-    def course(self, receiver: str) -> Course:
+    def course(self, receiver: str) -> LinkSchedule:
         """All that is known of a receiver's link in advance."""
         link = self.link(receiver)
-        return Course(
+        return LinkSchedule(
             link.settings(self.slot_seconds),
             self.window(receiver),
             self.timeline.changes[receiver],

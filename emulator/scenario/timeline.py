@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.model.links.link import Fate
-from evedrop.model.slot.link import NEVER, Change, Outage
+from evedrop.model.slot.link import NEVER, Change, ReceiverOutage
 from evedrop.scenario.events import EventTable
 from evedrop.scenario.words import as_toml
 
@@ -52,7 +52,7 @@ class Act:
 
 
 @dataclass(frozen=True)
-class Away(Outage):
+class Away(ReceiverOutage):
     """An outage of a receiver, and what it knows when it is back."""
 
     keeps_state: bool = True

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.acknowledgements import WayBack, rates_of
-from evedrop.model.numeric.detection import Chart, Watch, chart_for
+from evedrop.model.acknowledgements import AckChannel, rates_of
+from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
@@ -63,9 +63,9 @@ class Acknowledging:
     """The way back in memory: what the legitimate estimator, the router and the sensor's watch do of a live run. Final."""
 
     def __init__(self, spec: WayBackSpec, chart: Chart | None, key: bytes, batch: Batch) -> None:
-        self._way = WayBack(spec.attack, spec.quality, key, batch, spec.spans)
+        self._way = AckChannel(spec.attack, spec.quality, key, batch, spec.spans)
         self._jammer = spec.jammer
-        self._watch = None if chart is None else Watch(chart, batch.trials)
+        self._watch = None if chart is None else CusumBatch(chart, batch.trials)
         self.alarms: Flags = np.zeros(batch.trials, np.bool_)
         """Where the last slot has raised an alarm, (R,)."""
 

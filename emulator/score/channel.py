@@ -13,7 +13,7 @@ import numpy as np
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain, LossModel
-from evedrop.model.slot.link import Course
+from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import stretches
 from evedrop.scenario import Scenario
 from evedrop.score.sums import Tally
@@ -88,7 +88,7 @@ def interval(rate: float, expected: float, variance: float) -> tuple[float, floa
     return low, high
 
 
-def _pieces(course: Course, done: int) -> list[tuple[range, LossModel]]:
+def _pieces(course: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
     """The slots below `done` in which packets met a loss model, and the model."""
     marks = stretches(course)
     ends = [*(start for start, _, _ in marks[1:]), done]
@@ -118,7 +118,7 @@ def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
     return float(chain.law @ lost) / begins if begins > 0.0 else None
 
 
-def _delays(course: Course, tally: Tally) -> dict[str, Any]:
+def _delays(course: LinkSchedule, tally: Tally) -> dict[str, Any]:
     """Fractions of the packets that came through by the slots they took, the last for more than the window; quantiles."""
     total = int(tally.delays.sum())
     if course.settings.get("delay") is None or not total:
@@ -131,7 +131,7 @@ def _delays(course: Course, tally: Tally) -> dict[str, Any]:
     }
 
 
-def _expected_delays(course: Course) -> list[float] | None:
+def _expected_delays(course: LinkSchedule) -> list[float] | None:
     """The same by the model, of a link whose delays stay the same and which has no queue."""
     if any(change.settings is not None for change in course.changes) or course.settings.get("rate", 1.0) < 1.0:
         return None

@@ -35,7 +35,7 @@ def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
     return f"evedrop montecarlo {where} --trials {scenario.trials}{_MODES[mode]}"
 
 
-def told(expectation: Mapping[str, Any]) -> str:
+def format_expectation(expectation: Mapping[str, Any]) -> str:
     """An expectation of a summary as a sentence."""
     found, held = expectation["found"], expectation["held"]
     word = {True: "held", False: "FAILED", None: "this run does not tell"}[held]

@@ -14,7 +14,7 @@ import numpy as np
 from evedrop.model import privacy
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.energy import Meter, energy
-from evedrop.model.load_guess import House, LoadGuess
+from evedrop.model.load_guess import HousePlaces, LoadGuess
 from evedrop.model.perfect import PerfectLoop
 from evedrop.model.process import Floats
 from evedrop.scenario import Scenario
@@ -28,7 +28,7 @@ def guesses_of(scenario: Scenario, table: HouseholdTable, trials: int) -> dict[s
     assert plant is not None and controller is not None and assignment is not None  # noqa: S101, PT018 - a house has them
     names, strategy = plant.disturbances, CONTROLLERS[controller.strategy]
     sun = None if table.sun is None else names.index(table.sun)
-    house = House((scenario.process.states or []).index(table.battery), names.index(table.load), sun)
+    house = HousePlaces((scenario.process.states or []).index(table.battery), names.index(table.load), sun)
     shone = np.zeros(scenario.slots) if sun is None else disturbances_of(scenario)[:, sun]
     return {name: LoadGuess(assignment, strategy(assignment, trials), house, shone) for name in scenario.receivers}
 

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     pass
 
 
-class Kept(StrEnum):
+class SecrecyKept(StrEnum):
     """What a scheme keeps secret from an adversary, in a word."""
 
     PERFECT = "perfect"
@@ -18,5 +18,5 @@ class Kept(StrEnum):
     BROKEN = "broken"
 
 
-MARKS = {Kept.PERFECT: "●", Kept.RELATIVE: "◐", Kept.UNDECIDED: "?", Kept.BROKEN: "✕"}
+MARKS = {SecrecyKept.PERFECT: "●", SecrecyKept.RELATIVE: "◐", SecrecyKept.UNDECIDED: "?", SecrecyKept.BROKEN: "✕"}
 """Verdicts as marks that can be told apart without colours."""

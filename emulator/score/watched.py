@@ -24,7 +24,7 @@ _LATE = {"received_fraction": 0, "used_fraction": 1}
 Late = Sequence[NDArray[np.uint16]] | NDArray[np.uint16]
 
 
-class Watch(NamedTuple):
+class WatchedSlots(NamedTuple):
     """What to keep of which slots, from first to before end."""
 
     what: str
@@ -33,15 +33,15 @@ class Watch(NamedTuple):
     end: int
 
 
-def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, Watch] | None:
+def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
     """Receiver, and what an expectation needs kept of it; None where the summary's figures, or theory, will do."""
     if expect.in_step is not None:
-        return expect.in_step, Watch(IN_STEP, _since(scenario, expect), scenario.slots)
+        return expect.in_step, WatchedSlots(IN_STEP, _since(scenario, expect), scenario.slots)
     if expect.figure is None or (expect.slots is None and expect.quantile is None):
         return None
     receiver, _, figure = expect.figure.partition(".")
     first, end = expect.slots or (0, scenario.slots)
-    return None if figure == "expected_trace_covariance" else (receiver, Watch(figure, first, end))
+    return None if figure == "expected_trace_covariance" else (receiver, WatchedSlots(figure, first, end))
 
 
 def _since(scenario: Scenario, expect: ExpectTable) -> int:
@@ -53,7 +53,7 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
     return max(over, default=0)
 
 
-def watches_of(scenario: Scenario) -> dict[str, tuple[Watch, ...]]:
+def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
     """Receiver → all that the scenario's expectations need kept of it."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
     return {name: tuple(dict.fromkeys(watch for one, watch in wanted if one == name)) for name in scenario.receivers}
@@ -62,7 +62,7 @@ def watches_of(scenario: Scenario) -> dict[str, tuple[Watch, ...]]:
 class Watched:
     """What was kept of R trials. Final."""
 
-    def __init__(self, watches: Iterable[Watch], trials: int) -> None:
+    def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
         self._trials = trials
         # Of the believed trace no trial's own is known in a live run: its entry is the sum over all trials.
         self._kept = {
@@ -88,19 +88,19 @@ class Watched:
                 if late is not None and watch.what in _LATE:
                     np.add(kept, late[_LATE[watch.what]][rows].sum(axis=0), out=kept)
 
-    def means(self, watch: Watch) -> Floats:
+    def means(self, watch: WatchedSlots) -> Floats:
         """A figure's mean over the slots, of each trial, (R,)."""
         return self._kept[watch] / (watch.end - watch.first)
 
-    def mean(self, watch: Watch) -> float:
+    def mean(self, watch: WatchedSlots) -> float:
         """A figure's mean over the slots and trials."""
         return float(self.means(watch).sum()) / self._trials
 
-    def quantile(self, watch: Watch, level: float) -> float:
+    def quantile(self, watch: WatchedSlots, level: float) -> float:
         """A quantile over trials of a trial's mean over the slots."""
         return float(np.quantile(self.means(watch), level))
 
-    def in_step(self, watch: Watch) -> int | None:
+    def in_step(self, watch: WatchedSlots) -> int | None:
         """The largest over trials of the first slot in which a packet was used as the state; None if a trial has none."""
         kept = self._kept[watch]
         return None if (kept == _NEVER).any() else int(kept.max())

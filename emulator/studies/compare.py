@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.expected.expectations import Expectation, expectations_of
-from evedrop.memory.montecarlo import Merger, News, Plan, results_of, said_of, teller
+from evedrop.memory.montecarlo import Merger, News, Plan, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.model.process import MARGINAL, Floats
@@ -38,7 +38,7 @@ from evedrop.results.resolved_scenario import resolved
 from evedrop.results.writer import plain
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
-from evedrop.score.kept import Kept
+from evedrop.score.kept import SecrecyKept
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.score.verdict import Secrecy, Verdict
@@ -65,7 +65,7 @@ class Theory:
 
 
 @dataclass(frozen=True)
-class Measured:
+class SimulatedError:
     """A receiver's squared error in simulation, over all slots; theory beside it."""
 
     mean: float
@@ -88,9 +88,9 @@ class Cell:
     """One adversary against one scheme."""
 
     match: Match
-    legitimate: Measured | None = None
+    legitimate: SimulatedError | None = None
     """The user, meanwhile: an attack may concern it too."""
-    eavesdropper: Measured | None = None
+    eavesdropper: SimulatedError | None = None
     secrecy: Secrecy | None = None
 
     @property
@@ -109,20 +109,20 @@ class Cell:
         return other / user if user else math.inf
 
     @property
-    def verdict(self) -> Kept | None:
+    def verdict(self) -> SecrecyKept | None:
         """What the run shows; that an error is unbounded, or that two are equal, is for theory to say as well."""
         secrecy, other, user = self.secrecy, self.eavesdropper, self.legitimate
         if secrecy is None or other is None or user is None:
             return None
         if secrecy.relative is Verdict.FAILED:
-            return Kept.BROKEN
+            return SecrecyKept.BROKEN
         unbounded = _limit(other) == math.inf and _limit(user) < math.inf
         if secrecy.perfect is Verdict.HELD and unbounded:
-            return Kept.PERFECT
+            return SecrecyKept.PERFECT
         if secrecy.relative is Verdict.HELD:
-            return Kept.RELATIVE
+            return SecrecyKept.RELATIVE
         denied = secrecy.relative_by_theory is False and secrecy.relative_from is None and not unbounded
-        return Kept.BROKEN if denied else Kept.UNDECIDED
+        return SecrecyKept.BROKEN if denied else SecrecyKept.UNDECIDED
 
     def as_dict(self) -> dict[str, Any]:
         """As in compare.json."""
@@ -169,7 +169,7 @@ class SchemeResult:
     name: str
     parameters: Mapping[str, Any]
     needs: Needs
-    legitimate: Measured
+    legitimate: SimulatedError
     """The user, with nobody meddling."""
     cells: Mapping[str, Cell]
     """By adversary, all of them."""
@@ -192,17 +192,17 @@ class SchemeResult:
         return max(_lasting(one) for one in users)
 
 
-def _limit(of: Measured) -> float:
+def _limit(of: SimulatedError) -> float:
     known = None if of.theory is None else of.theory.limit
     return math.nan if known is None else known
 
 
-def _error(of: Measured | None) -> float:
+def _error(of: SimulatedError | None) -> float:
     assert of is not None  # noqa: S101 - asked by the caller
     return of.typical if of.theory is None or of.theory.bound else of.theory.mean
 
 
-def _lasting(of: Measured) -> float:
+def _lasting(of: SimulatedError) -> float:
     known = _limit(of)
     return of.typical if math.isnan(known) else known
 
@@ -303,7 +303,10 @@ def compare_all(matchups: Matchups, folder: Path, tell: Callable[[News], None], 
     with stop_on_signals() as stop, connected(plan.scheduler) as client:
         new_folder(folder)
         everything = list(itertools.chain(*tasks))
-        with said_of(folder), contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+        with (
+            disk_errors(folder),
+            contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results,
+        ):
             written, took = time.monotonic(), 0.0
             try:
                 for group, its_tasks in zip(groups, tasks, strict=True):
@@ -384,11 +387,11 @@ def _needs(scenario: Scenario, user: Tally) -> Needs:
     )
 
 
-def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expectation) -> Measured:
+def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expectation) -> SimulatedError:
     means = trial_means(tally)
     heavy = expected.infinite_variance
     spread = None if heavy or len(means) < 2 else float(np.std(means, ddof=1)) / math.sqrt(len(means))
-    return Measured(
+    return SimulatedError(
         tally.figures["mean_squared_error"],
         spread,
         {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
@@ -433,7 +436,7 @@ def _grows(scenario: Scenario) -> bool:
 def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:
     from evedrop.view.comparison_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
 
-    with said_of(folder):
+    with disk_errors(folder):
         _write_found(folder, found)
         scenarios = folder / "scenarios"
         make_private(scenarios)

@@ -20,7 +20,7 @@ from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.results.folder import claimed, default_folder
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
-from evedrop.score.expectations_held import told
+from evedrop.score.expectations_held import format_expectation
 
 
 class Outcome(Enum):
@@ -135,4 +135,4 @@ def _reasons(summary: Mapping[str, Any]) -> Iterator[str]:
     for expectation in summary["expectations"]:
         if expectation["held"] is not True:
             replay = expectation.get("replay")
-            yield told(expectation) + (f"; see it again: {replay}" if replay is not None else "")
+            yield format_expectation(expectation) + (f"; see it again: {replay}" if replay is not None else "")

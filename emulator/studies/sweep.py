@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.loading import load, value_of
-from evedrop.memory.montecarlo import Merger, Plan, check_mode, results_of, said_of, teller
+from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
@@ -104,7 +104,7 @@ def sweep_over(
         new_folder(folder)
         told = teller(tell, total)
         everything = list(itertools.chain(*tasks))
-        with said_of(folder):
+        with disk_errors(folder):
             text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
             write_private(folder / "sweep.json", text + "\n")
             with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:

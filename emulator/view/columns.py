@@ -1,4 +1,4 @@
-"""Slots as columns of the recording: what each panel is made of, and in which style."""
+"""SceneSlots as columns of the recording: what each panel is made of, and in which style."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.view.column import Column, scalars
 from evedrop.view.events import Event, Watcher
 from evedrop.view.lanes import Lane
 from evedrop.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
-from evedrop.view.scene import PeerSlots, Scene, Slots
+from evedrop.view.scene import PeerSlots, Scene, SceneSlots
 
 
 class Columns:
@@ -33,7 +33,7 @@ class Columns:
         self._trails = {name: plane.Trail(every) for name in (paths.TRUTH, *(r.name for r in scene.receivers))}
         self._watchers = {shown.name: Watcher(shown, scene) for shown in scene.receivers}
 
-    def of(self, slots: Slots) -> list[Column]:
+    def of(self, slots: SceneSlots) -> list[Column]:
         """The columns of the next slots."""
         k = np.arange(slots.first, slots.first + slots.count)
         columns: list[Column] = []
@@ -72,7 +72,7 @@ class Columns:
             logarithms: Floats = np.log10(np.maximum(values, self._floor))
         return logarithms
 
-    def _truth(self, k: NDArray[np.int64], slots: Slots) -> Iterator[Column]:
+    def _truth(self, k: NDArray[np.int64], slots: SceneSlots) -> Iterator[Column]:
         at = plane.frames(self._scene, slots.first, slots.count)
         positions = plane.on_plane(slots.x)
         yield from self._moving(paths.TRUTH, k, positions, at)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.score.kept import MARKS, Kept
+from evedrop.score.kept import MARKS, SecrecyKept
 from evedrop.view.figure_style import panels
 
 if TYPE_CHECKING:
@@ -16,13 +16,23 @@ if TYPE_CHECKING:
     from evedrop.studies.compare import Cell, Comparison, SchemeResult
 
 # Blue for what is kept and orange for what is not, the deeper the surer: apart for every kind of colour-blindness, and in grey.
-_GROUND = {Kept.PERFECT: "#1f6fb2", Kept.RELATIVE: "#a9cdea", Kept.UNDECIDED: "#f1efe8", Kept.BROKEN: "#e8833a"}
-_INK = {Kept.PERFECT: "white", Kept.RELATIVE: "#10202e", Kept.UNDECIDED: "#3c3c3c", Kept.BROKEN: "#2a1200"}
+_GROUND = {
+    SecrecyKept.PERFECT: "#1f6fb2",
+    SecrecyKept.RELATIVE: "#a9cdea",
+    SecrecyKept.UNDECIDED: "#f1efe8",
+    SecrecyKept.BROKEN: "#e8833a",
+}
+_INK = {
+    SecrecyKept.PERFECT: "white",
+    SecrecyKept.RELATIVE: "#10202e",
+    SecrecyKept.UNDECIDED: "#3c3c3c",
+    SecrecyKept.BROKEN: "#2a1200",
+}
 _SAID = {
-    Kept.PERFECT: "perfect: its error grows without bound",
-    Kept.RELATIVE: "relative: it stays above the legitimate error",
-    Kept.UNDECIDED: "too few trials to tell",
-    Kept.BROKEN: "broken",
+    SecrecyKept.PERFECT: "perfect: its error grows without bound",
+    SecrecyKept.RELATIVE: "relative: it stays above the legitimate error",
+    SecrecyKept.UNDECIDED: "too few trials to tell",
+    SecrecyKept.BROKEN: "broken",
 }
 _NOTABLE = 1.1  # times: the share by which an attack must raise the user's error to be noted
 _FACTS = ("legitimate\nerror", "ACKs", "bits a\npacket", "secret bits\na slot (+ once)")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from evedrop.view import paths
 from evedrop.view.column import Column, scalars
 from evedrop.view.palette import TRUTH_CURVE, Colour, colour
-from evedrop.view.scene import Moved, Scene, Slots
+from evedrop.view.scene import Moved, Scene, SceneSlots
 
 _MOST_POINTS = 20_000  # of a curve over a run: a day of seconds is drawn every five seconds
 _MOVING: tuple[Colour, ...] = (
@@ -33,7 +33,7 @@ BOUGHT: Colour = (222, 92, 82)
 SOLD: Colour = (60, 180, 120)
 
 
-def columns(scene: Scene, k: NDArray[np.int64], slots: Slots, moved: Moved) -> Iterator[Column]:
+def columns(scene: Scene, k: NDArray[np.int64], slots: SceneSlots, moved: Moved) -> Iterator[Column]:
     """The columns of some slots k."""
     at = np.flatnonzero(k % math.ceil(scene.slots / _MOST_POINTS) == 0)
     if len(at):

@@ -16,7 +16,7 @@ from evedrop.model.process import Floats
 from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
 from evedrop.score.household_tally import guesses_of
-from evedrop.view.scene import House, Moved
+from evedrop.view.scene import HouseScene, Moved
 
 
 class Showing:
@@ -77,7 +77,7 @@ def driven_scene(scenario: Scenario) -> dict[str, Any]:
     if house is not None:
         column = plant.disturbances.index(house.load)
         load = means(disturbances_of(scenario)[:, column], min(scenario.controller.period, scenario.slots))
-        shown_house = House(disturbances[column], float(load.max()))
+        shown_house = HouseScene(disturbances[column], float(load.max()))
     return {"states": _labels(process.states, process.units), "moving": moving, "house": shown_house}
 
 

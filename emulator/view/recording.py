@@ -19,9 +19,9 @@ from evedrop.view.column import Column
 from evedrop.view.columns import Columns, lines, log_styles
 from evedrop.view.events import Event, introduction
 from evedrop.view.paths import NOTES
-from evedrop.view.scene import Moved, PeerSlots, Scene, Shown, Slots
+from evedrop.view.scene import Moved, PeerSlots, Scene, SceneSlots, Shown
 
-__all__ = ["PeerSlots", "Recording", "Scene", "Shown", "Slots"]
+__all__ = ["PeerSlots", "Scene", "SceneSlots", "Shown", "ViewRecording"]
 
 _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds from one batch to the next, so that a batch is worth its overhead
@@ -30,7 +30,7 @@ _MOST_WAITING = 20_000  # slots the file may be behind, before the run waits for
 _FILE_TIMEOUT = 5.0  # seconds the run waits for the file, before it goes on without one
 
 
-class Recording:
+class ViewRecording:
     """Writes the recording of one run to `path`. Final; nothing here raises because of the disk: see `failure`."""
 
     def __init__(self, path: Path, scene: Scene) -> None:
@@ -38,7 +38,7 @@ class Recording:
         """Why there is no recording on disk, or an incomplete one."""
         self._scene = scene
         self._columns = Columns(scene)
-        self._waiting: list[Slots] = []
+        self._waiting: list[SceneSlots] = []
         self._waiting_slots = 0
         self._notes = introduction(scene)
         self._closing = False
@@ -52,7 +52,7 @@ class Recording:
         self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
         self._writer.start()
 
-    def add(self, slots: Slots) -> None:
+    def add(self, slots: SceneSlots) -> None:
         """Record the next slots. Waits only for the disk, and only if that is thousands of slots behind."""
         if not slots.count:
             return
@@ -105,7 +105,7 @@ class Recording:
         if self.failure is None:
             self._file.disconnect()
 
-    def _put(self, chunks: list[Slots], notes: list[Event]) -> None:
+    def _put(self, chunks: list[SceneSlots], notes: list[Event]) -> None:
         columns = [lines(NOTES, notes)] if notes else []
         if chunks:
             columns = [*self._columns.of(_joined(chunks)), *columns]
@@ -126,7 +126,7 @@ def _stream(scene: Scene) -> rr.RecordingStream:
     return rr.RecordingStream(_APPLICATION, recording_id=scene.run)
 
 
-def _joined(chunks: list[Slots]) -> Slots:
+def _joined(chunks: list[SceneSlots]) -> SceneSlots:
     if len(chunks) == 1:
         return chunks[0]
     peers = {
@@ -140,7 +140,7 @@ def _joined(chunks: list[Slots]) -> Slots:
         )
         for name in chunks[0].peers
     }
-    return Slots(
+    return SceneSlots(
         chunks[0].first,
         np.concatenate([chunk.x for chunk in chunks]),
         np.concatenate([chunk.nu for chunk in chunks]),
@@ -150,7 +150,7 @@ def _joined(chunks: list[Slots]) -> Slots:
     )
 
 
-def _joined_packets(chunks: list[Slots]) -> Flags | None:
+def _joined_packets(chunks: list[SceneSlots]) -> Flags | None:
     if all(chunk.sent is None for chunk in chunks):
         return None
     return np.concatenate([np.ones(chunk.count, np.bool_) if chunk.sent is None else chunk.sent for chunk in chunks])

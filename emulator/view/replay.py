@@ -15,7 +15,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Flags
 from evedrop.results.writer import Results, load_results
 from evedrop.score.scorekeeper import event_line
-from evedrop.view.scene import PeerSlots, Slots
+from evedrop.view.scene import PeerSlots, SceneSlots
 from evedrop.view.scored_slots import open_recording, showing_of
 
 _CHUNK = 1000  # slots handed over at once
@@ -51,7 +51,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
         deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
         moved = None if showing is None else showing.take(inputs[rows], deviations)
         shown = {name: _cut(peer, rows) for name, peer in peers.items()}
-        recording.add(Slots(first, x[rows], nu[rows], shown, moved, sent[rows]))
+        recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
     for event in results.summary.get("events", ()):
         recording.note(event["slot"], "INFO", event_line(event))
     recording.close()

@@ -24,7 +24,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class House:
+class HouseScene:
     """A plant that is a house."""
 
     load: str
@@ -54,7 +54,7 @@ class Scene:
     """Labels of the states, such as "SOC (%)"; none, or one for each."""
     moving: tuple[str, ...] = ()
     """Of a closed loop, labels of what moves the plant, such as "P_load (kW)": disturbances, then inputs."""
-    house: House | None = None
+    house: HouseScene | None = None
     """Where the plant is one."""
 
 
@@ -89,7 +89,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Slots:
+class SceneSlots:
     """c consecutive slots, complete. Its arrays are kept for a while: they must not be changed afterwards."""
 
     first: int

@@ -15,7 +15,7 @@ from evedrop.score.slots import Slots
 
 if TYPE_CHECKING:
     from evedrop.view.plant_slots import Showing
-    from evedrop.view.recording import Recording
+    from evedrop.view.recording import ViewRecording
 
 
 def showing_of(scenario: Scenario) -> Showing | None:
@@ -25,10 +25,10 @@ def showing_of(scenario: Scenario) -> Showing | None:
     return Showing.of(scenario)
 
 
-def open_recording(scenario: Scenario, run: str, path: Path) -> Recording:
+def open_recording(scenario: Scenario, run: str, path: Path) -> ViewRecording:
     """The run's recording, on disk."""
     from evedrop.view.plant_slots import driven_scene  # noqa: PLC0415 - only with a view
-    from evedrop.view.recording import Recording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
+    from evedrop.view.recording import ViewRecording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
     from evedrop.view.scene import Scene, Shown  # noqa: PLC0415 - the same
 
     quality = scenario.quality
@@ -53,7 +53,7 @@ def open_recording(scenario: Scenario, run: str, path: Path) -> Recording:
         noise=float(np.trace(scenario.process.process.Q)),
         **driven_scene(scenario),
     )
-    return Recording(path, scene)
+    return ViewRecording(path, scene)
 
 
 def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
@@ -61,8 +61,7 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], s
 
     around: the reference from which states are deviations, (n,); showing: of a closed loop, who follows the same trial.
     """
-    from evedrop.view.scene import PeerSlots  # noqa: PLC0415 - only with a view
-    from evedrop.view.scene import Slots as ShownSlots  # noqa: PLC0415 - the same
+    from evedrop.view.scene import PeerSlots, SceneSlots  # noqa: PLC0415 - only with a view
 
     peers = {
         name: PeerSlots(
@@ -80,4 +79,4 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], s
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
         moved = showing.take(slots.inputs.u[:, :, 0], estimates)
     sent = None if slots.sent is None else slots.sent[:, 0]
-    return ShownSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)
+    return SceneSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)

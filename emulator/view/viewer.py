@@ -51,14 +51,14 @@ def choose(mode: str) -> str:
 
 
 @dataclass(frozen=True)
-class Stand:
+class WebAddress:
     """Where browsers find a view: the page at a port, and what it shows at the next one."""
 
     host: str
     port: int
 
     @classmethod
-    def of(cls, text: str) -> Stand:
+    def of(cls, text: str) -> WebAddress:
         """From HOST:PORT. Raises UsageError if it is none."""
         host, _, port = text.rpartition(":")
         try:
@@ -141,7 +141,7 @@ class Viewer:
         return None
 
     @classmethod
-    def serve(cls, stand: Stand, logs: Path, recording: Path, complete: bool = False) -> Viewer:
+    def serve(cls, stand: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
         """Start one for browsers, at a place that is known beforehand; the rest as for `start`.
 
         Raises UsageError if it cannot be started, for one because the place is taken.
@@ -195,7 +195,7 @@ def _screen_is_remote() -> bool:
     return not os.environ.get("WAYLAND_DISPLAY") and not display.startswith((":", "/", "unix:"))
 
 
-def open_run(run: Path, mode: str, stand: Stand | None = None, recording: Path | None = None) -> Viewer:
+def open_run(run: Path, mode: str, stand: WebAddress | None = None, recording: Path | None = None) -> Viewer:
     """A viewer with the recording of a results folder, or another of the same run; for browsers, at a stand if there is one.
 
     Raises UsageError if there is none, or no viewer can be started.

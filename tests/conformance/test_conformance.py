@@ -10,7 +10,7 @@ import pytest
 from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
 from evedrop.conformance.examine import examined
 from evedrop.conformance.links import DelayChecks, LossChecks
-from evedrop.conformance.rules import Broken, Verdict
+from evedrop.conformance.rules import Broken, RuleVerdict
 from evedrop.conformance.schemes import scheme_verdicts
 from evedrop.errors import UsageError
 from evedrop.model.delays import DELAY_MODELS
@@ -23,7 +23,7 @@ from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.links.gilbert_elliott import GilbertElliott
 from evedrop.model.links.link import fates_of
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Heard
+from evedrop.model.receiver import Belief, Codes, Flags, Reception
 from evedrop.model.registry import asked
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.cipher import Cipher, CipherEstimator
@@ -101,7 +101,7 @@ class Remembers(PlainEstimator):
 
     last: Any = 0.0
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As plain, and a little of the last slot's."""
         found = super().step(k, belief, heard._replace(z=heard.z + 1e-9 * self.last))
         self.last = heard.z[0] * heard.gamma
@@ -111,7 +111,7 @@ class Remembers(PlainEstimator):
 class Peeks(PlainEstimator):
     """Uses a little of what was never received."""
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As plain, and more."""
         found = super().step(k, belief, heard)
         return found._replace(x_hat=found.x_hat + 1e-9 * heard.z)
@@ -120,7 +120,7 @@ class Peeks(PlainEstimator):
 class Discards(PlainEstimator):
     """Says that it uses what it leaves."""
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Other than `act`."""
         found = super().step(k, belief, heard)
         return found._replace(action=3 * found.action)
@@ -181,7 +181,7 @@ SCHEME_RULES = {
 }
 
 
-def broken(verdicts: list[Verdict]) -> dict[str, str]:
+def broken(verdicts: list[RuleVerdict]) -> dict[str, str]:
     """Rule → how it is broken, of those that are."""
     return {verdict.rule: verdict.broken for verdict in verdicts if verdict.broken is not None}
 

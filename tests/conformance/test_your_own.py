@@ -172,7 +172,7 @@ from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme
 from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.model.eavesdroppers.eavesdropper import PacketReader
 from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.delays.constant import Constant
+from evedrop.model.delays.constant import ConstantDelay
 from evedrop.model.schemes.plain import PlainEstimator
 
 
@@ -242,9 +242,9 @@ MISTAKES = {
              "quality is 'good'; expected a number from 0 to 1"),
     "chain": ("link", "Mine(Bernoulli):\n    parameters = {}\n    chain = (1, 2)\n    def __init__(self): super().__init__(0.9)",
               "in a dry run: "),
-    "soon": ("delay", "Mine(Constant):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
+    "soon": ("delay", "Mine(ConstantDelay):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
              "    def arrived(self, lag): return 'soon'", "arrived(0) is 'soon'; expected a number from 0 to 1"),
-    "late": ("delay", "Mine(Constant):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
+    "late": ("delay", "Mine(ConstantDelay):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
              "    def delays(self, first, numbers): return -numbers", "expected slots, 0 or more"),
 }  # fmt: skip
 

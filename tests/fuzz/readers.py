@@ -27,7 +27,7 @@ import tomli_w
 
 from evedrop.errors import EvedropError
 from evedrop.expected.estimates import warnings_of
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_use import expect_usable
@@ -35,7 +35,7 @@ from evedrop.loading import load, parse, shipped, value_of
 from evedrop.memory.montecarlo import simulate
 from evedrop.plugins import named_in
 from evedrop.recordings.disturbance_file import read_disturbances
-from evedrop.recordings.link_recording import Recording
+from evedrop.recordings.link_recording import LinkRecording
 from evedrop.results.diff import difference
 from evedrop.results.reading import load_results
 from evedrop.results.resolved_scenario import write_resolved
@@ -185,7 +185,7 @@ def _disturbances(data: bytes, folder: Path, name: str = "day.csv") -> None:
 
 def _trace(data: bytes, folder: Path, name: str = "walk.csv") -> None:
     (folder / name).write_bytes(data)
-    recording = Recording(folder / name)
+    recording = LinkRecording(folder / name)
     for column in [None, *recording.columns()[:3]]:
         for read in (recording.outcomes, recording.delays):
             _tried(lambda read=read, column=column: read(column))  # type: ignore[misc]
@@ -296,7 +296,7 @@ def _briefs() -> list[bytes]:
     found = []
     for name in ("eavesdroppers", "acknowledged", "microgrid", "restart"):
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
-        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False, None)).values():
+        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False, None)).values():
             found.append(json.dumps({**asdict(brief), "run": "r00000000", "password": "p"}).encode())
     return found
 

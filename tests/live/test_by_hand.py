@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import Meeting, meeting_at
+from evedrop.live.launch.ports import RouterEndpoint, meeting_at
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
@@ -365,7 +365,7 @@ def test_a_router_is_known_by_its_names(listen: str, connect: str | None, names:
     assert found.names == names
     assert (str(found.listen), str(found.connect)) == (listen, connect or listen)
     assert found.secure == listen.startswith("tls/")
-    assert isinstance(meeting_at("tcp/0.0.0.0:7447", "tcp/a:7447", insecure=True), Meeting)
+    assert isinstance(meeting_at("tcp/0.0.0.0:7447", "tcp/a:7447", insecure=True), RouterEndpoint)
 
 
 def test_what_is_refused_leaves_no_folder(evedrop: Evedrop) -> None:

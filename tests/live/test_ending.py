@@ -11,7 +11,7 @@ import pytest
 from evedrop.live.observer import conductor
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.protocol.codec import Reader, over
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 
 RUN = "r"
 NAMES = ("router", "relay", "sensor", "legitimate", "smart")
@@ -20,7 +20,7 @@ NAMES = ("router", "relay", "sensor", "legitimate", "smart")
 class Network:
     """The part of a session that a conductor uses, with processes that do as the test says when they are told something."""
 
-    keys, allowance, patience, router_id = Keys(RUN), 2**20, 1.0, "id"
+    keys, allowance, patience, router_id = RunKeys(RUN), 2**20, 1.0, "id"
 
     def __init__(self) -> None:
         self.reads: dict[str, Callable[[bytes], None]] = {}

@@ -17,7 +17,7 @@ from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.codec import control
 from evedrop.live.protocol.envelope import enclosed
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
@@ -142,13 +142,13 @@ def test_a_message_of_another_key_is_dropped_counted_and_sent_again(tmp_path: Pa
         run.running(more_than=100)
         # The observer may write there: its credentials stand in for a connection that takes one key for the other.
         observer = read_brief(tmp_path / "briefs" / "observer.json")
-        keys = Keys(observer.run)
+        keys = RunKeys(observer.run)
         with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(observer)))) as session:
             for name in ("other", "sensor"):
                 publisher = session.declare_publisher(keys.control(name))
                 wait_until(lambda publisher=publisher: publisher.matching_status.matching, f"{name} to read")
                 publisher.put(enclosed(keys.downlink("legitimate"), control("end")))
-            publisher.put(enclosed(Keys("another").control("sensor"), control("end")))
+            publisher.put(enclosed(RunKeys("another").control("sensor"), control("end")))
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert run.summary["misdelivered"]["other"] == 1

@@ -9,10 +9,10 @@ import pytest
 from evedrop.errors import Silence
 from evedrop.live.observer import stall
 from evedrop.live.observer.stall import Stall, patience_of, silent_of
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Whereabouts
 
-KEYS = Keys("r")
+KEYS = RunKeys("r")
 WINDOW = 100
 
 

@@ -11,7 +11,7 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.expected.expectations import expectations_of
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.loading import checked
 from evedrop.memory.montecarlo import check_mode
 from evedrop.memory.simulation import Mode, Simulation
@@ -105,7 +105,7 @@ def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("scheme", RUNS)
 def test_who_is_given_what(scheme: str) -> None:
     """Only the sensor holds what it alone needs; the router alone the way back; nobody but the sensor the leaks' states."""
-    briefs = briefs_of(scenario_of(scheme), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
+    briefs = briefs_of(scenario_of(scheme), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     kind = Simulation(scenario_of(scheme), range(1))._scheme
     assert set(briefs["sensor"].keys) == {"process", *kind.secret_streams}
     assert set(briefs["legitimate"].keys) == set(kind.estimator_streams)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evedrop.model.process import Floats, Process, Trajectory
-from evedrop.model.receiver import Belief, Flags, Heard, Receiver
+from evedrop.model.receiver import Belief, Flags, Receiver, Reception
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
@@ -50,5 +50,5 @@ def followed(receivers: Mapping[str, Receiver], heard: Iterator[Slot]) -> Iterat
     beliefs = {name: receiver.prior() for name, receiver in receivers.items()}
     for slot in heard:
         for name, receiver in receivers.items():
-            beliefs[name] = receiver.step(slot.k, beliefs[name], Heard(slot.gamma, slot.z))
+            beliefs[name] = receiver.step(slot.k, beliefs[name], Reception(slot.gamma, slot.z))
         yield slot, dict(beliefs)

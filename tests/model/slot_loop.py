@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Belief, Heard, Receiver
+from evedrop.model.receiver import Belief, Receiver, Reception
 from evedrop.model.schemes.scheme import Packet, Scheme
 from evedrop.streams import Batch, root_of_seed, stream_key
 
@@ -81,7 +81,7 @@ def play(
             # What is not received must not matter, whatever it is.
             z = np.where(received[name], packet.z, np.nan)
             header = None if packet.header is None else np.where(received[name], packet.header, -(2**62))
-            beliefs[name] = receiver.step(k, beliefs[name], Heard(received[name], z, header))
+            beliefs[name] = receiver.step(k, beliefs[name], Reception(received[name], z, header))
             played.beliefs[name].append(beliefs[name])
             played.received[name].append(received[name])
         encoder.acknowledged(k, acknowledge(k, sent, received) & sent)

@@ -11,7 +11,7 @@ from slot_loop import DRIFTING, STABLE, UNSTABLE, Played, play
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
-from evedrop.model.receiver import Action, Heard
+from evedrop.model.receiver import Action, Reception
 from evedrop.model.reference import ReferenceCode, ReferenceReceiver, stationary_covariance
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.theory.closed_forms import reference_covariances
@@ -223,11 +223,11 @@ def test_a_header_that_names_what_nobody_has_is_discarded() -> None:
     belief = receiver.prior()
     z, on = np.ones((2, 3)), np.ones(3, bool)
     for k in range(3):
-        belief = receiver.step(k, belief, Heard(on, z, np.full((1, 3), k - 1)))
-    after = receiver.step(3, belief, Heard(on, z, np.array([[3, 0, -7]])))
+        belief = receiver.step(k, belief, Reception(on, z, np.full((1, 3), k - 1)))
+    after = receiver.step(3, belief, Reception(on, z, np.array([[3, 0, -7]])))
     assert (after.action == Action.DISCARDED).all()
     assert np.allclose(after.x_hat, UNSTABLE.A @ belief.x_hat)
-    without = receiver.step(3, belief, Heard(on, z))
+    without = receiver.step(3, belief, Reception(on, z))
     assert (without.action == Action.STATE).all()
     assert np.array_equal(without.x_hat, z)
 

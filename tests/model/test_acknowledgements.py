@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.stats import binomtest
 from slot_loop import ROOT, UNSTABLE, coins, play
 
-from evedrop.model.acknowledgements import ATTACKS, WayBack, rates_of
+from evedrop.model.acknowledgements import ATTACKS, AckChannel, rates_of
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.numeric.detection import Chart, chart_for
@@ -40,7 +40,7 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     """Counted over a million packets, each rate lies within binomial bounds at 1e-6 confidence."""
     mu, mu_e, quality, slots, trials = 0.8, 0.6, 0.7, 100, 10_000
     batch = Batch(slots, trials)
-    way = WayBack(attack, quality, KEY, batch)
+    way = AckChannel(attack, quality, KEY, batch)
     gamma, gamma_e = coins(mu, slots, trials, 1), coins(mu_e, slots, trials, 2)
     arrived = np.array([way.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
     rates = rates_of(attack, mu, mu_e, quality)
@@ -58,7 +58,7 @@ def test_what_was_not_sent_is_not_acknowledged() -> None:
     """Not even where it is forged; and a trial's way back is the same alone and among others, slots in any order."""
     gamma = np.zeros(50, bool)
     sent = np.arange(50) % 2 == 0
-    among, alone = WayBack("forge", 0.5, KEY, Batch(20, 50, 7)), WayBack("forge", 0.5, KEY, Batch(20, 1, 7 + 12))
+    among, alone = AckChannel("forge", 0.5, KEY, Batch(20, 50, 7)), AckChannel("forge", 0.5, KEY, Batch(20, 1, 7 + 12))
     for k in (3, 0, 19, 3):
         arrived = among.arrived(k, sent, gamma, gamma)
         assert not arrived[~sent].any()
@@ -70,7 +70,7 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
     """Mean believed trace after a few slots, user's and eavesdropper's, by the recursion, at 5 standard errors."""
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
-    way = WayBack(attack, 0.9, KEY, batch)
+    way = AckChannel(attack, 0.9, KEY, batch)
     eve = STRATEGIES["reference"](Knowledge(UNSTABLE, 1.0, {}, {}), batch)
     played = play(
         Acknowledged(UNSTABLE),

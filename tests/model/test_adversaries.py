@@ -13,7 +13,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.model.links.pooled import pooled
 from evedrop.model.process import Floats, Process, Trajectory
-from evedrop.model.receiver import Heard
+from evedrop.model.receiver import Reception
 from evedrop.model.slot.link import link_of
 from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
 from evedrop.streams import Batch, Stream, uniforms
@@ -118,8 +118,8 @@ def test_one_betrayed_state_barely_hurts_the_innovation_scheme() -> None:
     one, two = informed.prior(), other.prior()
     for slot in slots(MARGINAL, 0.3, 0.9, batch):
         truth = slot.x if slot.k == 20 else None
-        one = informed.step(slot.k, one, Heard(slot.gamma, slot.z, truth=truth))
-        two = other.step(slot.k, two, Heard(slot.gamma, slot.z))
+        one = informed.step(slot.k, one, Reception(slot.gamma, slot.z, truth=truth))
+        two = other.step(slot.k, two, Reception(slot.gamma, slot.z))
         if slot.k == 20:
             assert not errors(slot, one.x_hat).any()
             assert not one.P.any()
@@ -133,7 +133,7 @@ def test_a_state_that_was_not_betrayed_is_missed() -> None:
         Knowledge(MARGINAL, 0.3, {"reads_as": "constant", "learns_at": 0}, {}), Batch(2, 1)
     )
     with pytest.raises(ValueError, match="slot 0: the state was to be betrayed"):
-        one.step(0, one.prior(), Heard(np.ones(1, bool), np.zeros((2, 1))))
+        one.step(0, one.prior(), Reception(np.ones(1, bool), np.zeros((2, 1))))
 
 
 @pytest.mark.parametrize("reads_as", ["bayesian", "likelihood"])
@@ -159,7 +159,7 @@ def test_one_betrayed_state_breaks_twin_tracks(reads_as: str) -> None:
         z = np.where(random.random(400) < 0.5, x, x + apart)
         for name, one in receivers.items():
             truth = x if name == "informed" and k == learns_at else None
-            beliefs[name] = one.step(k, beliefs[name], Heard(np.ones(400, bool), z, truth=truth))
+            beliefs[name] = one.step(k, beliefs[name], Reception(np.ones(400, bool), z, truth=truth))
             if k > learns_at:
                 found[name] += float(((x - beliefs[name].x_hat) ** 2).sum()) / (49 * 400)
     assert found["other"] > 0.9

@@ -13,7 +13,7 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import CAPACITY, Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Action, Heard, Receiver
+from evedrop.model.receiver import Action, Receiver, Reception
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.streams import Batch
 from tests.model.listening import EXAMPLE, MARGINAL, MICROGRID, followed, keys, slots
@@ -94,7 +94,7 @@ def test_it_is_the_posterior_over_all_type_words(
     belief, z = one.prior(), []
     for slot in slots(process, mu_d, 1.0, Batch(len(gamma), 1, seed % 1000)):
         z.append(slot.z[:, 0])
-        belief = one.step(slot.k, belief, Heard(np.array(gamma[slot.k : slot.k + 1]), slot.z))
+        belief = one.step(slot.k, belief, Reception(np.array(gamma[slot.k : slot.k + 1]), slot.z))
         mean, P, state = enumerated(process, mu_d, np.array(z), gamma[: slot.k + 1])
         scale = 1.0 + np.abs(P).max()
         assert np.allclose(belief.x_hat[:, 0], mean, rtol=1e-8, atol=1e-8 * np.sqrt(scale))
@@ -206,7 +206,7 @@ def test_it_may_come_late_and_stays_itself() -> None:
     belief, errors = one.prior(late), []
     for slot in slots(process, 0.5, 0.6, batch):
         if slot.k >= late:
-            belief = one.step(slot.k, belief, Heard(slot.gamma, slot.z))
+            belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
             errors.append(((slot.x - belief.x_hat) ** 2).sum(axis=0).mean())
     assert np.all(np.abs(belief.memory[0].sum(axis=0) - 1.0) < 1e-14)
     assert np.all(np.linalg.eigvalsh(np.moveaxis(belief.P, 2, 0)) >= 0.0)
@@ -230,7 +230,7 @@ def test_unstable_covariances_survive_where_cholesky_fails() -> None:
     one, belief = made("bayesian", EXAMPLE, 0.9, batch), None
     belief = one.prior()
     for slot in slots(EXAMPLE, 0.9, 1.0, batch):
-        belief = one.step(slot.k, belief, Heard(np.full(300, slot.k >= 80), slot.z))
+        belief = one.step(slot.k, belief, Reception(np.full(300, slot.k >= 80), slot.z))
         if slot.k == 79:
             assert np.linalg.cond(belief.P[:, :, 0]) > 1e16
     error = ((slot.x - belief.x_hat) ** 2).sum(axis=0)

@@ -11,7 +11,7 @@ from scipy import stats
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
-from evedrop.model.receiver import Action, Belief, Heard, Receiver
+from evedrop.model.receiver import Action, Belief, Receiver, Reception
 from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(12)
@@ -58,10 +58,10 @@ def beliefs(name: str, batch: Batch, gamma: np.ndarray, z: np.ndarray) -> list[B
     return found
 
 
-def heard(name: str, k: int, gamma: np.ndarray, z: np.ndarray) -> Heard:
+def heard(name: str, k: int, gamma: np.ndarray, z: np.ndarray) -> Reception:
     """What a strategy hears in a slot."""
     truth = np.full(z.shape, 2.0) if name == "replay-informed" and k == LEARNS_AT else None
-    return Heard(gamma, z, truth=truth)
+    return Reception(gamma, z, truth=truth)
 
 
 def uniform(stream: str, k: int, r: int) -> float:
@@ -182,7 +182,7 @@ def test_who_looks_at_packets_says_so(name: str) -> None:
         with pytest.raises(NotImplementedError, match="γ alone does not tell its action"):
             one.act(0, gamma)
     else:
-        assert np.array_equal(one.act(0, gamma), one.step(0, one.prior(), Heard(gamma, np.zeros((2, 3)))).action)
+        assert np.array_equal(one.act(0, gamma), one.step(0, one.prior(), Reception(gamma, np.zeros((2, 3)))).action)
 
 
 def test_a_delegate_is_its_reader() -> None:
@@ -206,7 +206,7 @@ def test_use_probabilities_are_what_it_does(name: str) -> None:
     nu = uniforms(Stream(KEYS["schedule"], range(trials), 1).words(range(slots)))[:, :, 0] >= MU_D
     used = np.empty((slots, trials), bool)
     for k in range(slots):
-        belief = one.step(k, belief, Heard(np.ones(trials, bool), np.zeros((2, trials))))
+        belief = one.step(k, belief, Reception(np.ones(trials, bool), np.zeros((2, trials))))
         used[k] = belief.action == Action.STATE
     for kind, probability in enumerate(STRATEGIES[name].use_probabilities(PARAMETERS[name])):
         chosen = used[1:][nu[1:] == bool(kind)]
@@ -227,5 +227,5 @@ def test_certain_suspicion_is_smart_or_naive() -> None:
         one = receiver("suspicious", Batch(50, 20), use_state=1.0, use_innovation=use_innovation)
         belief = one.prior()
         for k, expected in enumerate(beliefs(twin, Batch(50, 20), gamma, z)):
-            belief = one.step(k, belief, Heard(gamma[k], z[k]))
+            belief = one.step(k, belief, Reception(gamma[k], z[k]))
             assert all(np.array_equal(left, right) for left, right in zip(belief[:3], expected[:3], strict=True))

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evedrop.model.energy import Difference, Meter, energy
+from evedrop.model.energy import EnergyDifference, Meter, energy
 
 
-def difference(run: np.ndarray, reference: np.ndarray) -> Difference:
+def difference(run: np.ndarray, reference: np.ndarray) -> EnergyDifference:
     """Of a run from one reference for all its trials."""
     return Meter.over(run, reference.reshape(reference.shape + (1,) * (run.ndim - reference.ndim))).difference
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evedrop.model.controllers import CONTROLLERS, Assignment
-from evedrop.model.load_guess import House, LoadGuess
+from evedrop.model.load_guess import HousePlaces, LoadGuess
 from evedrop.model.perfect import PerfectLoop
 from evedrop.model.plant import Plant
 from evedrop.model.process import Process
@@ -74,7 +74,7 @@ def test_who_knows_the_level_knows_the_load(sun: int | None) -> None:
     d[:, 0] = np.repeat(d[::PERIOD, 0], PERIOD) if sun == 0 else 0.0
     nothing = np.zeros((SLOTS, 2, 2))
     x, _ = loop(nothing, nothing, d)
-    guess = LoadGuess(GIVEN, CONTROLLERS["lqr"](GIVEN, 2), House(0, 1, sun), d[:, 0])
+    guess = LoadGuess(GIVEN, CONTROLLERS["lqr"](GIVEN, 2), HousePlaces(0, 1, sun), d[:, 0])
     found = [guess.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
     assert found[0] is None
     for period, load in enumerate(found[1:]):
@@ -92,10 +92,10 @@ def test_what_is_not_known_is_taken_for_load() -> None:
         if k % PERIOD == 0:
             u = PLANT.limited(controller.decide(k, x[k], d[k]))
         x[k + 1] = x[k] + B @ u + (B_D @ d[k])[:, None] + nothing[k]
-    blind = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), House(0, 1, None), d[:, 0])
+    blind = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), HousePlaces(0, 1, None), d[:, 0])
     found = [blind.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
     assert np.allclose(found[1:], -1.0)
-    off = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), House(0, 1, 0), d[:, 0])
+    off = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), HousePlaces(0, 1, 0), d[:, 0])
     off.take(0, x[0])
     last = off.take(PERIOD, x[PERIOD] - np.array([[0.3], [0.0]]))
     assert np.allclose(last, 0.5 + 0.3 / (0.03 * PERIOD))

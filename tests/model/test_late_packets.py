@@ -14,11 +14,11 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.links.link import Fate
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Action, Belief, Heard, Receiver, prior
+from evedrop.model.receiver import Action, Belief, Receiver, Reception, prior
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.account import COUNTED_BURSTS, Accountant
 from evedrop.model.slot.intermittent_receiver import Absence, Follower
-from evedrop.model.slot.link import Course, Fates, Link, streams_of
+from evedrop.model.slot.link import Fates, Link, LinkSchedule, streams_of
 from evedrop.model.slot.transit import Arrival, Late, Transit
 from evedrop.streams import Batch, root_of_seed, stream_key
 
@@ -51,7 +51,7 @@ def packets() -> list[np.ndarray]:
 
 def fates(window: int) -> Fates:
     """Of a link that loses, delays and duplicates."""
-    course = Course(FULL, window)
+    course = LinkSchedule(FULL, window)
     keys = {name: stream_key(root_of_seed(6), name) for name in streams_of("it", course)}
     return Link(course, "it", keys, BATCH).fates(range(BATCH.slots))
 
@@ -74,7 +74,7 @@ def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) 
         belief = follower.take(k, transit.arrival(k, course, k, z[k]))
         expected = one.prior()
         for j in range(k + 1):
-            expected = one.step(j, expected, Heard(there[j] & (j + course.delays[j] <= k), z[j]))
+            expected = one.step(j, expected, Reception(there[j] & (j + course.delays[j] <= k), z[j]))
         assert same(belief, expected), k
         arrivals = [there[j] & (j + course.delays[j] == k) for j in range(k)]
         counts = np.sum(arrivals, axis=0) if arrivals else np.zeros(BATCH.trials)
@@ -89,8 +89,8 @@ def test_duplicates_change_nothing() -> None:
     everybody = np.ones(BATCH.trials, bool)
     plain, twice = Follower(one, 3), Follower(one, 3)
     for k in range(6):
-        heard = Heard(everybody, z[k])
-        copies = tuple(Late(j, Heard(everybody, z[j]), copy=True) for j in range(max(0, k - 3), k + 1))
+        heard = Reception(everybody, z[k])
+        copies = tuple(Late(j, Reception(everybody, z[j]), copy=True) for j in range(max(0, k - 3), k + 1))
         assert same(plain.take(k, Arrival(heard)), twice.take(k, Arrival(heard, copies)))
         assert not twice.late.any()
 
@@ -102,16 +102,16 @@ def test_what_is_older_than_the_window_changes_nothing() -> None:
     for age, news in ((3, True), (4, False)):
         plain, given_ = Follower(one, 3), Follower(one, 3)
         for k in range(8):
-            late = (Late(k - age, Heard(everybody, z[k - age])),) if k == 7 else ()
-            before = plain.take(k, Arrival(Heard(nobody, z[k])))
-            after = given_.take(k, Arrival(Heard(nobody, z[k]), late))
+            late = (Late(k - age, Reception(everybody, z[k - age])),) if k == 7 else ()
+            before = plain.take(k, Arrival(Reception(nobody, z[k])))
+            after = given_.take(k, Arrival(Reception(nobody, z[k]), late))
         assert same(before, after) is not news
 
 
 def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
     """Carried on from any belief, and from the prior of any slot, to the bit."""
     one = receivers()["smart"]
-    nothing = Heard(np.zeros(BATCH.trials, bool), np.zeros((2, BATCH.trials)))
+    nothing = Reception(np.zeros(BATCH.trials, bool), np.zeros((2, BATCH.trials)))
     for first in (0, 1, 7):
         absence, belief = Absence(PROCESS, prior(PROCESS, BATCH.trials, first)), one.prior(first)
         for k in range(first, first + 5):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.links.link import Fate
-from evedrop.model.slot.link import NEVER, Change, Course, Fates, Link, Outage, streams_of
+from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, ReceiverOutage, streams_of
 from evedrop.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 
 ROOT = root_of_seed(77)
@@ -28,18 +28,20 @@ FULL = {
     "queue": 6,
 }
 COURSES = {
-    "plain": Course(PLAIN),
-    "bursts": Course(BURSTS),
-    "everything": Course(FULL, window=4),
-    "changes": Course(
+    "plain": LinkSchedule(PLAIN),
+    "bursts": LinkSchedule(BURSTS),
+    "everything": LinkSchedule(FULL, window=4),
+    "changes": LinkSchedule(
         PLAIN, changes=(Change(9, BURSTS), Change(20, cut=True), Change(31, cut=False), Change(40, FULL)), window=3
     ),
-    "outages": Course(FULL, window=4, outages=(Outage(10, 17, Fate.DOWN), Outage(50, NEVER, Fate.PAUSED))),
-    "tied": Course(BURSTS, correlation=("other", 0.6)),
+    "outages": LinkSchedule(
+        FULL, window=4, outages=(ReceiverOutage(10, 17, Fate.DOWN), ReceiverOutage(50, NEVER, Fate.PAUSED))
+    ),
+    "tied": LinkSchedule(BURSTS, correlation=("other", 0.6)),
 }
 
 
-def link(course: Course, batch: Batch) -> Link:
+def link(course: LinkSchedule, batch: Batch) -> Link:
     """A link with the streams of a seed."""
     return Link(course, "it", {name: stream_key(ROOT, name) for name in streams_of("it", course)}, batch)
 
@@ -75,7 +77,7 @@ def test_bits_do_not_depend_on_pieces_or_on_the_batch(name: str) -> None:
     assert same(alone, whole.part(trials=slice(2, 3)))
 
 
-def reference(course: Course, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+def reference(course: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Codes and delays of a link of independent losses, packet by packet from docs/mathematics.md, links."""
     codes, delays = np.zeros((batch.slots, batch.trials), int), np.zeros((batch.slots, batch.trials), int)
     losses, chances = drawn("link/it", 1, batch), drawn("fate/it", 3, batch)
@@ -115,15 +117,17 @@ def reference(course: Course, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     "course",
     [
-        Course(PLAIN),
-        Course(FULL, window=4),
-        Course(FULL, window=0),
-        Course(FULL, 3, (Change(12, {**FULL, "rate": 0.3, "queue": 2}), Change(30, cut=True), Change(40, cut=False))),
-        Course(FULL, 4, (), (Outage(0, 4, Fate.PAUSED), Outage(20, 33, Fate.DOWN))),
-        Course(PLAIN, 0, (Change(5, {"loss": {"model": "bernoulli", "quality": 0.1}}), Change(6, PLAIN))),
+        LinkSchedule(PLAIN),
+        LinkSchedule(FULL, window=4),
+        LinkSchedule(FULL, window=0),
+        LinkSchedule(
+            FULL, 3, (Change(12, {**FULL, "rate": 0.3, "queue": 2}), Change(30, cut=True), Change(40, cut=False))
+        ),
+        LinkSchedule(FULL, 4, (), (ReceiverOutage(0, 4, Fate.PAUSED), ReceiverOutage(20, 33, Fate.DOWN))),
+        LinkSchedule(PLAIN, 0, (Change(5, {"loss": {"model": "bernoulli", "quality": 0.1}}), Change(6, PLAIN))),
     ],
 )
-def test_fates_are_those_of_the_reference(course: Course) -> None:
+def test_fates_are_those_of_the_reference(course: LinkSchedule) -> None:
     """What befalls a packet, in the documented order, from the documented streams."""
     batch = Batch(80, 7, 11)
     fates = link(course, batch).fates(range(80))
@@ -141,7 +145,7 @@ def test_a_change_known_late_is_one_known_early(at: int, kind: str, name: str) -
     course, batch = COURSES[name], Batch(60, 3)
     change = {"cut": Change(at, cut=True), "loss": Change(at, BURSTS), "all": Change(at, FULL)}[kind]
     earlier = tuple(one for one in course.changes if one.at < at)
-    knowing = Course(course.settings, course.window, (*earlier, change), course.outages, course.correlation)
+    knowing = LinkSchedule(course.settings, course.window, (*earlier, change), course.outages, course.correlation)
     expected = link(knowing, batch).fates(range(60))
     one = link(course, batch)
     start = at - at % 7
@@ -157,9 +161,9 @@ def test_correlation_ties_losses_and_leaves_each_link_alone() -> None:
     batch, q = Batch(400, 500), 0.7
     settings_ = {"loss": {"model": "bernoulli", "quality": q}}
     key = {"link/it": stream_key(ROOT, "link/other")}
-    other = Link(Course(settings_), "it", key, batch).fates(range(400)).in_time
+    other = Link(LinkSchedule(settings_), "it", key, batch).fates(range(400)).in_time
     for strength in (0.0, 0.35, 1.0):
-        course = Course(settings_, correlation=("other", strength))
+        course = LinkSchedule(settings_, correlation=("other", strength))
         found = link(course, batch).fates(range(400)).in_time
         assert abs(found.mean() - q) < 5 * math.sqrt(q * (1 - q) / found.size)
         correlation = np.corrcoef(found.ravel(), other.ravel())[0, 1]
@@ -179,7 +183,7 @@ SPECS: dict[str, dict[str, Any]] = {
 def test_delays_have_the_law_they_say(name: str) -> None:
     """The fraction of packets that are there after each lag is as the model says, within 5 standard errors."""
     batch = Batch(300, 300)
-    course = Course({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": SPECS[name]}, window=20)
+    course = LinkSchedule({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": SPECS[name]}, window=20)
     fates = link(course, batch).fates(range(300))
     assert fates.delays is not None
     model = delay_of(SPECS[name])

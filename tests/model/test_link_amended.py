@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evedrop.model.slot.link import Change, Course, Fates, Link, streams_of
+from evedrop.model.slot.link import Change, Fates, Link, LinkSchedule, streams_of
 from evedrop.streams import Batch
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}
@@ -22,7 +22,7 @@ Changes = tuple[Change, ...]
 
 def link(*changes: Change) -> Link:
     """A link in bursts with some changes known."""
-    course = Course({"loss": BURSTS}, window=3, changes=changes)
+    course = LinkSchedule({"loss": BURSTS}, window=3, changes=changes)
     keys = {name: bytes(31) + bytes([i]) for i, name in enumerate(streams_of("it", course))}
     return Link(course, "it", keys, Batch(SLOTS, 4))
 

@@ -15,7 +15,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.model.modulated import ModulatedCovariance, limit_of
 from evedrop.model.process import Process
-from evedrop.model.slot.link import NEVER, Change, Course, Outage
+from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.scenario.timeline import Away
@@ -41,7 +41,7 @@ def aged(quality: Callable[[int], float], there: Callable[[int], float], window:
     return found
 
 
-def traces(course: Course) -> np.ndarray:
+def traces(course: LinkSchedule) -> np.ndarray:
     """What theory says."""
     return Expectation(WALK, law_of(course), Outcomes.plain).traces(SLOTS)
 
@@ -58,7 +58,7 @@ DELAYS = (
 @pytest.mark.parametrize("delay", DELAYS, ids=lambda delay: delay["model"])
 def test_late_packets(delay: dict[str, Any], window: int) -> None:
     """With delays, reordering and corruption, the expectation and its limit, to 1e-12."""
-    course = Course({**PLAIN, "delay": delay, "reorder": 0.2, "corrupt": 0.1}, window)
+    course = LinkSchedule({**PLAIN, "delay": delay, "reorder": 0.2, "corrupt": 0.1}, window)
     model = delay_of(delay)
     there = [0.2 + 0.8 * (model.arrived(lag) or 0.0) for lag in range(window + 1)]
     expected = aged(lambda _: 0.6 * 0.9, lambda lag: there[lag], window)
@@ -72,7 +72,7 @@ def test_late_packets(delay: dict[str, Any], window: int) -> None:
 def test_links_that_change() -> None:
     """Other qualities and other delays from some slot on, and a cut in between."""
     later = {"loss": {"model": "bernoulli", "quality": 0.9}}
-    course = Course(PLAIN, 0, (Change(15, later), Change(20, cut=True), Change(30, cut=False), Change(40, PLAIN)))
+    course = LinkSchedule(PLAIN, 0, (Change(15, later), Change(20, cut=True), Change(30, cut=False), Change(40, PLAIN)))
 
     def quality(k: int) -> float:
         return 0.0 if 20 <= k < 30 else 0.9 if 15 <= k < 40 else 0.6
@@ -92,14 +92,14 @@ def test_a_quality_that_differs_from_slot_to_slot() -> None:
     }
     qualities = loss_of(moving).quality_at(range(SLOTS))
     expected = aged(lambda k: float(qualities[k]), lambda _: 1.0, 0)
-    np.testing.assert_allclose(traces(Course({"loss": moving})), expected, rtol=1e-12)
+    np.testing.assert_allclose(traces(LinkSchedule({"loss": moving})), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("keeps", [True, False])
 @pytest.mark.parametrize(("start", "stop"), [(0, 5), (10, 25), (30, NEVER)])
 def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
     """Its last estimate is carried on, or it starts from 0 and Σ."""
-    course = Course(PLAIN, 0, (), (Away(start, stop, Fate.DOWN, keeps),))
+    course = LinkSchedule(PLAIN, 0, (), (Away(start, stop, Fate.DOWN, keeps),))
     if keeps:
         expected = aged(lambda k: 0.0 if start <= k < stop else 0.6, lambda _: 1.0, 0)
     else:
@@ -115,14 +115,16 @@ def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
     """Bursts whose states are alike are no bursts, also with late packets; and a new chain begins in its own law."""
     alike = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.4, "bad": 0.4}}
     delay = {"delay": {"model": "normal", "mean": 1.5, "deviation": 1.0}}
-    np.testing.assert_allclose(traces(Course({**alike, **delay}, 4)), traces(Course({**PLAIN, **delay}, 4)), rtol=1e-12)
-    changed = Course(PLAIN, 0, (Change(20, alike), Change(30, PLAIN)))
-    np.testing.assert_allclose(traces(changed), traces(Course(PLAIN)), rtol=1e-12)
+    np.testing.assert_allclose(
+        traces(LinkSchedule({**alike, **delay}, 4)), traces(LinkSchedule({**PLAIN, **delay}, 4)), rtol=1e-12
+    )
+    changed = LinkSchedule(PLAIN, 0, (Change(20, alike), Change(30, PLAIN)))
+    np.testing.assert_allclose(traces(changed), traces(LinkSchedule(PLAIN)), rtol=1e-12)
 
 
 def test_slots_may_be_asked_for_in_any_pieces() -> None:
     """The same numbers."""
-    course = Course({**PLAIN, "delay": DELAYS[1]}, 3, (Change(17, {**PLAIN, "delay": DELAYS[0]}),))
+    course = LinkSchedule({**PLAIN, "delay": DELAYS[1]}, 3, (Change(17, {**PLAIN, "delay": DELAYS[0]}),))
     law = law_of(course)
     assert law is not None
     stream = ModulatedCovariance(WALK, law, Outcomes.plain)
@@ -133,15 +135,15 @@ def test_slots_may_be_asked_for_in_any_pieces() -> None:
 @pytest.mark.parametrize(
     "course",
     [
-        Course({**PLAIN, "rate": 0.5, "queue": 5}),
-        Course({**PLAIN, "delay": {"model": "trace", "values": [1.0]}}, 2),
-        Course({**PLAIN, "delay": DELAYS[0]}, 2, (), (Outage(3, 5, Fate.DOWN),)),
-        Course({"loss": {"model": "trace", "outcomes": "110", "random_start": True}}),
-        Course({"loss": {"model": "pattern", "outcomes": "110"}}),
+        LinkSchedule({**PLAIN, "rate": 0.5, "queue": 5}),
+        LinkSchedule({**PLAIN, "delay": {"model": "trace", "values": [1.0]}}, 2),
+        LinkSchedule({**PLAIN, "delay": DELAYS[0]}, 2, (), (ReceiverOutage(3, 5, Fate.DOWN),)),
+        LinkSchedule({"loss": {"model": "trace", "outcomes": "110", "random_start": True}}),
+        LinkSchedule({"loss": {"model": "pattern", "outcomes": "110"}}),
     ],
     ids=["queue", "recorded delays", "away while packets are under way", "memory", "no limit"],
 )
-def test_what_theory_does_not_know(course: Course) -> None:
+def test_what_theory_does_not_know(course: LinkSchedule) -> None:
     """There is no number then."""
     assert law_of(course) is None
     assert np.isnan(traces(course)).all()

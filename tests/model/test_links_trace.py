@@ -14,7 +14,7 @@ from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.counting import count_variance
 from evedrop.model.links.link import Fate
 from evedrop.model.links.markov import stationary
-from evedrop.model.links.trace import MOST_OUTCOMES, Trace
+from evedrop.model.links.trace import MOST_OUTCOMES, RecordedLoss
 from evedrop.model.process import Floats
 from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
@@ -60,7 +60,7 @@ def test_random_starts_are_everywhere() -> None:
     """A million trials begin at each of eight places about equally often: chi-square below its 1e-6 quantile, 40.5."""
     length, trials = 8, 1_000_000
     u = uniforms(Stream(KEY, range(trials), 1).words(range(1)))[:, :, 0]
-    model = Trace("10000000", random_start=True)
+    model = RecordedLoss("10000000", random_start=True)
     hits = np.zeros(length)
     for k in range(length):
         hits[(length - k) % length] = (model.fates(k, u[:, None, :]) == Fate.DELIVERED).sum()
@@ -72,7 +72,7 @@ def test_random_starts_are_everywhere() -> None:
 def test_the_rate_of_a_random_start_scatters_as_windows_do(window: int) -> None:
     """Variance over trials: that over all places where a window can lie, round and round."""
     outcomes = "1101001110"
-    trace = Trace(outcomes, random_start=True)
+    trace = RecordedLoss(outcomes, random_start=True)
     ring = [int(c) for c in outcomes] * 5
     rates = [sum(ring[begin : begin + window]) / window for begin in range(len(outcomes))]
     assert trace.rate_variance(range(4, 4 + window)) == pytest.approx(float(np.var(rates)), abs=1e-15)
@@ -144,6 +144,6 @@ def test_the_rate_of_many_slots_has_its_limit() -> None:
 )
 def test_a_mistake_of_a_trace_is_named(given: dict[str, Any], entry: str, said: str) -> None:
     """One mistake, at its entry."""
-    ((found, what),) = Trace.mistakes(given)
+    ((found, what),) = RecordedLoss.mistakes(given)
     assert found == entry
     assert said in what

@@ -9,10 +9,10 @@ from scipy.linalg import solve_discrete_are
 from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.controllers.lqr import Lqr, gain, held
-from evedrop.model.input_aware import Informed, Offset
+from evedrop.model.input_aware import InputAwareEstimator, Offset
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Action, Heard
+from evedrop.model.receiver import Action, Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.streams import Batch, root_of_seed, stream_key
 
@@ -165,13 +165,13 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
     drive, trajectory = Drive(of, np.zeros((200, 0))), Trajectory(process, KEY, batch, None, of.noise)
     encoder = scheme.encoder(secret, batch)
     unaware, offset = scheme.estimator(secret, batch), Offset(process, of, 5)
-    aware = Informed(scheme.estimator(secret, batch), of)
+    aware = InputAwareEstimator(scheme.estimator(secret, batch), of)
     one, other = aware.prior(), unaware.prior()
     errors = []
     for k in range(200):
         x = trajectory.advance(drive.pushed(k))
         packet = encoder.encode(k, x, trajectory.predicted)
-        heard = Heard(random.random(5) < 0.5, packet.z)
+        heard = Reception(random.random(5) < 0.5, packet.z)
         one, other = aware.step(k, one, heard), unaware.step(k, other, heard)
         u = random.normal(size=(2, 5))
         assert np.allclose(one.x_hat, other.x_hat + offset.next(other.action, u), atol=1e-12)

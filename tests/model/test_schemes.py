@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Action, Belief, Heard
+from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import state_covariances
@@ -51,7 +51,7 @@ def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> l
     estimator = made(scheme, process).estimator(KEYS, batch)
     belief, found = estimator.prior(), []
     for k, (_, z, _) in enumerate(packets(scheme, process, batch)):
-        belief = estimator.step(k, belief, Heard(gamma[k], z))
+        belief = estimator.step(k, belief, Reception(gamma[k], z))
         found.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
     return found
 

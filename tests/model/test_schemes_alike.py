@@ -9,7 +9,7 @@ import pytest
 from slot_loop import STABLE, UNSTABLE, Played, coins, keys_of, play
 
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Heard
+from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.streams import Batch
@@ -60,7 +60,7 @@ def test_a_step_is_pure(name: str) -> None:
     belief = estimator.prior()
     for k, packet in enumerate(played.packets):
         gamma = played.received["legitimate"][k]
-        heard = Heard(gamma, packet.z, packet.header)
+        heard = Reception(gamma, packet.z, packet.header)
         before = [array.copy() for array in (belief.x_hat, belief.P, *belief.memory)]
         first, second = estimator.step(k, belief, heard), estimator.step(k, belief, heard)
         for one, other in zip(

@@ -14,16 +14,16 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.eavesdroppers.tracker import Tracker
 from evedrop.model.process import Process, Trajectory
-from evedrop.model.receiver import Action, Belief, Heard
-from evedrop.model.schemes.twin_track import Tracks, TwinTrack
+from evedrop.model.receiver import Action, Belief, Reception
+from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.streams import Batch, stream_key
 
 KEYS = keys_of(("start", "track"))
 CLOSE = Process(UNSTABLE.A, UNSTABLE.Q, UNSTABLE.Q)
-"""Tracks that begin no further apart than a slot's noise."""
+"""TwinTracks that begin no further apart than a slot's noise."""
 RESTLESS = Process(np.eye(2), np.eye(2), np.eye(2))
-"""Tracks that stay so."""
+"""TwinTracks that stay so."""
 
 
 class Slot(NamedTuple):
@@ -58,7 +58,7 @@ def believed(process: Process, batch: Batch, gamma: np.ndarray, learns_at: int) 
     belief = one.prior()
     for slot in slots(process, batch, gamma):
         truth = slot.x if slot.k == learns_at else None
-        belief = one.step(slot.k, belief, Heard(slot.gamma, slot.z, truth=truth))
+        belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z, truth=truth))
         found.append((slot, belief))
     return found
 
@@ -160,7 +160,7 @@ def test_one_betrayed_state_breaks_twin_tracks() -> None:
     estimator = TwinTrack(DRIFTING).estimator(KEYS, batch)
     user, belief = [], estimator.prior()
     for slot in slots(DRIFTING, batch, gamma):
-        belief = estimator.step(slot.k, belief, Heard(slot.gamma, slot.z))
+        belief = estimator.step(slot.k, belief, Reception(slot.gamma, slot.z))
         user.append((slot, belief))
     legitimate = errors(user)
     assert np.all(found[learns_at] == 0.0)
@@ -179,10 +179,10 @@ def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
     gamma = coins(0.9, 40, 1000)
     gamma[learns_at] = True
     pairs = believed(UNSTABLE, batch, gamma, learns_at)
-    tracks, estimator = Tracks(UNSTABLE, KEYS, batch), TwinTrack(UNSTABLE).estimator(KEYS, batch)
+    tracks, estimator = TwinTracks(UNSTABLE, KEYS, batch), TwinTrack(UNSTABLE).estimator(KEYS, batch)
     on_twin, user = tracks.on_twin(learns_at), estimator.prior()
     for slot, belief in pairs:
-        user = estimator.step(slot.k, user, Heard(slot.gamma, slot.z))
+        user = estimator.step(slot.k, user, Reception(slot.gamma, slot.z))
         if slot.k > learns_at:
             scale = float(np.abs(slot.x).max())
             away = np.abs(belief.x_hat - user.x_hat).max(axis=0)
@@ -229,7 +229,7 @@ def test_more_room_changes_little() -> None:
         one, total = Tracker(Knowledge(RESTLESS, 1.0, {}, {}), batch, capacity), 0.0
         belief = one.prior()
         for slot in slots(RESTLESS, batch, gamma):
-            belief = one.step(slot.k, belief, Heard(slot.gamma, slot.z))
+            belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
             if slot.k == 15:
                 belief = one.knowing(slot.k, slot.x, belief)
             total += float(((slot.x - belief.x_hat) ** 2).sum())

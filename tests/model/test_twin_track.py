@@ -10,7 +10,7 @@ from slot_loop import DRIFTING, STABLE, UNSTABLE, coins, keys_of, play
 from evedrop.model.eavesdroppers import READERS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
-from evedrop.model.schemes.twin_track import Tracks, TwinTrack
+from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import expected_covariances
 from evedrop.streams import Batch
@@ -30,7 +30,7 @@ def test_packets_are_on_one_track_or_the_other(process: Process) -> None:
     slots, trials = 20, 5000
     batch = Batch(slots, trials)
     played = play(TwinTrack(process), batch, {"legitimate": np.ones((slots, trials), bool)})
-    tracks = Tracks(process, KEYS, batch)
+    tracks = TwinTracks(process, KEYS, batch)
     assert np.array_equal(played.x[0], tracks.initial)
     apart = played.packets[0].z - played.x[0]
     twins = 0
@@ -109,7 +109,7 @@ def test_the_bound_is_met_by_who_sees_both_tracks() -> None:
     """Half-way between the tracks the mean squared error is the bound itself: there is no better one."""
     slots, trials = 10, 20_000
     batch = Batch(slots, trials)
-    tracks = Tracks(UNSTABLE, KEYS, batch)
+    tracks = TwinTracks(UNSTABLE, KEYS, batch)
     bound = twin_track_bound(UNSTABLE, slots)
     for k in range(slots):
         error = ((tracks.distance(k) / 2.0) ** 2).sum(0)
@@ -120,8 +120,8 @@ def test_one_state_that_leaks_breaks_it() -> None:
     """Who learns a single x_k tells the tracks apart in that slot, and by their distance in every other."""
     batch = Batch(10, 500)
     played = play(TwinTrack(UNSTABLE), batch, {"legitimate": np.ones((10, 500), bool)})
-    on_twin = Tracks(UNSTABLE, KEYS, batch).on_twin(4)
+    on_twin = TwinTracks(UNSTABLE, KEYS, batch).on_twin(4)
     guessed = ((played.packets[4].z - played.x[4]) ** 2).sum(0) > 1e-12
     assert np.array_equal(guessed, on_twin)
     back = np.linalg.matrix_power(np.linalg.inv(UNSTABLE.A), 4) @ (played.packets[4].z - played.x[4])
-    assert np.allclose(back[:, guessed], Tracks(UNSTABLE, KEYS, batch).distance(0)[:, guessed], atol=1e-6)
+    assert np.allclose(back[:, guessed], TwinTracks(UNSTABLE, KEYS, batch).distance(0)[:, guessed], atol=1e-6)

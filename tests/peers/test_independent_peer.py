@@ -14,13 +14,13 @@ import pytest
 from independent_legitimate import Estimator
 
 from evedrop import montecarlo
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.loading import load
 from evedrop.model.digest import BeliefLog, Blocks, RunDigest
 from evedrop.model.process import Trajectory
-from evedrop.model.receiver import Heard
+from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
@@ -64,7 +64,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     """Fed with the deliveries of a run, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots, first_trial)
     keys, batch = StreamKeys.of(scenario), Batch(slots, 9, first_trial)
-    made = briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
+    made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
     model = scenario.process.process
     trajectory = Trajectory(model, keys.process, batch)
@@ -76,7 +76,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     beliefs, blocks = [], {}
     for k, gamma in enumerate(gammas):
         z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
-        belief = estimator.step(k, belief, Heard(gamma, z))
+        belief = estimator.step(k, belief, Reception(gamma, z))
         beliefs.append(belief)
         digests = log.add(k, belief)
         if digests is not None:
@@ -95,7 +95,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
 def test_it_refuses_a_gap() -> None:
     """A slot that is not due is an error, as the protocol says."""
     scenario = scenario_of(UNSTABLE, 10, 0)
-    made = briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
+    made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
         peer.receive(packets.delivery(1, b"\0\0", b""))
@@ -106,7 +106,7 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
     scenario = load("eavesdroppers", {"slots": 300, "trials": 2})
     out = tmp_path / "out"
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    briefs = briefs_of(scenario, endpoint, Observation(out, False), ends_with_stdin=False)
+    briefs = briefs_of(scenario, endpoint, ObserverTask(out, False), ends_with_stdin=False)
     with ExitStack() as stack:
         running = {}
         for name, brief in briefs.items():

@@ -17,13 +17,13 @@ import evedrop.live.network.mailbox
 import evedrop.peers.following
 import evedrop.peers.sensor
 from evedrop.errors import Gap, MalformedMessage
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.reporting import is_due
-from evedrop.live.network.resending import Kept
+from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import Brief, Flow
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks
 from evedrop.model.flag_bits import packed_flags
@@ -61,7 +61,7 @@ def scenario_of(**changes: Any) -> Scenario:
 
 def briefs(**changes: Any) -> dict[str, Brief]:
     """Briefs with a small window."""
-    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
+    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 
 
@@ -72,13 +72,13 @@ class Stage:
     inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
     funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
-    kept: dict[str, Kept] = field(default_factory=dict)
+    kept: dict[str, ReplayBuffer] = field(default_factory=dict)
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
     """Of the conductor, as `wire.control` makes them."""
 
     def session(self, brief: Brief) -> FakeSession:
         """In the place of `Session`."""
-        return FakeSession(self, Keys(brief.run))
+        return FakeSession(self, RunKeys(brief.run))
 
     def fill(self, key: str, messages: list[bytes]) -> None:
         """Put messages into an inbox."""
@@ -114,7 +114,7 @@ class FakeInbox:
 class FakeSession:
     """The part of `Session` that peers use."""
 
-    def __init__(self, stage: Stage, keys: Keys) -> None:
+    def __init__(self, stage: Stage, keys: RunKeys) -> None:
         self._stage = stage
         self.keys = keys
         self.place = Place()
@@ -139,9 +139,9 @@ class FakeSession:
         """Puts into the stage."""
         return lambda payload: self._stage.put.put((key, payload))
 
-    def kept(self, key: str, *how: Any, **more: Any) -> Kept:
+    def kept(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
         """The same, kept to be sent once more."""
-        self._stage.kept[key] = kept = Kept(self.outlet(key), *how, **more)
+        self._stage.kept[key] = kept = ReplayBuffer(self.outlet(key), *how, **more)
         return kept
 
     def ready(self) -> None:
@@ -187,7 +187,7 @@ RECEIVERS = {"legitimate": estimate, "naive": eavesdrop, "smart": eavesdrop, "su
 def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     """A receiver's reports cover all slots without gap, with progress after each batch, and it leaves on `end`."""
     brief = briefs()[name]
-    keys = Keys(brief.run)
+    keys = RunKeys(brief.run)
     stage.fill(keys.downlink(name), deliveries())
     stage.commands.put(wire.control("end"))
     RECEIVERS[name](brief)
@@ -216,11 +216,11 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
     found = []
     for flow in (Flow(1024, 7), Flow(1024, batch)):
         brief = replace(briefs(slots=600)[name], flow=flow, run="r")
-        stage.fill(Keys("r").downlink(name), deliveries(600))
+        stage.fill(RunKeys("r").downlink(name), deliveries(600))
         stage.commands.put(wire.control("end"))
         RECEIVERS[name](brief)
         end, x_hat, P, blocks = 0, [], [], {}
-        for payload in stage.all(Keys("r").telemetry(name)):
+        for payload in stage.all(RunKeys("r").telemetry(name)):
             report = telemetry.read_report(wire.Reader("", payload), end, replace(EXTENT, slots=600), Blocks(600))
             end += report.count
             x_hat.append(report.x_hat)
@@ -255,7 +255,7 @@ def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
     """A gap that is not closed, or a malformed delivery, ends a receiver with an error that names the key and what was due."""
     messages, error, text = BAD[what]
     brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
-    stage.fill(Keys(brief.run).downlink(name), messages)
+    stage.fill(RunKeys(brief.run).downlink(name), messages)
     with pytest.raises(error, match=text) as caught:
         RECEIVERS[name](brief)
     assert caught.value.exit_status == 3
@@ -269,12 +269,12 @@ def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
     good = deliveries()
     for messages in (
         good,
-        [*good[:20], *good[23:30], packets.hold(25), *good[5:40], packets.hold(7), good[0], *good[30:]],
+        [*good[:20], *good[23:30], packets.barrier(25), *good[5:40], packets.barrier(7), good[0], *good[30:]],
     ):
-        stage.fill(Keys("r").downlink(name), messages)
+        stage.fill(RunKeys("r").downlink(name), messages)
         stage.commands.put(wire.control("end"))
         RECEIVERS[name](brief)
-        found.append(stage.all(Keys("r").telemetry(name)))
+        found.append(stage.all(RunKeys("r").telemetry(name)))
     assert found[0] == found[1]
 
 
@@ -300,29 +300,29 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
         return packets.delivery(k, packed_flags(gamma).tobytes(), bytes(32), header=header)
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
-    stage.fill(Keys("r").downlink("legitimate"), [delivered(k) for k in slots])
+    stage.fill(RunKeys("r").downlink("legitimate"), [delivered(k) for k in slots])
     stage.commands.put(wire.control("end"))
     estimate(brief)
     expected = [packets.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
-    assert stage.all(Keys("r").acknowledged) == expected
+    assert stage.all(RunKeys("r").acknowledged) == expected
 
 
 @pytest.mark.parametrize("name", ["legitimate", "smart"])
 def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
     """What the observer may not have joined yet can be sent once more, and nothing that is older; the last progress too."""
     brief = replace(briefs()[name], run="r")
-    stage.fill(Keys("r").downlink(name), deliveries())
+    stage.fill(RunKeys("r").downlink(name), deliveries())
     stage.commands.put(wire.control("end"))
     RECEIVERS[name](brief)
     stage.all("")
-    stage.kept[Keys("r").telemetry(name)].again(1, 0)
+    stage.kept[RunKeys("r").telemetry(name)].again(1, 0)
     ends = []
-    for payload in stage.all(Keys("r").telemetry(name)):
+    for payload in stage.all(RunKeys("r").telemetry(name)):
         message = wire.Reader("", payload)
         ends.append(message.integer("k") + message.integer("c"))
     assert ends == [40, 44, 48, 50]
-    stage.kept[Keys("r").progress(name)].again(1, SLOTS)
-    assert stage.all(Keys("r").progress(name)) == [wire.progress(SLOTS)]
+    stage.kept[RunKeys("r").progress(name)].again(1, SLOTS)
+    assert stage.all(RunKeys("r").progress(name)) == [wire.progress(SLOTS)]
 
 
 class Sensing:
@@ -330,7 +330,7 @@ class Sensing:
 
     def __init__(self, stage: Stage, brief: Brief) -> None:
         self.stage = stage
-        self.keys = Keys(brief.run)
+        self.keys = RunKeys(brief.run)
         self.thread = threading.Thread(target=sense, args=(brief,), daemon=True)
         self.thread.start()
 
@@ -395,7 +395,7 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     sensing.packets(WINDOW, WINDOW + 8)
     stage.kept[sensing.keys.uplink].again(4, 10)
     key, payload = sensing.next()
-    assert (key, payload) == (sensing.keys.uplink, packets.once_more(4, 10, 7))
+    assert (key, payload) == (sensing.keys.uplink, packets.resend(4, 10, 7))
     for k in range(7, WINDOW + 8):
         packets.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
     stage.kept[sensing.keys.uplink].again(5, 8)
@@ -427,7 +427,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
     monkeypatch.setattr(evedrop.live.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
-    window = Window(session, followers, 10, Kept(print))  # type: ignore[arg-type]
+    window = Window(session, followers, 10, ReplayBuffer(print))  # type: ignore[arg-type]
 
     def reaches(limit: int) -> None:
         window.wait(limit - 1)
@@ -453,7 +453,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
 def test_sensor_refuses_malformed_progress(k: float, stage: Stage) -> None:
     """Progress that is not as documented, or beyond what was sent, is an error that names its key and its sender."""
     session = stage.session(briefs()["sensor"])
-    window = Window(session, ("a",), 1, Kept(print))  # type: ignore[arg-type]
+    window = Window(session, ("a",), 1, ReplayBuffer(print))  # type: ignore[arg-type]
     stage.funnels[session.keys.progress("a")](msgpack.packb({"k": k}))
     with pytest.raises(MalformedMessage, match=rf"progress/a: k = {k}.*Check that a speaks") as found:
         window.wait(2)

@@ -19,7 +19,7 @@ from evedrop.errors import ScenarioError, TraceError
 from evedrop.loading import load
 from evedrop.model.links.checks import as_toml
 from evedrop.recordings import link_recording as traces
-from evedrop.recordings.link_recording import Recording
+from evedrop.recordings.link_recording import LinkRecording
 from tests.conftest import Evedrop
 
 GOOD: dict[str, Any] = {
@@ -50,23 +50,23 @@ def write(folder: Path, name: str, text: str | bytes) -> Path:
 )
 def test_a_csv_file_is_read(tmp_path: Path, text: str, column: str | None) -> None:
     """With or without names, with blanks and line ends of any kind."""
-    assert Recording(write(tmp_path, "walk.csv", text)).outcomes(column).tolist() == [1, 1, 0, 1]
+    assert LinkRecording(write(tmp_path, "walk.csv", text)).outcomes(column).tolist() == [1, 1, 0, 1]
 
 
 @pytest.mark.parametrize("values", [[1, 1, 0, 1], [True, True, False, True], [1.0, 1.0, 0.0, 1.0]])
 def test_a_parquet_file_is_read(tmp_path: Path, values: list[Any]) -> None:
     """Whole numbers, flags and floats."""
     pq.write_table(pa.table({"received": values, "x": [0.5] * 4}), tmp_path / "walk.parquet")
-    assert Recording(tmp_path / "walk.parquet").outcomes("received").tolist() == [1, 1, 0, 1]
-    assert Recording(tmp_path / "walk.parquet").columns() == ["received", "x"]
+    assert LinkRecording(tmp_path / "walk.parquet").outcomes("received").tolist() == [1, 1, 0, 1]
+    assert LinkRecording(tmp_path / "walk.parquet").columns() == ["received", "x"]
 
 
 def test_delays_are_read(tmp_path: Path) -> None:
     """A lost packet has none."""
     path = write(tmp_path, "walk.csv", "received,delay\n1,2.5\n0,\n1,3\n")
-    assert np.array_equal(Recording(path).delays("delay"), [2.5, np.nan, 3.0], equal_nan=True)
-    assert Recording(path).columns() == ["received", "delay"]
-    assert Recording(write(tmp_path, "bare.csv", "1\n0\n")).columns() == []
+    assert np.array_equal(LinkRecording(path).delays("delay"), [2.5, np.nan, 3.0], equal_nan=True)
+    assert LinkRecording(path).columns() == ["received", "delay"]
+    assert LinkRecording(write(tmp_path, "bare.csv", "1\n0\n")).columns() == []
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_what_is_no_recording_is_said(
     if text is not None:
         write(tmp_path, name, text)
     with pytest.raises(TraceError) as caught:
-        Recording(tmp_path / name).outcomes(column)
+        LinkRecording(tmp_path / name).outcomes(column)
     assert (caught.value.entry, caught.value.exit_status) == (entry, 2)
     assert said in caught.value.what
     loss = {"model": "trace", "file": name, **({} if column is None else {"column": column})}
@@ -117,7 +117,7 @@ def test_parquet_says_row_and_gap(tmp_path: Path) -> None:
     for values, said in (([1, 7], 'row 2 is "7"'), ([1, 0, None], "row 3 is empty"), (["1", "x"], 'row 2 is "x"')):
         pq.write_table(pa.table({"received": values}), tmp_path / "walk.parquet")
         with pytest.raises(TraceError, match=said):
-            Recording(tmp_path / "walk.parquet").outcomes()
+            LinkRecording(tmp_path / "walk.parquet").outcomes()
 
 
 @pytest.mark.parametrize("delay", ["-1", "inf", "soon", "nan"])
@@ -125,7 +125,7 @@ def test_a_delay_that_is_none_is_said(tmp_path: Path, delay: str) -> None:
     """Negative, infinite, no number."""
     path = write(tmp_path, "walk.csv", f"delay\n1\n{delay}\n")
     with pytest.raises(TraceError, match=f'line 3 is "{delay}"; expected a delay in slots'):
-        Recording(path).delays("delay")
+        LinkRecording(path).delays("delay")
 
 
 def mistakes(folder: Path, loss: dict[str, Any], **more: Any) -> list[str]:

@@ -14,7 +14,7 @@ from evedrop import scenario
 from evedrop.api import montecarlo
 from evedrop.loading import parse
 from evedrop.results import growing_tables as growing
-from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, Stream, Unfinished, finish
+from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
 from evedrop.results.writer import ACTIONS, DIGESTS, JOURNAL, Results, load_results
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -90,7 +90,7 @@ def masks(rows: int, width: int) -> list[np.ndarray]:
 def journal(folder: Path, parts: list[list[np.ndarray]]) -> pq.ParquetFile:
     """The Parquet file of a journal that was written in a round for each part."""
     unfinished = Unfinished(folder)
-    stream = Stream(folder / UNFINISHED / "journal-0.arrows", JOURNAL, {"link": ("legitimate",)})
+    stream = TableStream(folder / UNFINISHED / "journal-0.arrows", JOURNAL, {"link": ("legitimate",)})
     for columns in parts:
         stream.add(columns)
         unfinished.round("", 0, {"journal": stream})

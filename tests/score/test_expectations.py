@@ -20,10 +20,10 @@ from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.receiver import Action
 from evedrop.results.writer import Results, load_results
-from evedrop.score.expectations_held import Evidence, told
+from evedrop.score.expectations_held import Evidence, format_expectation
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
-from evedrop.score.watched import IN_STEP, Watch, Watched
+from evedrop.score.watched import IN_STEP, Watched, WatchedSlots
 from tests.conftest import Evedrop
 
 SLOTS, TRIALS, FIRST = 90, 12, 30
@@ -110,7 +110,7 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
     unknown = found["links.naive.lost_by.nothing above 0"]
     assert (unknown["found"], unknown["held"]) == (None, None)
-    assert told(unknown).endswith(": this run does not tell")
+    assert format_expectation(unknown).endswith(": this run does not tell")
     perfect = found["perfect secrecy against smart promised by theory and shown by the run"]
     assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))
@@ -142,8 +142,8 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     """Slots in chunks and trials in blocks: the bits are those of one piece."""
     draw = np.random.default_rng(1)
     error, action = draw.lognormal(size=(40, 7)), draw.integers(0, 4, (40, 7)).astype(np.uint8)
-    watches = [Watch(figure, *span) for figure in FIGURES for span in ((0, 40), (7, 21))]
-    steps = [Watch(IN_STEP, 0, 40), Watch(IN_STEP, 11, 40)]
+    watches = [WatchedSlots(figure, *span) for figure in FIGURES for span in ((0, 40), (7, 21))]
+    steps = [WatchedSlots(IN_STEP, 0, 40), WatchedSlots(IN_STEP, 11, 40)]
 
     def watched(trials: slice, ends: list[int]) -> Watched:
         one = Watched([*watches, *steps], error[:, trials].shape[1])
@@ -170,7 +170,7 @@ def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> No
     )
     (one,) = results.summary["expectations"]
     assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
-    assert told(one) == "expected legitimate in step by slot 3: FAILED, found none"
+    assert format_expectation(one) == "expected legitimate in step by slot 3: FAILED, found none"
     ranged = {"figure": "smart.used_fraction", "slots": [3, 9], "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
@@ -237,7 +237,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     assert "2 of 2 expectations FAILED" in done.out
     said = [line.strip() for line in done.out.splitlines()]
     for one in first:
-        assert said[said.index(told(one)) + 1] == f"see it again: {one['replay']}"
+        assert said[said.index(format_expectation(one)) + 1] == f"see it again: {one['replay']}"
     words = shlex.split(first[0]["replay"])
     assert words[:2] == ["evedrop", command]
     again = evedrop(*words[1:], *view, "--json", "--out", "again")

@@ -9,7 +9,7 @@ import pytest
 
 from evedrop.expected.expectations import Expectation
 from evedrop.model.process import Floats, Process
-from evedrop.model.slot.link import Course
+from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
@@ -41,7 +41,7 @@ def expectation(link: dict[str, Any], mu_d: float, uses: tuple[float, float] | N
     def outcomes_at(quality: float) -> Outcomes:
         return Outcomes.legitimate(quality, mu_d) if uses is None else Outcomes.eavesdropper(quality, mu_d, *uses)
 
-    return Expectation(STABLE, law_of(Course({"loss": link})), outcomes_at)
+    return Expectation(STABLE, law_of(LinkSchedule({"loss": link})), outcomes_at)
 
 
 def good(quality: float) -> dict[str, Any]:
@@ -191,9 +191,9 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
 
     def found(process: Process, mu: float, mu_e: float) -> Secrecy:
         ours = Expectation(
-            process, law_of(Course({"loss": good(mu)})), lambda quality: Outcomes.legitimate(quality, 0.6)
+            process, law_of(LinkSchedule({"loss": good(mu)})), lambda quality: Outcomes.legitimate(quality, 0.6)
         )
-        chain = law_of(Course({"loss": good(mu_e)}))
+        chain = law_of(LinkSchedule({"loss": good(mu_e)}))
         theirs = Expectation(process, chain, None, lambda quality: Outcomes.genie(quality, 0.6))
         assert np.isnan(theirs.traces(3)).all()
         return secrecy((user, ours), ("eve", other, theirs))
@@ -209,7 +209,7 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
             "perfect secrecy" if perfect else "relative secrecy" if relative else "relative secrecy from slot 7 on"
         )
         assert one.sentence.endswith(f"theory promises {promise}")
-    nothing = Expectation(STABLE, law_of(Course({"loss": good(0.9)})), None)
+    nothing = Expectation(STABLE, law_of(LinkSchedule({"loss": good(0.9)})), None)
     one = secrecy((user, expectation(good(0.9), 0.5)), ("eve", other, nothing))
     assert one.sentence.endswith("no closed form of its error is known")
 
@@ -219,7 +219,7 @@ def test_rounding_on_a_perfect_link_is_no_failure() -> None:
     growing = around(np.geomspace(1.0, 1e6, WINDOWS))
     user, other = tally(around(1e-20)), tally(growing)
     perfect = Expectation(
-        STABLE, law_of(Course({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
+        STABLE, law_of(LinkSchedule({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
     )
     misled = expectation(good(0.5), 0.5, (1.0, 1.0))
     assert secrecy((user, perfect), ("eve", other, misled)).perfect is Verdict.HELD

@@ -15,7 +15,7 @@ from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
-from evedrop.score.kept import Kept
+from evedrop.score.kept import SecrecyKept
 from evedrop.studies.compare import Comparison
 from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
 from tests.conftest import Evedrop
@@ -24,17 +24,17 @@ MARGINAL = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0
 """Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
 
 VERDICTS = {
-    ("plain", "naive"): Kept.BROKEN,
-    ("cipher", "naive"): Kept.PERFECT,
-    ("innovation", "naive"): Kept.PERFECT,
-    ("acknowledged", "reference"): Kept.PERFECT,
-    ("acknowledged", "blocks-critical"): Kept.BROKEN,
-    ("acknowledged", "blocks-all"): Kept.BROKEN,
-    ("acknowledged", "forges"): Kept.BROKEN,
-    ("twin-track", "naive"): Kept.PERFECT,
-    ("twin-track", "tracker"): Kept.PERFECT,
-    ("twin-track", "replay-informed"): Kept.RELATIVE,
-    ("innovation", "genie"): Kept.RELATIVE,
+    ("plain", "naive"): SecrecyKept.BROKEN,
+    ("cipher", "naive"): SecrecyKept.PERFECT,
+    ("innovation", "naive"): SecrecyKept.PERFECT,
+    ("acknowledged", "reference"): SecrecyKept.PERFECT,
+    ("acknowledged", "blocks-critical"): SecrecyKept.BROKEN,
+    ("acknowledged", "blocks-all"): SecrecyKept.BROKEN,
+    ("acknowledged", "forges"): SecrecyKept.BROKEN,
+    ("twin-track", "naive"): SecrecyKept.PERFECT,
+    ("twin-track", "tracker"): SecrecyKept.PERFECT,
+    ("twin-track", "replay-informed"): SecrecyKept.RELATIVE,
+    ("innovation", "genie"): SecrecyKept.RELATIVE,
 }
 
 Everything = tuple[Comparison, Path]
@@ -171,7 +171,7 @@ def test_one_trial_decides_nothing(tmp_path: Path) -> None:
     for adversary in ("naive", "smart"):
         cell = found.cell("innovation", adversary)
         assert cell.eavesdropper is not None
-        assert cell.verdict is Kept.UNDECIDED
+        assert cell.verdict is SecrecyKept.UNDECIDED
         assert cell.eavesdropper.standard_error is None
 
 
@@ -217,7 +217,7 @@ def test_innovations_have_no_acknowledgements_to_block(literature: Comparison) -
         cell = literature.cell("innovation", adversary)
         assert cell.ratio is not None
         assert cell.ratio > 1.0
-        assert cell.verdict in {Kept.RELATIVE, Kept.PERFECT}
+        assert cell.verdict in {SecrecyKept.RELATIVE, SecrecyKept.PERFECT}
 
 
 def test_a_forged_acknowledgement_is_the_users_loss(literature: Comparison) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process, Trajectory
-from evedrop.model.receiver import Heard, Receiver
+from evedrop.model.receiver import Receiver, Reception
 from evedrop.model.schemes import SCHEMES
 from evedrop.streams import Batch, root_of_seed, stream_key
-from evedrop.view.recording import PeerSlots, Scene, Shown, Slots
+from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
 
 STATE_PROBABILITY = 0.35
 USE_STATE, USE_INNOVATION = 0.8, 0.3
@@ -35,9 +35,9 @@ class Simulated:
     """A run: its scene, and all its slots in one piece."""
 
     scene: Scene
-    slots: Slots
+    slots: SceneSlots
 
-    def chunks(self, length: int) -> Iterator[Slots]:
+    def chunks(self, length: int) -> Iterator[SceneSlots]:
         """The slots, as the observer hands them over: some at a time."""
         for first in range(0, self.scene.slots, length):
             part = slice(first, first + length)
@@ -52,7 +52,7 @@ class Simulated:
                 )
                 for name, p in self.slots.peers.items()
             }
-            yield Slots(first, self.slots.x[part], self.slots.nu[part], peers)
+            yield SceneSlots(first, self.slots.x[part], self.slots.nu[part], peers)
 
 
 def simulate(
@@ -83,7 +83,7 @@ def simulate(
         nus.append(nu[0])
         for name, (_, receiver) in receivers.items():
             gamma = arrivals.random(trials) < qualities[name]
-            beliefs[name] = b = receiver.step(k, beliefs[name], Heard(gamma, z))
+            beliefs[name] = b = receiver.step(k, beliefs[name], Reception(gamma, z))
             error = np.sum((x - b.x_hat) ** 2, axis=0).mean()
             trace = np.trace(b.P).mean()
             seen[name].append((b.x_hat[:, 0], b.P[:, :, 0], b.action[0], error, trace))
@@ -98,7 +98,7 @@ def simulate(
     scene = Scene(
         "Simulated", f"simulated-{seed}-{slots}", slots, trials, process.n, pace, shown, float(np.trace(process.Q))
     )
-    return Simulated(scene, Slots(0, np.array(truth), np.array(nus), peers))
+    return Simulated(scene, SceneSlots(0, np.array(truth), np.array(nus), peers))
 
 
 def expected(process: Process, shown: Shown, slots: int) -> Floats:

@@ -13,14 +13,14 @@ from simulated_run import Simulated
 
 from evedrop.errors import UsageError
 from evedrop.view.picture import opened, picture, picture_apart
-from evedrop.view.recording import Recording
+from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer_process import guarded
 from tests.conftest import wait_until
 
 
 def recorded(run: Simulated, rrd: Path) -> Path:
     """The run on file."""
-    recording = Recording(rrd, run.scene)
+    recording = ViewRecording(rrd, run.scene)
     for slots in run.chunks(100):
         recording.add(slots)
     assert recording.close()

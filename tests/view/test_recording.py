@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from simulated_run import Simulated
 
 from evedrop.view import plane
-from evedrop.view.recording import Recording, Scene
+from evedrop.view.recording import Scene, ViewRecording
 from tests.conftest import LIMIT
 
 SLOTS = 400
@@ -20,7 +20,7 @@ SLOTS = 400
 
 def record(run: Simulated, rrd: Path, chunk: int = 60) -> None:
     """Put a run on file, some slots at a time."""
-    recording = Recording(rrd, run.scene)
+    recording = ViewRecording(rrd, run.scene)
     for slots in run.chunks(chunk):
         recording.add(slots)
     recording.note(5, "WARN", "a note")
@@ -138,7 +138,7 @@ def test_long_runs_have_bounded_frames() -> None:
 
 def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) -> None:
     """Without a file the run goes on, and the reason is kept."""
-    recording = Recording(tmp_path / "missing" / "r.rrd", run.scene)
+    recording = ViewRecording(tmp_path / "missing" / "r.rrd", run.scene)
     for slots in run.chunks(100):
         recording.add(slots)
     recording.close()
@@ -150,7 +150,7 @@ def test_slots_that_cannot_be_drawn_end_the_recording_and_not_the_run(
     run: Simulated, simulated: Callable[..., Simulated], tmp_path: Path
 ) -> None:
     """Slots of another process than the scene's: adding and closing end, and the reason is kept."""
-    recording = Recording(tmp_path / "r.rrd", simulated(50, n=1).scene)
+    recording = ViewRecording(tmp_path / "r.rrd", simulated(50, n=1).scene)
     smart = run.slots.peers["smart"]
     recording.add(replace(run.slots, peers={name: replace(smart, x_hat=smart.x_hat[:3]) for name in run.slots.peers}))
     recording.close()
@@ -162,11 +162,11 @@ import os, resource, signal, sys
 sys.path.insert(0, sys.argv[1])
 from simulated_run import orbit, simulate
 from pathlib import Path
-from evedrop.view.recording import Recording
+from evedrop.view.recording import ViewRecording
 run = simulate(orbit(), 3000)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
-recording = Recording(Path(sys.argv[2]), run.scene)
+recording = ViewRecording(Path(sys.argv[2]), run.scene)
 for slots in run.chunks(300):
     recording.add(slots)
 safe = recording.close()

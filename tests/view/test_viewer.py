@@ -20,8 +20,8 @@ from simulated_run import Simulated
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
 from evedrop.view.growing_recording import Followed, feed
-from evedrop.view.recording import Recording
-from evedrop.view.viewer import Stand, Viewer, choose, open_run
+from evedrop.view.recording import ViewRecording
+from evedrop.view.viewer import Viewer, WebAddress, choose, open_run
 from tests.conftest import LIMIT, wait_until
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -283,7 +283,7 @@ def test_faulty_viewer_changes_nothing(
     """A viewer that hangs, dies or reads nothing of what it asked for holds up no slot, and the file is complete."""
     run = simulated(SLOTS)
     run = replace(run, scene=replace(run.scene, run=fault))
-    recording = Recording(tmp_path / "r.rrd", run.scene)
+    recording = ViewRecording(tmp_path / "r.rrd", run.scene)
     longest = 0.0
     with urllib.request.urlopen(data_of(viewer), timeout=LIMIT):  # noqa: S310 - our own address
         for slots in run.chunks(100):
@@ -303,7 +303,7 @@ def test_faulty_viewer_changes_nothing(
 def test_a_browser_gets_the_run(simulated: Callable[..., Simulated], viewer: Viewer, tmp_path: Path) -> None:
     """What is served while a run is recorded is the recording, whole."""
     run = simulated(SLOTS)
-    recording = Recording(tmp_path / "r.rrd", run.scene)
+    recording = ViewRecording(tmp_path / "r.rrd", run.scene)
     with urllib.request.urlopen(data_of(viewer), timeout=LIMIT) as reply:  # noqa: S310 - our own address
         for slots in run.chunks(500):
             recording.add(slots)
@@ -314,7 +314,7 @@ def test_a_browser_gets_the_run(simulated: Callable[..., Simulated], viewer: Vie
 
 def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
     """The page at the port that was asked for, the data at the next; whoever asks for the same place is refused."""
-    stand = Stand("127.0.0.1", free_port())
+    stand = WebAddress("127.0.0.1", free_port())
     viewer = Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
     try:
         assert viewer.address is not None
@@ -332,9 +332,9 @@ def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
 def test_a_place_that_is_none_is_refused(text: str) -> None:
     """An address and a port that has a next one."""
     with pytest.raises(UsageError, match=r"is no address and port; give one such as 127\.0\.0\.1:17450"):
-        Stand.of(text)
+        WebAddress.of(text)
 
 
 def test_every_address_is_seen_at_loopback() -> None:
     """What a browser on this machine is to be pointed at."""
-    assert Stand.of("0.0.0.0:17450").seen == Stand.of("127.0.0.1:17450").seen == "127.0.0.1"
+    assert WebAddress.of("0.0.0.0:17450").seen == WebAddress.of("127.0.0.1:17450").seen == "127.0.0.1"

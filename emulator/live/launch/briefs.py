@@ -10,7 +10,7 @@ from typing import Any
 
 from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.closed_loop_briefs import LoopBriefs
-from evedrop.live.launch.ports import Places, places_at
+from evedrop.live.launch.ports import RouterEndpoints, places_at
 from evedrop.live.launch.routers import Routers, identities_of
 from evedrop.live.protocol.brief import Brief, Flow, Model
 from evedrop.live.protocol.message_limits import Sizes
@@ -71,7 +71,7 @@ def history_of(scenario: Scenario) -> int:
 
 
 @dataclass(frozen=True)
-class Observation:
+class ObserverTask:
     """What the observer is told besides the scenario."""
 
     results: Path
@@ -82,8 +82,8 @@ class Observation:
 
 def briefs_of(
     scenario: Scenario,
-    places: Places | str,
-    observation: Observation,
+    places: RouterEndpoints | str,
+    observation: ObserverTask,
     ends_with_stdin: bool = True,
     patience: int = _LAUNCHED_PATIENCE,
 ) -> dict[str, Brief]:
@@ -230,7 +230,7 @@ def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
     return {"window": scenario.window(receiver), "outages": outages}
 
 
-def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path, patience: int) -> list[Path]:
+def write_briefs(scenario: Scenario, places: RouterEndpoints, results: Path, folder: Path, patience: int) -> list[Path]:
     """Write the briefs into a folder, for processes that are started by hand, on whichever hosts.
 
     results: the observer's folder, on its host; relative to where it is started. patience: seconds that everybody waits for
@@ -242,7 +242,7 @@ def write_briefs(scenario: Scenario, places: Places, results: Path, folder: Path
             f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
             "itself, with its own --first-trial and --trials"
         )
-    made = briefs_of(scenario, places, Observation(results, True), ends_with_stdin=False, patience=patience)
+    made = briefs_of(scenario, places, ObserverTask(results, True), ends_with_stdin=False, patience=patience)
     try:
         new_folder(folder)
         return [brief.write(folder) for brief in made.values()]

@@ -260,7 +260,7 @@ class Children:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
 
-    def story(self, first: Exit | None, ending: News | None) -> str:
+    def failure_report(self, first: Exit | None, ending: News | None) -> str:
         """What happened: the process at fault, and the last lines of its log and of who complained."""
         suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""

@@ -27,7 +27,7 @@ from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.results.shard_score import left
+from evedrop.results.shard_score import load_score
 from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
@@ -54,7 +54,7 @@ def gather(
     for name, gathered in _tables(scenario, shards).items():
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
     wall = 0.0 if started is None else time.monotonic() - started
-    totals = Totals.merged([left(shard.folder, shard.scenario) for shard in shards])
+    totals = Totals.merged([load_score(shard.folder, shard.scenario) for shard in shards])
     replay = replay_of(folder, scenario)
     ending = Ending(
         wall, how, replay, events=_events(shards), outages=_outages(shards), misdelivered=_misdelivered(shards)

@@ -12,7 +12,7 @@ _EXAMPLE = "give one such as tls/router.lan:7447"
 
 
 @dataclass(frozen=True)
-class Meeting:
+class RouterEndpoint:
     """Where the router listens, and what the others connect to."""
 
     listen: Endpoint
@@ -31,15 +31,15 @@ class Meeting:
 
 
 @dataclass(frozen=True)
-class Places:
+class RouterEndpoints:
     """Where everybody meets."""
 
-    router: Meeting
-    relay: Meeting | None = None
+    router: RouterEndpoint
+    relay: RouterEndpoint | None = None
     """Of a run with two routers: where all but the sensor are."""
 
     @property
-    def far(self) -> Meeting:
+    def far(self) -> RouterEndpoint:
         """Where all but the sensor connect to."""
         return self.relay or self.router
 
@@ -63,14 +63,14 @@ def places_at(
     relay: str | None = None,
     relay_connect: str | None = None,
     insecure: bool = False,
-) -> Places:
+) -> RouterEndpoints:
     """The places that the options of `evedrop brief` name, on whichever hosts. Raises UsageError if they are none."""
     second = None
     if relay is not None:
         second = meeting_at(relay, relay_connect, insecure, ("--relay", "--relay-connect"))
     elif relay_connect is not None:
         raise UsageError("--relay-connect is of a second router; add --relay ENDPOINT with the place where it listens")
-    return Places(meeting_at(listen, connect, insecure), second)
+    return RouterEndpoints(meeting_at(listen, connect, insecure), second)
 
 
 def meeting_at(
@@ -78,7 +78,7 @@ def meeting_at(
     connect: str | None = None,
     insecure: bool = False,
     options: tuple[str, str] = ("--listen", "--connect"),
-) -> Meeting:
+) -> RouterEndpoint:
     """The meeting that two options name, on whichever host.
 
     insecure: whether the user said that it may be in clear although others can get at it. Raises UsageError if it is no
@@ -104,7 +104,7 @@ def meeting_at(
             f"{listening} {here} is in clear, and others than this machine can get at it: they would read everything, and "
             f"could pose as the router; give tls/{str(here).partition('/')[2]}, or add --insecure"
         )
-    return Meeting(here, there)
+    return RouterEndpoint(here, there)
 
 
 def _endpoint(option: str, text: str) -> Endpoint:
@@ -114,7 +114,7 @@ def _endpoint(option: str, text: str) -> Endpoint:
         raise UsageError(f"{option} {error}; {_EXAMPLE}") from error
 
 
-def loopback_places(listen: str | None, relay: str | None = None, relayed: bool = False) -> Places:
+def loopback_places(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
     """The places of a run whose processes are all here: what was asked for, or free ports.
 
     Two routers take certificates unless they are asked not to: without, a router is told from others by what is no secret.
@@ -125,12 +125,12 @@ def loopback_places(listen: str | None, relay: str | None = None, relayed: bool 
     second = _loopback_meeting(relay, "--relay", asked) if relayed or relay is not None else None
     while relay is None and second is not None and second.listen.port == router.listen.port:
         second = _loopback_meeting(None, "--relay", asked)
-    places = Places(router, second)
+    places = RouterEndpoints(router, second)
     places.check(relayed)
     return places
 
 
-def _loopback_meeting(listen: str | None, option: str, protocol: str) -> Meeting:
+def _loopback_meeting(listen: str | None, option: str, protocol: str) -> RouterEndpoint:
     if listen is None:
         return meeting_at(f"{protocol}/127.0.0.1:{free_port()}")
     try:

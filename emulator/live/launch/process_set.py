@@ -16,9 +16,9 @@ from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit, News
-from evedrop.live.launch.ports import Places
+from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.network.control_file import remove_control
 from evedrop.names import OBSERVER
@@ -50,7 +50,7 @@ def launch_one(
     scenario: Scenario,
     folder: Path,
     view: str,
-    places: Places,
+    places: RouterEndpoints,
     tell: Callable[[News], None],
     stop: threading.Event,
     shard: bool = False,
@@ -63,7 +63,7 @@ def launch_one(
         make_private(folder / "logs")
         viewer = None
         try:
-            briefs = briefs_of(scenario, places, Observation(folder.absolute(), view != "off", shard))
+            briefs = briefs_of(scenario, places, ObserverTask(folder.absolute(), view != "off", shard))
             observer = briefs.pop(OBSERVER)
             with Children(held, private, scenario.controller is not None) as children:
                 for brief in briefs.values():
@@ -146,12 +146,12 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
     early: tuple[Exit, float] | None = None
     while True:
         if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
-            raise RunError(children.story(early[0], children.conclude(tell)))
+            raise RunError(children.failure_report(early[0], children.conclude(tell)))
         if stop.is_set():
             children.conclude(tell)
             raise Interrupted("interrupted; what was measured is in the results folder")
         if children.silent_seconds > SILENCE_SECONDS:
-            raise RunError(children.story(None, {"suspects": [OBSERVER]}))
+            raise RunError(children.failure_report(None, {"suspects": [OBSERVER]}))
         news = children.news(_LOOK_SECONDS)
         ending: News | None = None
         if isinstance(news, Exit):
@@ -165,7 +165,7 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
                 # An observer that has just ended may still say so; one that goes on would wait for who will not come back.
                 ending = children.conclude(tell)
             if ending is None or not _ended_well(ending):
-                raise RunError(children.story(news, ending))
+                raise RunError(children.failure_report(news, ending))
         elif news is not None:
             tell(news)
             ending = news if news["event"] == "ended" else None
@@ -174,7 +174,7 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
     if ending["status"] == Interrupted.exit_status:
         raise Interrupted("interrupted; what was measured is in the results folder")
     if not _ended_well(ending):
-        raise RunError(children.story(None, ending))
+        raise RunError(children.failure_report(None, ending))
     children.wait_all()
     return int(ending["status"])
 

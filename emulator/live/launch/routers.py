@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.live.launch.ports import Meeting, Places
+from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints
 from evedrop.live.protocol.brief import Identity
 from evedrop.names import RELAY, ROUTER, SENSOR
 
@@ -16,7 +16,7 @@ from evedrop.names import RELAY, ROUTER, SENSOR
 class Routers:
     """Who is let in where."""
 
-    places: Places
+    places: RouterEndpoints
     at_router: Mapping[str, str]
     """User → password."""
     at_relay: Mapping[str, str]
@@ -24,7 +24,7 @@ class Routers:
     """The router's Zenoh id, by which the relay knows it."""
 
     @classmethod
-    def of(cls, users: Mapping[str, str], places: Places) -> Routers:
+    def of(cls, users: Mapping[str, str], places: RouterEndpoints) -> Routers:
         """All at the router; or, if there is a relay, the sensor and the relay there, and all others at the relay."""
         if places.relay is None:
             return cls(places, users, {}, None)
@@ -43,13 +43,13 @@ class Routers:
         """A process's."""
         return {**self.at_router, **self.at_relay}.get(process, "")
 
-    def relay_part(self, receivers: tuple[str, ...], relay: Meeting) -> dict[str, Any]:
+    def relay_part(self, receivers: tuple[str, ...], relay: RouterEndpoint) -> dict[str, Any]:
         """What the relay is told."""
         listen = str(relay.listen)
         return {"users": self.at_relay, "receivers": list(receivers), "listen": listen, "zid": self.zid}
 
 
-def identities_of(run: str, places: Places, users: tuple[str, ...]) -> dict[str, Identity]:
+def identities_of(run: str, places: RouterEndpoints, users: tuple[str, ...]) -> dict[str, Identity]:
     """Process name, or operator → its certificate; nobody has one of a router that listens in clear."""
     if not places.router.secure:
         return {}

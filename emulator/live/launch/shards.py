@@ -19,7 +19,7 @@ from typing import Any
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.children import News
-from evedrop.live.launch.ports import Places, loopback_places
+from evedrop.live.launch.ports import RouterEndpoints, loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
@@ -134,7 +134,7 @@ class _Course:
     viewer: Viewer | None = None
 
     def launched(
-        self, shard: Shard, at: Places, tell: Callable[[News], None], view: str, stop: threading.Event
+        self, shard: Shard, at: RouterEndpoints, tell: Callable[[News], None], view: str, stop: threading.Event
     ) -> None:
         """Launch one, its routers at places, to its end; whatever ends it early ends all."""
         try:
@@ -193,9 +193,9 @@ def launch_shards(
         held.close()
 
 
-def _places(scenario: Scenario) -> list[Places]:
-    """Places for all shards; of ports that are found one by one, two might be the same while nobody listens yet."""
-    found: list[Places] = []
+def _places(scenario: Scenario) -> list[RouterEndpoints]:
+    """RouterEndpoints for all shards; of ports that are found one by one, two might be the same while nobody listens yet."""
+    found: list[RouterEndpoints] = []
     taken = set[int]()
     while len(found) < scenario.shards:
         places = loopback_places(None, None, scenario.relayed)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 
 
@@ -26,7 +26,7 @@ class Grant:
     watches: tuple[str, ...] = ()
     """Liveliness tokens it may watch."""
     answers: tuple[str, ...] = ()
-    """Keys at which it may be asked."""
+    """RunKeys at which it may be asked."""
     asks: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     """Liveliness tokens that it may ask for: its own, and so learns no more than that it is there."""
@@ -61,7 +61,7 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
 
     relayed: whether there is a relay, which the observer watches and tells the end.
     """
-    keys = Keys(run)
+    keys = RunKeys(run)
     followers = (*receivers, OBSERVER)
     processes = (SENSOR, *receivers) if loop is None else (SENSOR, *receivers, CONTROLLER)
     state = (keys.state,) if loop is not None and loop.on_truth else ()

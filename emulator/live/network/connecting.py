@@ -32,7 +32,7 @@ _NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of Open
 
 
 @dataclass(frozen=True)
-class Door:
+class RouterAddress:
     """Where to, with what, and whose."""
 
     router: str
@@ -82,7 +82,7 @@ def _reason(error: OSError | zenoh.ZError) -> object:
     return (error.strerror or error) if isinstance(error, OSError) else "it did not answer as one"
 
 
-def connected(door: Door, patience: float, meanwhile: Callable[[], None] = lambda: None) -> zenoh.Session:
+def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None) -> zenoh.Session:
     """A session with the router; `meanwhile` is called again and again until there is one.
 
     Raises BriefError for what no waiting mends, RunError if no router has answered after so many seconds.
@@ -167,7 +167,7 @@ def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
     return endpoint
 
 
-def _knock(endpoint: Endpoint, door: Door) -> None:
+def _knock(endpoint: Endpoint, door: RouterAddress) -> None:
     """See whether something listens there and, by its certificate, is the router of this run.
 
     Raises OSError if nothing does, BriefError if the certificate is not to be believed.
@@ -182,7 +182,7 @@ def _knock(endpoint: Endpoint, door: Door) -> None:
         raise _mistrusted(endpoint, door, error) from error
 
 
-def _mistrusted(endpoint: Endpoint, door: Door, error: ssl.SSLCertVerificationError) -> BriefError:
+def _mistrusted(endpoint: Endpoint, door: RouterAddress, error: ssl.SSLCertVerificationError) -> BriefError:
     """Why the certificate that is shown at an endpoint cannot be believed."""
     if error.verify_code in {_NOT_YET_VALID, _EXPIRED}:
         return BriefError(

@@ -15,7 +15,7 @@ VARIABLE = "EVEDROP_HEARTBEAT"
 _BEAT_SECONDS = 2.0
 
 
-class Heartbeat:
+class HeartbeatFile:
     """Touches the file of the environment, if there is one, until `stop`. Final."""
 
     def __init__(self, connected: Callable[[], bool], seconds: float = _BEAT_SECONDS) -> None:

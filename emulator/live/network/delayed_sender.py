@@ -14,7 +14,7 @@ from collections.abc import Callable
 Put = Callable[[bytes], None]
 
 
-class Postman:
+class DelayedSender:
     """Puts messages at their times, on a thread of its own. Final; daemonic, since a run ends when all have arrived."""
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ import zenoh
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import Brief
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 
 _CONNECT_SECONDS = 3.0
 _ANSWER_SECONDS = 3.0
@@ -30,7 +30,7 @@ def is_there(brief: Brief) -> bool:
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
     try:
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
-            answers = session.liveliness().get(Keys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
+            answers = session.liveliness().get(RunKeys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
             return any(answer.ok is not None for answer in answers)
     except zenoh.ZError:
         return False

@@ -10,7 +10,7 @@ Source: docs/protocol.md, two routers.
 from __future__ import annotations
 
 from evedrop.live.network.access import Grant
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY, ROUTER, SENSOR
 
 _NEAR = frozenset({SENSOR, ROUTER})
@@ -21,7 +21,7 @@ def at_router(run: str, table: list[Grant]) -> list[Grant]:
     to_router, from_router = _crossing(table)
     near, far = _sites(table)
     relay = Grant(
-        RELAY, to_router, from_router, None, (Keys(run).alive(ROUTER), *_tokens(near)), further_tokens=_tokens(far)
+        RELAY, to_router, from_router, None, (RunKeys(run).alive(ROUTER), *_tokens(near)), further_tokens=_tokens(far)
     )
     return [*near, relay]
 
@@ -30,7 +30,7 @@ def at_relay(run: str, table: list[Grant], zid: str) -> list[Grant]:
     """Who is let in at the relay: those of its site, and the router, by its Zenoh id, for all others."""
     to_router, from_router = _crossing(table)
     near, far = _sites(table)
-    token = Keys(run).alive(ROUTER)
+    token = RunKeys(run).alive(ROUTER)
     router = Grant(ROUTER, from_router, to_router, token, _tokens(far), further_tokens=_tokens(near), zid=zid)
     return [*far, router]
 

@@ -16,7 +16,7 @@ from evedrop.live.network.control_file import Control
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import OBSERVER
 
 DOES = ("link", "pause", "resume", "step", "status")
@@ -90,7 +90,7 @@ def ask(control: Control, request: Request, patience: float) -> Answer | None:
     Raises zenoh.ZError if the router is not there or does not let us in.
     """
     zenoh.init_log_from_env_or("off")
-    key = Keys(control.run).control(OBSERVER)
+    key = RunKeys(control.run).control(OBSERVER)
     # A run that goes on has a router: one attempt will do.
     with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
         for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):

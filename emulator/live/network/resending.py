@@ -17,7 +17,7 @@ from evedrop.errors import Gap
 from evedrop.live.protocol.codec import Reader
 
 
-class Kept:
+class ReplayBuffer:
     """An outlet that keeps what went through it; for several threads. Final.
 
     span: what is older than so many slots is forgotten; None: only what `forget` says.
@@ -65,7 +65,7 @@ class Kept:
                     self._put(payload)
 
 
-class Due:
+class GapDetector:
     """What a reader makes of slots that are not due: older ones it has, for later ones it waits. Final."""
 
     def __init__(self, key: str, patience: float) -> None:

@@ -20,34 +20,34 @@ import numpy as np
 
 from evedrop.errors import NotRegistered
 from evedrop.live.network.access import Wiring, access_control, grants
-from evedrop.live.network.delayed_sender import Postman
+from evedrop.live.network.delayed_sender import DelayedSender
 from evedrop.live.network.linked_routers import at_router
-from evedrop.live.network.resending import Due
-from evedrop.live.network.router_commands import Anew, Commands
+from evedrop.live.network.resending import GapDetector
+from evedrop.live.network.router_commands import Commands, ReplayRequested
 from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import Session, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import Reader, shown
 from evedrop.live.protocol.packets import (
-    Beside,
+    PacketExtras,
     acknowledgement,
+    barrier,
     delivery,
-    hold,
-    is_hold,
-    is_once_more,
+    is_barrier,
+    is_resend,
     packed_header,
     read_acknowledgement,
     read_beside,
-    read_once_more,
+    read_resend,
     read_uplink,
 )
 from evedrop.live.protocol.telemetry import Journal
-from evedrop.model.acknowledgements import WayBack
+from evedrop.model.acknowledgements import AckChannel
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
-from evedrop.model.slot.link import Change, Course, Fates, Link, streams_of
+from evedrop.model.slot.link import Change, Fates, Link, LinkSchedule, streams_of
 from evedrop.model.slot.transit import Late, Transit
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE
 
@@ -55,7 +55,7 @@ from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE
 class Downlink:
     """One receiver's link, decided a batch of slots ahead, and its outlet. Final."""
 
-    def __init__(self, name: str, course: Course, brief: Brief, put: Callable[[bytes, float], None]) -> None:
+    def __init__(self, name: str, course: LinkSchedule, brief: Brief, put: Callable[[bytes, float], None]) -> None:
         self._course = course
         keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, self._course)}
         self._link = Link(self._course, name, keys, brief.batch)
@@ -108,7 +108,7 @@ class Downlink:
         self._masks[row] = packed_flags(self._in_time[row]).tobytes()
         self._received[row] = int(np.count_nonzero(self._in_time[row]))
 
-    def deliver(self, k: int, z: Floats, whole: bytes, beside: Beside, known: bool = False) -> None:
+    def deliver(self, k: int, z: Floats, whole: bytes, beside: PacketExtras, known: bool = False) -> None:
         """Send slot k's delivery: of the packets z (n, R), or as bytes the whole of them, those that arrive in it.
 
         known: the receiver has it, and only what arrives later is of interest.
@@ -147,7 +147,7 @@ class Downlink:
     def mark(self, k: int) -> None:
         """Pass a mark on, if the receiver is there."""
         if not any(away.start < k <= away.stop for away in self._course.outages):
-            self._put(hold(k), 0.0)
+            self._put(barrier(k), 0.0)
 
 
 class Burst:
@@ -176,18 +176,18 @@ class WayBackLink:
 
     def __init__(self, brief: Brief, session: Session, spec: Mapping[str, Any]) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
-        self._way = WayBack(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
+        self._way = AckChannel(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
         self._jammer: str | None = spec["jammer"]
         self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged
-        self._due = Due(self._key, brief.flow.longest_outage)
+        self._due = GapDetector(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
         """What the legitimate estimator acknowledges; None: the conductor has said something that may end the waiting."""
         session.funnel(self._key, self.sent.put)
         self._put = session.outlet(session.keys.acknowledgements)
 
     def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink], commands: Commands) -> None:
-        """Wait for the acknowledgements of slot k, and pass on what reaches the sensor; sent (R,): as in `Beside`.
+        """Wait for the acknowledgements of slot k, and pass on what reaches the sensor; sent (R,): as in `PacketExtras`.
 
         A receiver that is not there acknowledges nothing. Raises what `Commands.check` does.
         """
@@ -228,12 +228,12 @@ class Routing:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
         self._uplink = session.inbox(session.keys.uplink)
-        self._due = Due(session.keys.uplink, brief.flow.longest_outage)
+        self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
-        postman = Postman() if brief.part["pace"] else None
+        postman = DelayedSender() if brief.part["pace"] else None
         self._bursts: list[Burst] = []
 
-        def outlet(name: str, course: Course) -> Callable[[bytes, float], None]:
+        def outlet(name: str, course: LinkSchedule) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
             if postman is None and brief.part["controller"] is not None and not self._is_waited_for(name):
                 self._bursts.append(Burst(put))
@@ -241,14 +241,14 @@ class Routing:
             delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
             return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
 
-        self._courses = {name: Course.of(spec) for name, spec in brief.part["links"].items()}
+        self._courses = {name: LinkSchedule.of(spec) for name, spec in brief.part["links"].items()}
         self._outlets = {name: outlet(name, course) for name, course in self._courses.items()}
         acknowledgements = brief.part["acknowledgements"]
         self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
         # To its own uplink, so that whoever waits there wakes: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
         waiting = [] if self._way_back is None else [self._way_back.sent]
-        self._commands = Commands(session, lambda: knock(hold(brief.slots)), waiting, brief.flow.longest_outage)
+        self._commands = Commands(session, lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage)
         self._stale = False
         """Whether what comes is of no interest until it is said to come once more."""
         self._begin(0, 0)
@@ -268,7 +268,7 @@ class Routing:
         while not self._commands.over():
             try:
                 self._take(Reader(self._session.keys.uplink, self._uplink.recv()))
-            except Anew:
+            except ReplayRequested:
                 self._stale = True
 
     def _begin(self, start: int, done: int) -> None:
@@ -299,8 +299,8 @@ class Routing:
 
     def _take(self, message: Reader) -> None:
         """Take what the sensor sends: a packet, a mark, or the word that packets come once more."""
-        if is_once_more(message):
-            self._once_more(message)
+        if is_resend(message):
+            self._resend(message)
             return
         k = message.integer("k")
         if self._stale or k == self._brief.slots:
@@ -310,7 +310,7 @@ class Routing:
             return
         if k == self._done:
             self._journal(k)
-        if is_hold(message):
+        if is_barrier(message):
             if k >= self._done:
                 self._journal(k)
                 self._hold(k)
@@ -336,9 +336,9 @@ class Routing:
         for burst in self._bursts:
             burst.flush()
 
-    def _once_more(self, message: Reader) -> None:
+    def _resend(self, message: Reader) -> None:
         """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
-        number, done, start = read_once_more(message, self._brief.slots)
+        number, done, start = read_resend(message, self._brief.slots)
         anew = self._commands.anew(number)
         if anew is None:  # it has asked once more since
             self._stale = True

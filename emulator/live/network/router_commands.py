@@ -15,7 +15,7 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.names import ROUTER
 
 
-class Anew(Exception):
+class ReplayRequested(Exception):
     """The conductor asks for packets once more: whatever is waited for may have been lost."""
 
 
@@ -33,7 +33,7 @@ class Commands:
         self._patience = patience
         self._orders: SimpleQueue[tuple[int, Reader] | None] = SimpleQueue()
         self._news = threading.Condition()
-        self._asked = Round()
+        self._asked = ReplayRound()
         self._heeded = 0
         self._ended = False
         self._failure: EvedropError | None = None
@@ -54,7 +54,7 @@ class Commands:
         match command.text("do"):
             case "again":
                 with self._news:
-                    self._asked = Round(command.integer("n"), command)
+                    self._asked = ReplayRound(command.integer("n"), command)
                     self._news.notify()
                 self._wake()
             case "end":
@@ -74,12 +74,12 @@ class Commands:
         return self._ended
 
     def check(self) -> None:
-        """Raise Anew if the conductor has ended the run, or asked for packets once more since it was heeded last."""
+        """Raise ReplayRequested if the conductor has ended the run, or asked for packets once more since it was heeded last."""
         if self.over() or self._asked.number != self._heeded:
-            raise Anew
+            raise ReplayRequested
 
     def next(self) -> Reader:
-        """The next command of the round at hand, not one of before. Raises Anew as `check` does."""
+        """The next command of the round at hand, not one of before. Raises ReplayRequested as `check` does."""
         while True:
             with self._session.place.waiting(self._session.keys.control(ROUTER)):
                 order = self._orders.get()
@@ -102,7 +102,7 @@ class Commands:
             return self._asked.command
 
 
-class Round:
+class ReplayRound:
     """Packets are sent once more: how often they were, and the command. Final."""
 
     def __init__(self, number: int = 0, command: Reader | None = None) -> None:

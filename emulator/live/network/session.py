@@ -22,18 +22,18 @@ from typing import Any, Protocol, Self
 import zenoh
 
 from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
-from evedrop.live.network.connecting import Door, Waiting, connected, endpoint_of
+from evedrop.live.network.connecting import RouterAddress, Waiting, connected, endpoint_of
 from evedrop.live.network.connection import Connection
-from evedrop.live.network.container_heartbeat import Heartbeat
+from evedrop.live.network.container_heartbeat import HeartbeatFile
 from evedrop.live.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
 from evedrop.live.network.launcher_watch import when_launcher_is_gone
 from evedrop.live.network.lifeline import Lifeline
 from evedrop.live.network.mailbox import allowance
-from evedrop.live.network.resending import Kept
+from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import Brief, Identity
 from evedrop.live.protocol.codec import Reader, over, refusal
 from evedrop.live.protocol.envelope import Dropped
-from evedrop.live.protocol.keys import Keys, reader_of
+from evedrop.live.protocol.keys import RunKeys, reader_of
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.names import OBSERVER, ROUTER
@@ -104,12 +104,12 @@ def client_config(entry: Credentials) -> dict[str, Any]:
     }
 
 
-def door_of(entry: Credentials) -> Door:
+def door_of(entry: Credentials) -> RouterAddress:
     """The way in for a brief, or for the operator."""
-    return Door(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
+    return RouterAddress(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
 
 
-def _once(door: Door) -> zenoh.Config:
+def _once(door: RouterAddress) -> zenoh.Config:
     """The configuration of a session that is closed when its connection is lost: Zenoh is to connect it once at most."""
     config = dict(door.config)
     config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
@@ -168,7 +168,7 @@ class Session:
         zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
-        self.keys = Keys(brief.run)
+        self.keys = RunKeys(brief.run)
         self._process = brief.process
         self.patience = float(brief.patience)
         """Seconds that are waited for the others."""
@@ -188,13 +188,13 @@ class Session:
         else:
             self._connection = Connection(_listening(listen, brief.identity, config), None)
         self._outlets: dict[str, Outlet] = {}
-        self._kept: list[Kept] = []
+        self._kept: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
         # A router has nobody to connect to: it is its network.
-        self._heartbeat = Heartbeat((lambda: True) if brief.role in ("router", "relay") else self.linked)
+        self._heartbeat = HeartbeatFile((lambda: True) if brief.role in ("router", "relay") else self.linked)
         self.funnel(self._control, self._told)
 
     def __enter__(self) -> Self:
@@ -258,9 +258,9 @@ class Session:
         span: int | None = None,
         head: Callable[[int, int, int], bytes] | None = None,
         back: int = 0,
-    ) -> Kept:
-        """A publisher for one exact key, of what is sent once more after a connection was lost; as in `Kept`."""
-        kept = Kept(self.outlet(key), span, head, back)
+    ) -> ReplayBuffer:
+        """A publisher for one exact key, of what is sent once more after a connection was lost; as in `ReplayBuffer`."""
+        kept = ReplayBuffer(self.outlet(key), span, head, back)
         self._kept.append(kept)
         return kept
 

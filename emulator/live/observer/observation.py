@@ -14,7 +14,7 @@ from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
 from evedrop.live.network.operator import Answer, read_request
-from evedrop.live.network.resending import Due
+from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.observer.joiner import Joiner
@@ -35,25 +35,25 @@ from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.rows import DigestRows, write_rows
-from evedrop.results.shard_score import leave
+from evedrop.results.shard_score import dump_score
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of
 from evedrop.view.scored_slots import open_recording, showing_of, shown
-from evedrop.view.viewer import Stand, Viewer
+from evedrop.view.viewer import Viewer, WebAddress
 
 if TYPE_CHECKING:
     from evedrop.view.plant_slots import Showing
-    from evedrop.view.recording import Recording
+    from evedrop.view.recording import ViewRecording
 
 Report = Callable[[Path, int, str], None]
 """Prints how a run ended: its results folder, its exit status, and why it failed."""
 _PROGRESS_SECONDS = 0.25
 
 
-class Observation:
+class ObservedRun:
     """One run as the observer sees it. Final."""
 
     def __init__(
@@ -79,7 +79,7 @@ class Observation:
         self._events: list[dict[str, Any]] = []
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
-        self._recording: Recording | None = None
+        self._recording: ViewRecording | None = None
         self._showing: Showing | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = time.monotonic()
@@ -90,7 +90,7 @@ class Observation:
         self._stall: Stall
         self._outages: list[Mapping[str, Any]] = []
         self._misdelivered: dict[str, int] = {}
-        self._due: dict[str, Due] = {}
+        self._due: dict[str, GapDetector] = {}
         self._recent: tuple[float, int] = (self._started, 0)
 
     @property
@@ -102,7 +102,7 @@ class Observation:
         """Keep hold of the results folder from now on. Raises OSError if there is none."""
         self._held = HeldFolder(self._place)
 
-    def show(self, stand: Stand) -> Viewer:
+    def show(self, stand: WebAddress) -> Viewer:
         """A viewer for browsers, which the run will be streamed to."""
         viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
         tell("view", address=viewer.address)
@@ -123,7 +123,7 @@ class Observation:
                 self._recording = open_recording(self._scenario, self._brief.run, path)
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             patience = self._brief.flow.longest_outage
-            self._due = {source: Due(key, patience) for source, key in conductor.keys.items()}
+            self._due = {source: GapDetector(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             batch = self._brief.flow.batch
             limit = patience_of(patience, self._scenario.pace, batch)
@@ -324,7 +324,7 @@ class Observation:
         """The summary by now; a shard leaves its score for the run's."""
         folder = self.folder
         if self._brief.part["shard"]:
-            leave(self._keeper.totals, folder)
+            dump_score(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(folder, self._scenario), self._ended - self._started
         ending = Ending(

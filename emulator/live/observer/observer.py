@@ -21,14 +21,14 @@ from evedrop.live.network.launcher_watch import launcher_is_gone, when_launcher_
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Stop
 from evedrop.live.observer.news import set_news_apart, tell
-from evedrop.live.observer.observation import Observation, Report
+from evedrop.live.observer.observation import ObservedRun, Report
 from evedrop.live.protocol.brief import Brief
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.folder import new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.scenario import Scenario
-from evedrop.view.viewer import Stand
+from evedrop.view.viewer import WebAddress
 
 _ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone
 
@@ -39,7 +39,7 @@ def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
     report: prints how a run ended that was started by hand. serve: HOST:PORT where browsers may see it, if anywhere.
     Raises UsageError, BriefError, RunError or Interrupted, of one started by hand, as long as nothing has begun.
     """
-    stand = None if serve is None else Stand.of(serve)
+    stand = None if serve is None else WebAddress.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
@@ -50,7 +50,7 @@ def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
         brief = replace(brief, ends_with_stdin=False)
     ANSWERS.learn(brief.part["classes"])  # so that the classes themselves need not run here
     scenario = Scenario.model_validate(brief.part["scenario"])
-    observation = Observation(brief, scenario, confirmations, by_hand)
+    observation = ObservedRun(brief, scenario, confirmations, by_hand)
     if by_hand:
         # Before there is anything in it: what a brief that does not fit leaves behind would be in the next one's way.
         new_folder(observation.folder)

@@ -31,7 +31,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Step:
+class OperatorStep:
     """Slots that are let through: from `first`, before which the run was held, to before `until`."""
 
     order: Order

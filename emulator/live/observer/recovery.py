@@ -25,7 +25,7 @@ _LONGEST_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
-class Outage:
+class ConnectionOutage:
     """A process that was cut off."""
 
     process: str
@@ -55,7 +55,7 @@ class Recovery:
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
-        self.outages: list[Outage] = []
+        self.outages: list[ConnectionOutage] = []
         """All so far."""
 
     def look(self, done: int) -> None:
@@ -95,7 +95,7 @@ class Recovery:
     def _close(self, done: int, now: float) -> None:
         """The run goes on: whoever was cut off is so no longer."""
         for name, (slot, since) in self._back.items():
-            outage = Outage(name, slot, done, now - since)
+            outage = ConnectionOutage(name, slot, done, now - since)
             self.outages.append(outage)
             self._say("reconnected", **asdict(outage))
         self._back = {}
@@ -150,7 +150,7 @@ class Recovery:
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
-        self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
+        self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
 
     def account(self) -> list[Mapping[str, Any]]:

@@ -16,7 +16,7 @@ from typing import Any
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
-from evedrop.live.observer.operator_orders import Order, Step
+from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
@@ -51,7 +51,7 @@ class Steering:
         self._since = 0.0
         self._orders: deque[Order] = deque()
         self._asked = False
-        self._step: Step | None = None
+        self._step: OperatorStep | None = None
         self._last = -1
         self._changed: set[str] = set()
         self.paused = False
@@ -184,7 +184,7 @@ class Steering:
             case "step":
                 slots = order.request.slots or 1
                 self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
-                self._step, self.paused = Step(order, k, k + slots), False
+                self._step, self.paused = OperatorStep(order, k, k + slots), False
 
     def _change(self, k: int, order: Order) -> None:
         """Let the scenario have one more event, at slot k, and tell the router what its links do from then on."""
@@ -209,7 +209,7 @@ class Steering:
         if said is not None:
             self._note(k, said, "operator")
 
-    def _step_is_over(self, step: Step, k: int) -> None:
+    def _step_is_over(self, step: OperatorStep, k: int) -> None:
         self._step = None
         self._pause(k)
         step.order.done(k, f"{step.passed(k)}; held before slot {k}")

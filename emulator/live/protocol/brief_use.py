@@ -19,7 +19,7 @@ from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.plant import Plant
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.slot.link import Course, Link, streams_of
+from evedrop.model.slot.link import Link, LinkSchedule, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
 
 _WRITE_AGAIN = "write it again with `evedrop brief`"
@@ -111,7 +111,7 @@ def _expect_controller(brief: Brief) -> None:
 def _expect_links(brief: Brief) -> None:
     for name, spec in brief.part["links"].items():
         with _using(f"part.links.{name}"):
-            course = Course.of(spec)
+            course = LinkSchedule.of(spec)
         _expect_keys(brief, streams_of(name, course))
         with _using(f"part.links.{name}"):
             keys = brief.stream_keys

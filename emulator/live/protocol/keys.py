@@ -11,7 +11,7 @@ from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SE
 
 
 @dataclass(frozen=True)
-class Keys:
+class RunKeys:
     """The keys of one run."""
 
     run: str

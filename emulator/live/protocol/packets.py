@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Flags, Heard
+from evedrop.model.receiver import Flags, Reception
 from evedrop.model.slot.transit import Arrival, Late
 
 Headers = NDArray[np.int64]
 
 
-class Beside(NamedTuple):
+class PacketExtras(NamedTuple):
     """What a packet has beside its slot and payload; None where a scheme, or a slot, has no such thing."""
 
     header: Headers | None = None
@@ -38,7 +38,7 @@ class Beside(NamedTuple):
 def uplink(
     k: int, z: Floats, header: Headers | None = None, sent: Flags | None = None, truth: Floats | None = None
 ) -> bytes:
-    """A packet: slot k, z (n, R), and what is beside it, as in `Beside`."""
+    """A packet: slot k, z (n, R), and what is beside it, as in `PacketExtras`."""
     fields = {"k": k, "z": (z if sent is None else np.where(sent, z, 0.0)).tobytes()}
     if header is not None:
         fields["header"] = header.astype("<i8").tobytes()
@@ -55,10 +55,10 @@ def read_uplink(message: Reader, k: int, shape: tuple[int, int]) -> Floats:
     return message.finite("z", shape)
 
 
-def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> Beside:
+def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> PacketExtras:
     """What a packet has beside z; header: rows that the scheme's packets have."""
     n, trials = shape
-    return Beside(
+    return PacketExtras(
         message.array("header", "<i8", (header, trials)) if header else None,
         message.flags("sent", (trials,)) if message.has("sent") else None,
         message.finite("truth", (n, trials)) if message.has("truth") else None,
@@ -76,17 +76,17 @@ def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
     return message.flags("gamma", (trials,))
 
 
-def hold(k: int) -> bytes:
+def barrier(k: int) -> bytes:
     """A mark between slots k − 1 and k, on uplink and downlinks: everybody reports all slots below k."""
     return pack({"k": k, "hold": True})
 
 
-def is_hold(message: Reader) -> bool:
+def is_barrier(message: Reader) -> bool:
     """Whether a message of uplink or downlink is such a mark."""
     return message.has("hold")
 
 
-def once_more(number: int, done: int, first: int) -> bytes:
+def resend(number: int, done: int, first: int) -> bytes:
     """What goes before packets that are sent once more, in the conductor's round of that number: from slot `first` on.
 
     done: every slot below this one is done.
@@ -94,12 +94,12 @@ def once_more(number: int, done: int, first: int) -> bytes:
     return pack({"k": first, "again": done, "n": number})
 
 
-def is_once_more(message: Reader) -> bool:
+def is_resend(message: Reader) -> bool:
     """Whether a message of the uplink says that packets are sent once more."""
     return message.has("again")
 
 
-def read_once_more(message: Reader, slots: int) -> tuple[int, int, int]:
+def read_resend(message: Reader, slots: int) -> tuple[int, int, int]:
     """Number of the round, first slot that is not done, and first slot that follows, of a run of so many."""
     done = message.integer("again", 0, slots)
     return message.integer("n", 1), done, message.integer("k", 0, done)
@@ -124,7 +124,7 @@ def delivery(
     return pack(fields)
 
 
-def _packets(k: int, heard: Heard) -> dict[str, Any]:
+def _packets(k: int, heard: Reception) -> dict[str, Any]:
     z = np.compress(heard.gamma, heard.z, axis=1)
     fields = {"k": k, "gamma": packed_flags(heard.gamma).tobytes(), "z": z.tobytes()}
     if heard.header is not None:
@@ -162,7 +162,7 @@ def read_delivery(
     return Arrival(heard, tuple(late))
 
 
-def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Heard:
+def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Reception:
     n, trials = shape
     gamma = message.flags("gamma", (trials,))
     received = int(np.count_nonzero(gamma))
@@ -172,7 +172,7 @@ def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Heard:
         if received:
             header[:, gamma] = message.array("header", "<i8", (rows, received))
     if received == trials:
-        return Heard(gamma, message.finite("z", shape), header)
+        return Reception(gamma, message.finite("z", shape), header)
     z = np.zeros(shape)
     if received:
         # Row by row, which numpy does three times as fast as the rows at once.
@@ -180,4 +180,4 @@ def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Heard:
             row[gamma] = values
     elif message.has("z"):
         raise message.malformed("z although nothing was received", "no z")
-    return Heard(gamma, z, header)
+    return Reception(gamma, z, header)

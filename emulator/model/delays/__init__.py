@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from evedrop.model.delays.constant import Constant
+from evedrop.model.delays.constant import ConstantDelay
 from evedrop.model.delays.delay import DelayModel
 from evedrop.model.delays.normal import Normal
 from evedrop.model.delays.pareto import Pareto
-from evedrop.model.delays.trace import Trace
+from evedrop.model.delays.trace import RecordedDelay
 from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[DelayModel]] = {
-    "constant": Constant,
+    "constant": ConstantDelay,
     "normal": Normal,
     "pareto": Pareto,
-    "trace": Trace,
+    "trace": RecordedDelay,
 }
 DELAY_MODELS: Registry[DelayModel] = Registry("delay model", DelayModel, "evedrop.delays", _BUILT_IN, ("model", "unit"))  # type: ignore[type-abstract]
 

@@ -13,7 +13,7 @@ from evedrop.model.delays.delay import DelayModel
 from evedrop.model.process import Floats
 
 
-class Constant(DelayModel):
+class ConstantDelay(DelayModel):
     """A delay of `value`.
 
     Source: docs/mathematics.md, late packets.

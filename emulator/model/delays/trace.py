@@ -16,7 +16,7 @@ MOST_DELAYS = 900_000
 """Of all links of a scenario together: its results hold them in their copy of the scenario."""
 
 
-class Trace(DelayModel):
+class RecordedDelay(DelayModel):
     """The packet of slot k takes `values[k]`, repeated without end; the same in every trial.
 
     A scenario names a `file`, whose numbers are put in the place of `values` when it is loaded.

@@ -19,7 +19,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, squared_length
 from evedrop.model.numeric.mixture import NEGLIGIBLE, Mixture, merge, pruned, summed, with_a_place
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Flags, Heard
+from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.theory.leak import Leak, Leaks
 from evedrop.streams import Batch
 
@@ -59,7 +59,7 @@ class Bayesian(PacketReader):
         nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
         return belief._replace(memory=Mixture(np.ones((1, trials)), x[:, None, :], *nothing))
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Predict every component, weigh it by the packet, add that of the packet itself: the mean and covariance of all."""
         gamma, z = heard.gamma, np.where(heard.gamma, heard.z, 0.0)
         mixture = Mixture(*belief.memory)

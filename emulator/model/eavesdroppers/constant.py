@@ -11,7 +11,7 @@ from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
 from evedrop.model.receiver import Flags
 
 
-class Constant(PacketTaker):
+class ConstantEstimate(PacketTaker):
     """b_k = 0 always: x̂ = 0 and P = Σ_k. Whoever does worse would do better not to listen.
 
     Source: docs/mathematics.md, eavesdroppers.

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.eavesdroppers.readers import READERS
-from evedrop.model.receiver import Belief, Codes, Flags, Heard
+from evedrop.model.receiver import Belief, Codes, Flags, Reception
 from evedrop.model.theory.covariances import OutcomesAt
 from evedrop.streams import Batch
 
@@ -45,6 +45,6 @@ class Delegate(Eavesdropper):
         """The reader's action."""
         return self.reader.act(k, gamma)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As the reader."""
         return self.reader.step(k, belief, heard)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from evedrop.model.receiver import Belief, Codes, Flags, Heard, cleared, select
+from evedrop.model.receiver import Belief, Codes, Flags, Reception, cleared, select
 from evedrop.model.schedule import Schedule
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.model.theory.leak import Leaks
@@ -42,7 +42,7 @@ class Genie(PacketReader):
         """Lost, used as the state, or read as an innovation."""
         return gamma.view(np.uint8) + (gamma & self._schedule.at(k)).view(np.uint8)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + QΣ⁻¹z, A P Aᵀ + Q − QΣ⁻¹Q) for an innovation."""
         gamma, nu = heard.gamma, self._schedule.at(k)
         state, innovation = gamma & ~nu, gamma & nu

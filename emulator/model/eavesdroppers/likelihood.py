@@ -14,7 +14,7 @@ from evedrop.kernels.elementary import cholesky, log
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, squared_length
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Flags, Heard
+from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.theory.leak import Leak, Leaks
 from evedrop.streams import Batch
 
@@ -43,7 +43,7 @@ class Likelihood(PacketReader):
         nothing = np.zeros((n * (n - 1) // 2, trials)), np.zeros((n, trials))
         return super().knowing(k, x, belief)._replace(memory=nothing)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for a state, (A x̂ + QΣ⁻¹z, A P Aᵀ + Q − QΣ⁻¹Q) for an innovation."""
         gamma, z = heard.gamma, np.where(heard.gamma, heard.z, 0.0)
         x_hat, P, state = belief.x_hat, Factors(*belief.memory), gamma

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.bayesian import Bayesian
-from evedrop.model.eavesdroppers.constant import Constant
+from evedrop.model.eavesdroppers.constant import ConstantEstimate
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.likelihood import Likelihood
@@ -27,7 +27,7 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "naive": Naive,
     "suspicious": Suspicious,
     "smart": Smart,
-    "constant": Constant,
+    "constant": ConstantEstimate,
     "likelihood": Likelihood,
     "bayesian": Bayesian,
     "genie": Genie,

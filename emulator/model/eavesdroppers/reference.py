@@ -6,7 +6,7 @@ import numpy as np
 
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Belief, Heard
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.reference import ReferenceReceiver
 from evedrop.streams import Batch
 
@@ -34,6 +34,6 @@ class Reference(PacketReader):
         slot = np.full(self.trials, k, np.int64)
         return known._replace(memory=(known.x_hat, known.P, kept, kept_spread, slot, named))
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """By the reference that the header names."""
         return self._reader.step(k, belief, heard)

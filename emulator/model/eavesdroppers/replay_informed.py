@@ -8,13 +8,13 @@ from typing import Any
 
 from evedrop.model.eavesdroppers.delegate import Delegate
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.receiver import Belief, Heard
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.theory.covariances import OutcomesAt
 from evedrop.streams import Batch
 
 
 class ReplayInformed(Delegate):
-    """Learns x_j in the slot j = `learns_at` from `Heard.truth`; reads as the strategy `reads_as` does before and after.
+    """Learns x_j in the slot j = `learns_at` from `Reception.truth`; reads as the strategy `reads_as` does before and after.
 
     Source: docs/mathematics.md, further eavesdroppers.
     """
@@ -40,7 +40,7 @@ class ReplayInformed(Delegate):
         """The slot j."""
         return int(parameters["learns_at"])
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As the reader; after slot j the state x_j and nothing else. Raises ValueError if it was not handed over there."""
         belief = self.reader.step(k, belief, heard._replace(truth=None))
         if k != self._learns_at:

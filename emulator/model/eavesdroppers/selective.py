@@ -6,7 +6,7 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.eavesdroppers.eavesdropper import PacketReader
-from evedrop.model.receiver import Action, Belief, Heard
+from evedrop.model.receiver import Action, Belief, Reception
 
 
 class Selective(PacketReader):
@@ -17,7 +17,7 @@ class Selective(PacketReader):
     Source: docs/mathematics.md, schedules by holding time.
     """
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is in clear."""
         # The codes 0 and 1 of `Action` are γ itself: the state where anything arrives.
         action = heard.gamma.astype(np.uint8)

@@ -19,7 +19,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
 from evedrop.model.numeric.mixture import Mixture, merge, pruned, summed, with_a_place
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Flags, Heard
+from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.twins import Twins
 from evedrop.streams import Batch
 
@@ -27,7 +27,7 @@ CAPACITY = 8
 """Histories that a trial may have of either kind; beyond it the two least probable ones become one."""
 
 
-class Tracks(NamedTuple):
+class FollowedTracks(NamedTuple):
     """What it knows of R trials' tracks. Of 2R columns the first R have the last track as x, the others its twin."""
 
     weight: Floats
@@ -60,7 +60,7 @@ class Tracker(PacketReader):
     """Minimum mean square error, but for what is lost where too many histories must be told apart; it is given nothing.
 
     Meant for the scheme `twin-track` alone. Told a true state, it knows which track is real, and keeps to it as far as
-    the two are further apart than the noise between two packets. `Belief.memory` is its `Tracks`, 2R columns as (2, R).
+    the two are further apart than the noise between two packets. `Belief.memory` is its `FollowedTracks`, 2R columns as (2, R).
     """
 
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
@@ -78,9 +78,9 @@ class Tracker(PacketReader):
         for _ in range(first - 1):
             (sigma,) = grown(self.process.A, sigma, self._noise)
         none = Mixture(*(np.zeros((*rows, 0, 2 * self.trials)) for rows in ((), (n,), (n * (n - 1) // 2,), (n,))))
-        return belief._replace(memory=_stored(Tracks(*none, belief.x_hat, *sigma)))
+        return belief._replace(memory=_stored(FollowedTracks(*none, belief.x_hat, *sigma)))
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Carry both tracks on, and weigh on which of them the packet is: the mean and covariance of all histories."""
         tracks = _read(belief.memory)
         if k:
@@ -104,17 +104,17 @@ class Tracker(PacketReader):
         histories = self._afresh(tracks.histories, (distance != 0.0).any(axis=0), distance, _nothing(self.process.n))
         histories.weight[:, R:] = 0.0
         after = self._few(histories, np.ones(R, np.bool_))
-        return super().knowing(k, x, belief)._replace(memory=_stored(Tracks(*after, x, *tracks.noise)))
+        return super().knowing(k, x, belief)._replace(memory=_stored(FollowedTracks(*after, x, *tracks.noise)))
 
-    def _carried(self, of: Tracks) -> Tracks:
+    def _carried(self, of: FollowedTracks) -> FollowedTracks:
         """A slot later."""
         A = self.process.A
         mean = self.process.predict(of.mean.reshape(len(A), -1)).reshape(of.mean.shape)
         (spread,) = grown(A, of.histories.spread, _nothing(len(A)))
         (noise,) = grown(A, of.noise, self._noise)
-        return Tracks(of.weight, mean, *spread, self.process.predict(of.last), *noise)
+        return FollowedTracks(of.weight, mean, *spread, self.process.predict(of.last), *noise)
 
-    def _heard(self, k: int, of: Tracks, gamma: Flags, z: Floats) -> Tracks:
+    def _heard(self, k: int, of: FollowedTracks, gamma: Flags, z: Floats) -> FollowedTracks:
         """With z (n, R) on one of the tracks where gamma (R,): that becomes the last one."""
         z = np.where(gamma, z, of.last)
         heard_of: Flags = np.any(of.weight > 0.0, axis=0)
@@ -125,7 +125,7 @@ class Tracker(PacketReader):
         if begun.any():
             apart = self._twins.at(k)
             histories = self._afresh(histories, begun, apart.mean(np.where(begun, z, 0.0)), apart.factor)
-        return Tracks(*self._few(histories, gamma), z, *(np.where(gamma, 0.0, part) for part in of.noise))
+        return FollowedTracks(*self._few(histories, gamma), z, *(np.where(gamma, 0.0, part) for part in of.noise))
 
     def _afresh(self, of: Mixture, where: Flags, mean: Floats, spread: Factor) -> Mixture:
         """One history of either kind in some trials (R,): o has this mean (n, R) and covariance."""
@@ -189,7 +189,7 @@ def _split(of: Mixture, gamma: Flags, distance: Floats, noise: Factors) -> Mixtu
     return Mixture(*(np.concatenate([a, np.roll(b, R, axis=-1)], axis=-2) for a, b in zip(same, other, strict=True)))
 
 
-def _moments(of: Tracks, total: Floats) -> tuple[Floats, Floats]:
+def _moments(of: FollowedTracks, total: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance of x in every trial, (n, R) and (n, n, R); total: of the weights, (2R,)."""
     n, R = of.last.shape
     weight, mean, lower, diagonal = (part[..., R:] for part in of.histories)
@@ -217,11 +217,11 @@ def _upon(order: NDArray[np.intp], part: Floats) -> NDArray[np.intp]:
     return np.broadcast_to(order, part.shape)
 
 
-def _stored(tracks: Tracks) -> tuple[Floats, ...]:
+def _stored(tracks: FollowedTracks) -> tuple[Floats, ...]:
     """With the trials as last axis."""
     return (*(part.reshape(*part.shape[:-1], 2, part.shape[-1] // 2) for part in tracks.histories), *tracks[4:])
 
 
-def _read(memory: tuple[NDArray[Any], ...]) -> Tracks:
+def _read(memory: tuple[NDArray[Any], ...]) -> FollowedTracks:
     """The same as columns."""
-    return Tracks(*(part.reshape(*part.shape[:-2], 2 * part.shape[-1]) for part in memory[:4]), *memory[4:])
+    return FollowedTracks(*(part.reshape(*part.shape[:-2], 2 * part.shape[-1]) for part in memory[:4]), *memory[4:])

@@ -12,7 +12,7 @@ from evedrop.model.links.link import LossModel
 from evedrop.model.links.markov import Markov
 from evedrop.model.links.pattern import Pattern
 from evedrop.model.links.pooled import Pooled
-from evedrop.model.links.trace import Trace
+from evedrop.model.links.trace import RecordedLoss
 from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[LossModel]] = {
@@ -21,7 +21,7 @@ _BUILT_IN: Mapping[str, type[LossModel]] = {
     "gilbert-elliott": GilbertElliott,
     "markov": Markov,
     "pattern": Pattern,
-    "trace": Trace,
+    "trace": RecordedLoss,
 }
 LOSS_MODELS: Registry[LossModel] = Registry("loss model", LossModel, "evedrop.links", _BUILT_IN, ("model",))  # type: ignore[type-abstract]
 

@@ -17,7 +17,7 @@ from evedrop.model.receiver import Codes
 MOST_OUTCOMES = 10_000_000
 
 
-class Trace(LossModel):
+class RecordedLoss(LossModel):
     """Delivered in slot k where `outcomes` has a 1 at place k, counted from a beginning and, unless `once`, round and round.
 
     The beginning is place 0, alike in all trials; with `random_start` it is ⌊u · length⌋, of u the trial's uniform number of

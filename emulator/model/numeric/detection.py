@@ -60,7 +60,7 @@ class Chart:
         return _steps_to_leave(chain)
 
 
-class Watch:
+class CusumBatch:
     """A chart over a batch of trials, slot by slot. Final."""
 
     def __init__(self, chart: Chart, trials: int) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from evedrop.model import update
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch
@@ -37,7 +37,7 @@ class CipherEstimator(Receiver):
         """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
         return gamma.astype(np.uint8)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, else (the state, 0)."""
         action = self.act(k, heard.gamma)
         state = self._mask.reveal(k, np.where(heard.gamma, heard.z, 0.0))

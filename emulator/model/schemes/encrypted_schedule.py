@@ -12,7 +12,7 @@ from evedrop.model import update
 from evedrop.model.holding_time import HoldingTime
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schemes.checks import count_mistakes
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
@@ -49,7 +49,7 @@ class EncryptedScheduleEstimator(Receiver):
         """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
         return gamma.astype(np.uint8)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, else (the state, 0)."""
         action = self.act(k, heard.gamma)
         encrypted = heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)

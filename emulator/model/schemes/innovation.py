@@ -10,7 +10,7 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.process import Floats, Process, StateFactors, product
-from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schedule import Schedule
 from evedrop.model.schemes.checks import probability_mistakes
 from evedrop.model.schemes.scheme import Encoder, Packet, Scheme, Shared
@@ -89,7 +89,7 @@ class InnovationEstimator(Receiver):
         # The codes 0, 1, 2 of `Action` are these sums: LOST, STATE where γ, INNOVATION where γ and ν.
         return gamma.view(np.uint8) + (gamma & self._secret.nu(k)).view(np.uint8)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
         action, z = self.act(k, heard.gamma), heard.z
         return Belief(

@@ -9,13 +9,13 @@ import numpy as np
 from evedrop.kernels.elementary import cholesky
 from evedrop.model import update
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.receiver import Belief, Codes, Flags, Heard, Receiver, select
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch, BlockReader
 
 
-class Tracks:
+class TwinTracks:
     """x_0 and y_0 ~ N(0, Σ0) from the stream `start`, their distance d_k = A^k (y_0 − x_0), and the coins from `track`.
 
     Final. Slots in order are quick; any other order is correct.
@@ -54,7 +54,7 @@ class Tracks:
 class TwinTrackEncoder(Encoder):
     """z_k = x_k, or x_k + d_k, slot 0 included."""
 
-    def __init__(self, tracks: Tracks) -> None:
+    def __init__(self, tracks: TwinTracks) -> None:
         self._tracks = tracks
 
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
@@ -66,7 +66,7 @@ class TwinTrackEncoder(Encoder):
 class TwinTrackEstimator(Receiver):
     """Knows x_0 before anything is sent, and the track of every packet."""
 
-    def __init__(self, process: Process, trials: int, tracks: Tracks) -> None:
+    def __init__(self, process: Process, trials: int, tracks: TwinTracks) -> None:
         super().__init__(process, trials)
         self._tracks = tracks
 
@@ -82,7 +82,7 @@ class TwinTrackEstimator(Receiver):
         """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
         return gamma.astype(np.uint8)
 
-    def step(self, k: int, belief: Belief, heard: Heard) -> Belief:
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, else (z, 0) or (z − d_k, 0)."""
         action = self.act(k, heard.gamma)
         z = select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
@@ -109,7 +109,7 @@ class TwinTrack(Scheme):
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The two starts and the coins."""
-        tracks = Tracks(self.process, keys, batch)
+        tracks = TwinTracks(self.process, keys, batch)
         return NoInnovations(
             self.process,
             batch.trials,
@@ -119,7 +119,7 @@ class TwinTrack(Scheme):
 
     def initial_state(self, keys: Mapping[str, bytes], batch: Batch) -> Floats:
         """x_0, (n, R), by the stream `start`."""
-        return Tracks(self.process, keys, batch).initial
+        return TwinTracks(self.process, keys, batch).initial
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet, and x_0 without any."""

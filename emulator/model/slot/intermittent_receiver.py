@@ -15,7 +15,7 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.process import Process
-from evedrop.model.receiver import Action, Belief, Flags, Heard, Receiver
+from evedrop.model.receiver import Action, Belief, Flags, Receiver, Reception
 from evedrop.model.slot.transit import Arrival, Late
 
 
@@ -24,7 +24,7 @@ class _Slot:
     """One of the window's slots, with all that has arrived of it."""
 
     k: int
-    heard: Heard
+    heard: Reception
     before: Belief
     news: Flags
     """Trials whose packet has just arrived."""
@@ -62,7 +62,7 @@ class Follower:
     def miss(self, slots: range) -> None:
         """Go through slots in which nothing was received, because the receiver was not there; the window is forgotten."""
         trials = self.belief.x_hat.shape[1]
-        nothing = Heard(np.zeros(trials, np.bool_), np.zeros_like(self.belief.x_hat))
+        nothing = Reception(np.zeros(trials, np.bool_), np.zeros_like(self.belief.x_hat))
         for k in slots:
             self.belief = self._receiver.step(k, self.belief, nothing)
         self._history.clear()
@@ -80,7 +80,7 @@ class Follower:
         header = slot.heard.header
         if late.heard.header is not None:
             header = late.heard.header if header is None else np.where(new, late.heard.header, header)
-        slot.heard = Heard(slot.heard.gamma | new, z, header, slot.heard.truth)
+        slot.heard = Reception(slot.heard.gamma | new, z, header, slot.heard.truth)
         slot.news = slot.news | new
         return True
 

@@ -73,7 +73,7 @@ class Fates(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Outage:
+class ReceiverOutage:
     """Slots start ≤ k < stop in which a receiver is not there."""
 
     start: int
@@ -87,13 +87,13 @@ class Change:
 
     at: int
     settings: Mapping[str, Any] | None = None
-    """As in `Course.settings`; None leaves them."""
+    """As in `LinkSchedule.settings`; None leaves them."""
     cut: bool | None = None
     """None leaves it."""
 
 
 @dataclass(frozen=True)
-class Course:
+class LinkSchedule:
     """All that is known of a link in advance: its settings at slot 0, and when they change."""
 
     settings: Mapping[str, Any]
@@ -102,18 +102,18 @@ class Course:
     window: int = 0
     """Slots by which a packet may be late for its receiver."""
     changes: tuple[Change, ...] = ()
-    outages: tuple[Outage, ...] = ()
+    outages: tuple[ReceiverOutage, ...] = ()
     correlation: tuple[str, float] | None = None
     """Whose losses these are tied to, and how strongly."""
 
     @classmethod
-    def of(cls, spec: Mapping[str, Any]) -> Course:
+    def of(cls, spec: Mapping[str, Any]) -> LinkSchedule:
         """From plain values, as `plain` gives them."""
         return cls(
             spec["settings"],
             spec["window"],
             tuple(Change(**change) for change in spec["changes"]),
-            tuple(Outage(start, stop, Fate(reason)) for start, stop, reason in spec["outages"]),
+            tuple(ReceiverOutage(start, stop, Fate(reason)) for start, stop, reason in spec["outages"]),
             tuple(spec["correlation"]) if spec["correlation"] is not None else None,
         )
 
@@ -128,7 +128,7 @@ class Course:
         }
 
 
-def streams_of(receiver: str, course: Course) -> tuple[str, ...]:
+def streams_of(receiver: str, course: LinkSchedule) -> tuple[str, ...]:
     """The random streams of a receiver's link: losses, delays, everything else that may befall, and correlation."""
     names = (f"link/{receiver}", f"delay/{receiver}", f"fate/{receiver}")
     return names if course.correlation is None else (*names, f"mix/{receiver}", f"link/{course.correlation[0]}")
@@ -156,7 +156,7 @@ class Link:
     keys: of `streams_of`.
     """
 
-    course: Course
+    course: LinkSchedule
     receiver: str
     keys: Mapping[str, bytes]
     batch: Batch
@@ -308,4 +308,4 @@ def _joined(parts: list[Fates]) -> Fates:
 
 def link_of(loss: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
     """A link that does nothing but lose: its loss model, `{"model": …}`, and the key of its losses."""
-    return Link(Course({"loss": loss}), "it", {"link/it": key}, batch)
+    return Link(LinkSchedule({"loss": loss}), "it", {"link/it": key}, batch)

@@ -15,7 +15,7 @@ from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain
 from evedrop.model.process import Floats
-from evedrop.model.slot.link import Course
+from evedrop.model.slot.link import LinkSchedule
 
 _FAR = 10**8  # a slot by which everything that moves has come to rest
 
@@ -74,7 +74,7 @@ class LinkLaw:
         return self.last if one and self.segments[0].quality_at is None and self.segments[0].chain.independent else None
 
 
-def law_of(course: Course) -> LinkLaw | None:
+def law_of(course: LinkSchedule) -> LinkLaw | None:
     """The law of a link, from all that is known of it in advance; None if theory does not know it.
 
     It does not know losses with a memory that is no chain, or that never settle, queues, delays that are no independent
@@ -95,7 +95,7 @@ def law_of(course: Course) -> LinkLaw | None:
     return LinkLaw(tuple(segments), outages)
 
 
-def stretches(course: Course) -> list[tuple[int, Mapping[str, Any], bool]]:
+def stretches(course: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool]]:
     """First slots of stretches in which a link's settings are the same, with them and whether it is cut."""
     settings, cut = course.settings, False
     marks = [(0, settings, False)]

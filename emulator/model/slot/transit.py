@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.links.link import Fate
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Flags, Heard
+from evedrop.model.receiver import Flags, Reception
 from evedrop.model.slot.link import Fates
 
 
@@ -18,7 +18,7 @@ class Late(NamedTuple):
 
     k: int
     """The slot they were sent in."""
-    heard: Heard
+    heard: Reception
     """The packets; γ marks the trials in which one arrives."""
     copy: bool = False
     """Whether these are second copies of packets that have arrived."""
@@ -27,7 +27,7 @@ class Late(NamedTuple):
 class Arrival(NamedTuple):
     """All that arrives at a receiver in a slot."""
 
-    heard: Heard
+    heard: Reception
     """The slot's own packets."""
     late: tuple[Late, ...] = ()
 
@@ -52,15 +52,15 @@ class Transit:
             waits = delays[row]
             for wait in np.unique(waits[delivered]):
                 if wait:
-                    self._keep(k, int(wait), Heard(delivered & (waits == wait), z, header), copy=False)
+                    self._keep(k, int(wait), Reception(delivered & (waits == wait), z, header), copy=False)
             delivered = delivered & (waits == 0)
         if again is not None and again[row].any():
             waits = np.zeros(len(codes), np.uint32) if delays is None else delays[row]
             for wait in np.unique(waits[again[row]]):
-                self._keep(k, int(wait), Heard(again[row] & (waits == wait), z, header), copy=True)
+                self._keep(k, int(wait), Reception(again[row] & (waits == wait), z, header), copy=True)
             due += self._due.pop(k, [])
-        return Arrival(Heard(delivered, z, header), tuple(due))
+        return Arrival(Reception(delivered, z, header), tuple(due))
 
-    def _keep(self, k: int, wait: int, heard: Heard, copy: bool) -> None:
+    def _keep(self, k: int, wait: int, heard: Reception, copy: bool) -> None:
         header = None if heard.header is None else heard.header.copy()
-        self._due.setdefault(k + wait, []).append(Late(k, Heard(heard.gamma, heard.z.copy(), header), copy))
+        self._due.setdefault(k + wait, []).append(Late(k, Reception(heard.gamma, heard.z.copy(), header), copy))

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import loopback_places
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import Brief, Flow
 from evedrop.live.protocol.envelope import enclosed, payload_of
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 
@@ -100,7 +100,7 @@ class Bench:
     """A router process, and sessions with everybody else's credentials in the test's hands."""
 
     def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
-        observation = Observation(folder / "results", False)
+        observation = ObserverTask(folder / "results", False)
         listen = f"{protocol}/127.0.0.1:{free_port()}"
         places = loopback_places(listen, None, scenario.relayed)
         made = briefs_of(scenario, places, observation, ends_with_stdin=False)
@@ -108,7 +108,7 @@ class Bench:
             name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
         self.scenario = scenario
-        self.keys = Keys(self.briefs["router"].run)
+        self.keys = RunKeys(self.briefs["router"].run)
         self.log = folder / "router.log"
         self.private = folder / "private"
         self.private.mkdir()

@@ -15,7 +15,7 @@ from evedrop.live.protocol import packets, telemetry, whereabouts
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
-from evedrop.model.receiver import Belief, Heard
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
 
@@ -43,8 +43,8 @@ def _changed(command: Reader) -> Any:
 
 READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "packet": _on("uplink", lambda m: (packets.read_uplink(m, K, SHAPE), packets.read_beside(m, SHAPE, 1))),
-    "once more": _on("uplink", lambda m: packets.is_once_more(m) and packets.read_once_more(m, SLOTS)),
-    "mark": _on("uplink", lambda m: packets.is_hold(m) and m.slot(K)),
+    "once more": _on("uplink", lambda m: packets.is_resend(m) and packets.read_resend(m, SLOTS)),
+    "mark": _on("uplink", lambda m: packets.is_barrier(m) and m.slot(K)),
     "delivery": _on("downlink/eve", lambda m: packets.read_delivery(m, K, SHAPE, 1, WINDOW)),
     "acknowledgement": _on("ack/sent", lambda m: packets.read_acknowledgement(m, K, TRIALS)),
     "estimate": _on("estimate", lambda m: loop_wire.read_known(m, "x_hat", K, SHAPE)),
@@ -82,12 +82,12 @@ def _accounts() -> dict[str, Account]:
 
 
 _z, _header, _flags = np.arange(6.0).reshape(SHAPE), np.ones((1, TRIALS), np.int64), np.array([True, False, True])
-_late = (Late(3, Heard(_flags, _z, _header)),)
+_late = (Late(3, Reception(_flags, _z, _header)),)
 _digests = {0: np.zeros((TRIALS, 32), np.uint8)}
 EXAMPLES: Mapping[str, bytes] = {
     "packet": packets.uplink(K, _z, _header, _flags, _z),
-    "once more": packets.once_more(2, 6, 4),
-    "mark": packets.hold(K),
+    "once more": packets.resend(2, 6, 4),
+    "mark": packets.barrier(K),
     "delivery": packets.delivery(K, b"\5", _z[:, _flags].tobytes(), _late, packets.packed_header(_header, _flags), _z.tobytes()),
     "acknowledgement": packets.acknowledgement(K, _flags),
     "estimate": loop_wire.known("x_hat", K, _z),

@@ -21,10 +21,10 @@ from cryptography.x509.oid import NameOID
 
 from evedrop.errors import BriefError, RunError, UsageError
 from evedrop.live.launch.authority import Authority
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import places_at
 from evedrop.live.network.certificates import check_identity
-from evedrop.live.network.connecting import Door, connected
+from evedrop.live.network.connecting import RouterAddress, connected
 from evedrop.live.network.control_file import Control, read_control
 from evedrop.live.network.session import client_config, door_of
 from evedrop.live.protocol import codec as wire
@@ -170,7 +170,7 @@ def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:
     """A brief of another run says whose router it found, within seconds."""
-    other = briefs_of(stage.scenario, stage.briefs[EVE].router, Observation(Path("nowhere"), False))[EVE]
+    other = briefs_of(stage.scenario, stage.briefs[EVE].router, ObserverTask(Path("nowhere"), False))[EVE]
     with pytest.raises(BriefError) as caught:
         connected(door_of(other), 60.0)
     assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)
@@ -197,7 +197,7 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
 
 def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
     """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
-    made = briefs_of(scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), Observation(tmp_path, False))
+    made = briefs_of(scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False))
     texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
     keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
     assert len(set(keys.values())) == len(made)
@@ -219,7 +219,9 @@ def certificate_of(brief: Brief) -> x509.Certificate:
 
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
-    made = briefs_of(scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), Observation(tmp_path, False))
+    made = briefs_of(
+        scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+    )
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]
     assert [str(one) for one in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
@@ -285,13 +287,13 @@ def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
             BriefError, match=r"not valid now by this host's clock \(certificate has expired\); set the clock"
         ),
     ):
-        connected(Door(endpoint, stage.keys.run, config, eve), 20.0)
+        connected(RouterAddress(endpoint, stage.keys.run, config, eve), 20.0)
 
 
 def test_a_router_that_is_not_there_is_waited_for() -> None:
     """Nobody listens: the process says so when its patience ends, as a failure of the run."""
     calls: list[None] = []
-    door = Door(f"tcp/127.0.0.1:{free_port()}", "r01", {})
+    door = RouterAddress(f"tcp/127.0.0.1:{free_port()}", "r01", {})
     with pytest.raises(
         RunError, match=r"no router answered at tcp/.* within 1 s \(Connection refused\); start it there"
     ):
@@ -302,9 +304,9 @@ def test_a_router_that_is_not_there_is_waited_for() -> None:
 def test_briefs_that_fit_no_endpoint_are_refused() -> None:
     """Certificates for a router in clear, none for one that takes them, and what is no endpoint."""
     for door, said in (
-        (Door("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
-        (Door("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),
-        (Door("7447", "r01", {}), "7447 is no endpoint"),
+        (RouterAddress("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
+        (RouterAddress("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),
+        (RouterAddress("7447", "r01", {}), "7447 is no endpoint"),
     ):
         with pytest.raises(BriefError, match=said):
             connected(door, 1.0)

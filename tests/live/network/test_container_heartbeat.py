@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.live.network.container_heartbeat import VARIABLE, Heartbeat
+from evedrop.live.network.container_heartbeat import VARIABLE, HeartbeatFile
 from tests.conftest import wait_until
 
 
@@ -24,7 +24,7 @@ def test_the_file_is_touched_as_long_as_there_is_a_connection(tmp_path: Path, mo
         wait_until(lambda: len(looks) > seen + times, "more looks at the connection")
 
     monkeypatch.setenv(VARIABLE, str(file))
-    heart = Heartbeat(look, seconds=0.001)
+    heart = HeartbeatFile(look, seconds=0.001)
     heart.start()
     look_again()
     assert not file.exists()
@@ -54,7 +54,7 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, monkeypatch:
         return True
 
     monkeypatch.setenv(VARIABLE, str(tmp_path / "nowhere" / "heartbeat"))
-    heart = Heartbeat(look, seconds=0.001)
+    heart = HeartbeatFile(look, seconds=0.001)
     heart.start()
     wait_until(lambda: len(looks) > 3, "more looks at the connection")
     heart.stop()
@@ -67,6 +67,6 @@ def test_without_a_file_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     def look() -> bool:
         raise AssertionError("nobody asked")
 
-    heart = Heartbeat(look)
+    heart = HeartbeatFile(look)
     heart.start()
     heart.stop()

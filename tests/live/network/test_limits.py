@@ -18,7 +18,7 @@ from evedrop.live.protocol.envelope import head_of
 from evedrop.live.protocol.message_limits import Sizes
 from evedrop.live.protocol.whereabouts import Whereabouts
 from evedrop.model.links.link import REASONS
-from evedrop.model.receiver import Belief, Heard
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
 
@@ -41,7 +41,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
     n, R, c, recorded = sizes.n, sizes.trials, sizes.batch, sizes.recorded
     z, all_of, k = np.ones((n, R)), np.ones(R, bool), 2**40
     header = np.ones((sizes.header, R), np.int64) if sizes.header else None
-    heard = Heard(all_of, z, header)
+    heard = Reception(all_of, z, header)
     late = tuple(Late(k, heard) for _ in range(2 * (sizes.window + 1)))
     packed = b"" if header is None else packets.packed_header(header, all_of)
     digests = {k: np.ones((R, 32), np.uint8), k + 1: np.ones((R, 32), np.uint8)}

@@ -23,7 +23,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import Brief, read_brief
 from evedrop.live.protocol.envelope import enclosed
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.loading import load
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
@@ -91,7 +91,7 @@ class Evidence:
     output: str
 
 
-def asked_for(keys: Keys) -> list[str]:
+def asked_for(keys: RunKeys) -> list[str]:
     """Every key of the run, and the wildcards over them."""
     named = [getattr(keys, kind)(name) for kind in ("telemetry", "progress", "control", "alive") for name in EVERYBODY]
     downlinks = [keys.downlink(name) for name in ("legitimate", "mallory", "nadia")]
@@ -100,7 +100,7 @@ def asked_for(keys: Keys) -> list[str]:
     return [keys.uplink, keys.journal, *named, *downlinks, *wide, f"{under}/alive/*", f"{under}/downlink/*"]
 
 
-def listen(eve: Brief, keys: Keys, stack: ExitStack) -> dict[str, Ear]:
+def listen(eve: Brief, keys: RunKeys, stack: ExitStack) -> dict[str, Ear]:
     """Ask in every way to be told: by subscription, by watching tokens."""
     attacker = stack.enter_context(connect(eve))
     ears = {}
@@ -112,7 +112,7 @@ def listen(eve: Brief, keys: Keys, stack: ExitStack) -> dict[str, Ear]:
     return ears
 
 
-def ask(eve: Brief, keys: Keys) -> dict[str, set[str]]:
+def ask(eve: Brief, keys: RunKeys) -> dict[str, set[str]]:
     """Ask in every way to be answered: by query, and for tokens."""
     with connect(eve) as attacker:
         own = f"@/{attacker.zid()}/"
@@ -126,7 +126,7 @@ def ask(eve: Brief, keys: Keys) -> dict[str, set[str]]:
     return answers
 
 
-def disturb(eve: Brief, keys: Keys) -> None:
+def disturb(eve: Brief, keys: RunKeys) -> None:
     """Put what would wreck the run on every key that is not its own, delete everything, feign tokens, offer answers."""
     own = {keys.telemetry("eve"), keys.progress("eve"), keys.alive("eve")}
     with connect(eve) as attacker:
@@ -175,7 +175,7 @@ def attack(folder: Path) -> Evidence:
         stack.callback(run.kill)
         found = until(lambda: (here := processes_of(run.pid)).keys() == set(EVERYBODY) and here, "all processes")
         briefs = {name: read_brief(kept / f"{name}.json") for name in EVERYBODY}
-        keys, eve = Keys(briefs["eve"].run), briefs["eve"]
+        keys, eve = RunKeys(briefs["eve"].run), briefs["eve"]
         meant = {keys.downlink(name): name for name in PROCESSES[1:]}
         meant |= {keys.telemetry(name): "observer" for name in PROCESSES} | {keys.journal: "observer"}
         meant |= {keys.progress(name): "sensor" for name in (*PROCESSES[1:], "observer")}

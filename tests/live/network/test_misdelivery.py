@@ -15,7 +15,7 @@ import zenoh
 from bench import LIMIT_SECONDS, scenario_of, until
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.declared import InboxClosedError, Question
 from evedrop.live.network.operator import Answer, Request, ask
@@ -24,14 +24,14 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import Reader, control, progress
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
 from tests.proxy import Cable, cable
 
 GOOD = progress(7)
 
 
-def foreign(keys: Keys, key: str) -> list[bytes]:
+def foreign(keys: RunKeys, key: str) -> list[bytes]:
     """Messages that do not belong on a key: of another key, of another run, and with no envelope."""
     other = key.replace(keys.run, "another-run")
     return [enclosed(keys.control("smart"), GOOD), enclosed(other, GOOD), GOOD, b"", b"\xc1", head_of(key)[:-1]]
@@ -43,7 +43,7 @@ class Stage:
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         port = free_port()
         self.cable: Cable = stack.enter_context(cable(port))
-        observation = Observation(folder / "results", False)
+        observation = ObserverTask(folder / "results", False)
         self.briefs = briefs_of(scenario_of(), self.cable.endpoint, observation, ends_with_stdin=False)
         with users_file({"operator": "password", **{one.user: one.password for one in self.briefs.values()}}) as users:
             config = {
@@ -53,7 +53,7 @@ class Stage:
                 "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
             }
             self.router = stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(config))))
-        self.keys = Keys(self.briefs["eve"].run)
+        self.keys = RunKeys(self.briefs["eve"].run)
 
     @property
     def eve(self) -> Brief:

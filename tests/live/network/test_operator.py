@@ -20,7 +20,7 @@ from evedrop.live.network.operator import Answer, Request, ask, read_request
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
 PATIENCE = 5.0
@@ -178,7 +178,7 @@ def test_the_operator_may_do_nothing_else(stage: Bench) -> None:
 def test_of_another_run_nothing_can_be_asked(stage: Bench) -> None:
     """The operator's rights end with the keys of its run."""
     with answering(stage) as asked, connect(operator(stage)) as session:
-        assert replies(session, Keys("another").control("observer")) == []
+        assert replies(session, RunKeys("another").control("observer")) == []
         assert asked == []
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from queue import SimpleQueue
 
-from evedrop.live.network.delayed_sender import Postman
+from evedrop.live.network.delayed_sender import DelayedSender
 
 
 def test_messages_go_out_when_they_are_due_and_in_order() -> None:
     """A message waits its time; one that is due at once goes before it on another round, and after it on its own."""
-    postman, out = Postman(), SimpleQueue[tuple[str, bytes, float]]()
+    postman, out = DelayedSender(), SimpleQueue[tuple[str, bytes, float]]()
     slow = postman.round(lambda payload: out.put(("slow", payload, time.monotonic())))
     quick = postman.round(lambda payload: out.put(("quick", payload, time.monotonic())))
     began = time.monotonic()

@@ -19,11 +19,11 @@ from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import envelope, packets, telemetry
 from evedrop.live.protocol.brief import read_brief
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import BeliefLog, Blocks, RunDigest
 from evedrop.model.flag_bits import packed_flags
-from evedrop.model.receiver import Belief, Heard
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
 from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
@@ -47,14 +47,14 @@ def flags(rows: Any) -> np.ndarray:
     return np.array(rows, np.bool_)
 
 
-def heard_of(shape: dict[str, Any], gamma: Any, z: Any) -> Heard:
+def heard_of(shape: dict[str, Any], gamma: Any, z: Any) -> Reception:
     """What a receiver gets: payloads of the trials that receive one, 0 in the others."""
     full = np.zeros((shape["n"], shape["trials"]))
     full[:, flags(gamma)] = np.array(z, float).reshape(shape["n"], -1)
-    return Heard(flags(gamma), full)
+    return Reception(flags(gamma), full)
 
 
-def packets_of(heard: Heard) -> dict[str, Any]:
+def packets_of(heard: Reception) -> dict[str, Any]:
     """The same as values: z of the trials that received, and nothing in the others."""
     assert not heard.z[:, ~heard.gamma].any()
     return {"gamma": heard.gamma.astype(int).tolist(), "z": heard.z[:, heard.gamma].tolist()}
@@ -230,15 +230,15 @@ def decode_leaving(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
 def decode_mark(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As router and receivers read it."""
     message = wire.Reader(KEY, raw)
-    assert packets.is_hold(message)
+    assert packets.is_barrier(message)
     return {"k": message.slot(value["k"]), "hold": message.flag("hold")}
 
 
-def decode_once_more(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+def decode_resend(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the router reads it."""
     message = wire.Reader(KEY, raw)
-    assert packets.is_once_more(message)
-    number, done, first = packets.read_once_more(message, SLOTS)
+    assert packets.is_resend(message)
+    number, done, first = packets.read_resend(message, SLOTS)
     return {"n": number, "again": done, "k": first}
 
 
@@ -322,8 +322,8 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw, SLOTS)},
     ),
     "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
-    "once more": (lambda _shape, value: packets.once_more(value["n"], value["again"], value["k"]), decode_once_more),
-    "mark": (lambda _shape, value: packets.hold(value["k"]), decode_mark),
+    "once more": (lambda _shape, value: packets.resend(value["n"], value["again"], value["k"]), decode_resend),
+    "mark": (lambda _shape, value: packets.barrier(value["k"]), decode_mark),
     "held": (lambda _shape, value: telemetry.held(value["k"]), decode_held),
     "leaving": (encode_leaving, decode_leaving),
     "request": (lambda _shape, value: operator.Request(**value).pack(), decode_request),
@@ -479,7 +479,7 @@ def test_table_of_keys_is_the_access_table() -> None:
         for what, keys in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
             for key in filter(None, keys):
                 granted.setdefault((what, key), set()).add(grant.process)
-    keys = Keys("r")
+    keys = RunKeys("r")
     no_row = {
         ("writes", keys.control("observer")),
         ("reads", keys.control("observer")),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.live.network.resending import Kept
+from evedrop.live.network.resending import ReplayBuffer
 
 
 def slot_message(k: int) -> bytes:
@@ -32,7 +32,7 @@ def test_a_round_announces_the_slot_that_follows(
 ) -> None:
     """Whatever was forgotten, however late a round is asked for: the head names the message behind it, and none is missing."""
     sent: list[bytes] = []
-    kept = Kept(sent.append, span=span, head=head, back=back)
+    kept = ReplayBuffer(sent.append, span=span, head=head, back=back)
     for k in range(slots):
         kept(k, slot_message(k))
     kept.forget(min(done, slots))
@@ -50,7 +50,7 @@ def test_a_round_announces_the_slot_that_follows(
 def test_a_late_round_does_not_announce_what_is_forgotten() -> None:
     """A round from slot 0 on, asked for when 1184 slots were done, once made the reader wait for slot 0 in vain."""
     sent: list[bytes] = []
-    kept = Kept(sent.append, head=head, back=2)
+    kept = ReplayBuffer(sent.append, head=head, back=2)
     for k in range(1190):
         kept(k, slot_message(k))
     kept.forget(1184)
@@ -64,7 +64,7 @@ def test_a_late_round_does_not_announce_what_is_forgotten() -> None:
 def test_the_last_message_is_sent_in_any_case(k: int) -> None:
     """Who has all of them hears that the sender is there."""
     sent: list[bytes] = []
-    kept = Kept(sent.append)
+    kept = ReplayBuffer(sent.append)
     kept(k, slot_message(k))
     del sent[:]
     kept.again(1, k + 1)

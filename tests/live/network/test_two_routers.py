@@ -23,7 +23,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.envelope import enclosed
-from evedrop.live.protocol.keys import Keys
+from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
 
 EVE = "eve"
@@ -159,7 +159,7 @@ def test_each_process_has_its_own_place(stage: Bench) -> None:
 
 def test_what_crosses_is_no_more_than_it_must_be() -> None:
     """Uplink and acknowledgements to the sensor stay at the sensor's site, telemetry of receivers and requests at theirs."""
-    keys, table = Keys("r"), grants("r", ("legitimate", "eve"), relayed=True)
+    keys, table = RunKeys("r"), grants("r", ("legitimate", "eve"), relayed=True)
     (relay,) = [one for one in at_router("r", table) if one.process == RELAY]
     (router,) = [one for one in at_relay("r", table, "abc") if one.process == "router"]
     assert set(relay.reads) == {

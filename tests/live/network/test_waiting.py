@@ -10,7 +10,7 @@ import pytest
 from bench import scenario_of
 
 from evedrop.errors import RunError
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network import connecting
 from evedrop.live.network.session import Session
 from evedrop.ports import free_port
@@ -22,7 +22,7 @@ def test_a_process_says_that_it_waits_for_its_router(
     """Every few seconds, on standard error: who waits, for which router, for how long, and what came of the last attempt."""
     monkeypatch.setattr(connecting, "WAITING_SECONDS", 0.3)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    brief = briefs_of(scenario_of(), endpoint, Observation(tmp_path, False), ends_with_stdin=False)["eve"]
+    brief = briefs_of(scenario_of(), endpoint, ObserverTask(tmp_path, False), ends_with_stdin=False)["eve"]
     with pytest.raises(RunError, match="no router answered"):
         Session(replace(brief, patience=1))
     said = capfd.readouterr().err.splitlines()

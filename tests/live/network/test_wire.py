@@ -23,7 +23,7 @@ from evedrop.live.protocol.keys import writer_of
 from evedrop.model.digest import Blocks
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
-from evedrop.model.receiver import Belief, Heard
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
 from tests.live.network.readers import EXAMPLES, READERS, fields_of
@@ -67,7 +67,7 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
     late = tuple(
         Late(
             data.draw(st.integers(0, k)),
-            Heard(
+            Reception(
                 data.draw(arrays(bool, trials).filter(np.any)),
                 data.draw(arrays(float, (n, trials), elements=FINITE)),
             ),
@@ -87,7 +87,7 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
 
 def test_a_late_packet_from_the_future_is_refused() -> None:
     """What arrives in slot 4 was not sent in slot 5."""
-    late = (Late(5, Heard(np.ones(1, bool), np.zeros((1, 1)))),)
+    late = (Late(5, Reception(np.ones(1, bool), np.zeros((1, 1)))),)
     with pytest.raises(MalformedMessage, match="a late packet of slot 5; expected one of slot 4 or before"):
         packets.read_delivery(Reader("d", packets.delivery(4, b"\0", b"", late)), 4, (1, 1))
 
@@ -95,8 +95,11 @@ def test_a_late_packet_from_the_future_is_refused() -> None:
 @given(SLOTS)
 def test_marks(k: int) -> None:
     """A mark is no packet and no delivery, a word that the sensor holds no truth, and each says before which slot."""
-    mark, held = Reader("u", packets.hold(k)), Reader("t", telemetry.held(k))
-    assert (packets.is_hold(mark), packets.is_hold(Reader("u", packets.uplink(k, np.zeros((1, 1)))))) == (True, False)
+    mark, held = Reader("u", packets.barrier(k)), Reader("t", telemetry.held(k))
+    assert (packets.is_barrier(mark), packets.is_barrier(Reader("u", packets.uplink(k, np.zeros((1, 1)))))) == (
+        True,
+        False,
+    )
     truth = telemetry.Truth(k, np.zeros((1, 1, 1)), np.zeros((1, 1), bool)).pack()
     assert (telemetry.is_held(held), telemetry.is_held(Reader("t", truth))) == (True, False)
     assert mark.slot(k) == held.slot(k) == k

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from evedrop.errors import BriefError
-from evedrop.live.launch.briefs import Observation, briefs_of
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief import Brief, Flow, Model, read_brief
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.loading import load
@@ -140,7 +140,7 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
 
 def made(scenario: Scenario) -> dict[str, Brief]:
     """The briefs of a scenario."""
-    return briefs_of(scenario, "tcp/127.0.0.1:1", Observation(Path("nowhere"), False))
+    return briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
 
 
 def test_who_is_given_which_keys() -> None:
