@@ -359,7 +359,7 @@ def test_another_shape_in_a_later_slot_is_not_sent(evedrop: Evedrop) -> None:
 LATER = {
     "packet": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
                "        return Packet(x * (np.nan if k == 30 else 1.0), np.zeros(x.shape[1], bool))",
-               "the scheme later_packet:Mine failed in slot 30, trials {trials}: Packet.z, trial {first}, is nan; expected finite"),
+               "the scheme later_packet:Mine failed in slot 30, trials {trials}: Packet.z, trial {first}, is nan; "),
     "turned": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
                "        return Packet(x[:1] if k == 30 else x, np.zeros(x.shape[1], bool))",
                "the scheme later_turned:Mine failed in slot 30, trials {trials}: Packet.z has shape (1, "),
