@@ -186,7 +186,7 @@ def _parquet(path: Path) -> Any:
     texts = [
         field.name
         for field in pq.read_schema(path)
-        if not (pa.types.is_boolean(field.type) or pa.types.is_integer(field.type) or pa.types.is_floating(field.type))
+        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
     ]
     # A text that stands in every row of a million is kept once.
     return pq.ParquetFile(path, read_dictionary=texts)

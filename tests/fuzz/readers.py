@@ -296,7 +296,7 @@ def _briefs() -> list[bytes]:
     found = []
     for name in ("eavesdroppers", "acknowledged", "microgrid", "restart"):
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
-        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False, None)).values():
+        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False)).values():
             found.append(json.dumps({**asdict(brief), "run": "r00000000", "password": "p"}).encode())
     return found
 

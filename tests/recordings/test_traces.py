@@ -112,6 +112,17 @@ def test_what_is_no_recording_is_said(
     assert said in line
 
 
+def test_a_column_of_lists_does_not_hide_the_others(tmp_path: Path) -> None:
+    """Names of columns, and the column of outcomes, are read; a column of lists is named as what it is."""
+    columns = {"received": [1, 0], "nested": [[1], []], "note": ["a", "a"]}
+    pq.write_table(pa.table(columns), tmp_path / "walk.parquet")
+    recording = Recording(tmp_path / "walk.parquet")
+    assert recording.columns() == [*columns]
+    assert recording.outcomes("received").tolist() == [1, 0]
+    with pytest.raises(TraceError, match="has lists or tables in the column"):
+        recording.outcomes("nested")
+
+
 def test_parquet_says_row_and_gap(tmp_path: Path) -> None:
     """A row that is neither 0 nor 1, and one without a value."""
     for values, said in (([1, 7], 'row 2 is "7"'), ([1, 0, None], "row 3 is empty"), (["1", "x"], 'row 2 is "x"')):
