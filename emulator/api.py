@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from evedrop.errors import UsageError
 from evedrop.loading import checked, load
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.outcomes import GENIE_SCHEMES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
 from evedrop.names import LEGITIMATE
@@ -134,7 +133,7 @@ def design(
     from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - the same
 
     made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
-    if made.encoding.scheme not in GENIE_SCHEMES:
+    if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
@@ -162,7 +161,8 @@ def design(
 
 def _not_for(scheme: str) -> str:
     """Why nothing is designed for a scheme, and what to do instead."""
-    why = f"the design of μ_d is for the scheme {listed(GENIE_SCHEMES)}"
+    designed = [name for name in SCHEMES if SCHEMES[name].sends_states_and_innovations]
+    why = f"the design of μ_d is for the scheme {listed(designed)}"
     instead = "give --set 'encoding={scheme = \"innovation\", state_probability = 0.6}' to design that on this process"
     if SCHEMES.foreign(scheme):
         return f"{why}; no closed form is known for {scheme}; {instead}, or study it by evedrop sweep"

@@ -82,6 +82,8 @@ def _class(kind: type[Eavesdropper]) -> dict[str, Any]:
     return {
         "parameters": dict(kind.parameters),
         "pools_links": bool(kind.pools_links),
+        "inverts_noise": bool(kind.inverts_noise),
+        "only_against": kind.only_against,
         "takes": takes,
         "own_outcomes": getattr(kind.outcomes, "__func__", None) is not inherited,
     }

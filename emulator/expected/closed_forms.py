@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 
 from evedrop.model.acknowledgements import rates_of
-from evedrop.model.outcomes import closed_form
 from evedrop.model.process import Floats, Process
 from evedrop.model.reference import ReferenceCode
+from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_forms import SensorChain, encrypted_schedule, reference_covariances, scheduled
@@ -87,7 +87,7 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
     process, quality = scenario.process.process, scenario.quality
     split = _split(scenario, receiver)
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
-    kind = closed_form(scenario.encoding.scheme, reader)
+    kind = SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
     # Unless acknowledgements are forged the user never misses a reference, and what it does with a slot tells more.
     told = receiver != LEGITIMATE or table.attack == "forge"
     if kind == "reference" and told and not ReferenceCode(process).decorrelates:

@@ -11,9 +11,9 @@ import numpy as np
 
 from evedrop.expected.closed_forms import Closed, ClosedStream, closed_of
 from evedrop.model import modulated
-from evedrop.model.outcomes import GENIE_SCHEMES, eavesdropper_outcomes, legitimate_outcomes
+from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Floats, Process
-from evedrop.model.schemes import scheme_of
+from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt
@@ -122,7 +122,8 @@ def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
     """The same of the genie behind a receiver's link, where it bounds the receiver: against the secret, and without it."""
-    if receiver == LEGITIMATE or receiver in scenario.leaks or scenario.encoding.scheme not in GENIE_SCHEMES:
+    scheme = SCHEMES[scenario.encoding.scheme]
+    if receiver == LEGITIMATE or receiver in scenario.leaks or not scheme.sends_states_and_innovations:
         return None
     return partial(_genie, scenario.encoding.mu_d)
 

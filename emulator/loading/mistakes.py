@@ -16,7 +16,7 @@ from pydantic_core import ErrorDetails
 
 from evedrop.files import Unreadable, contents
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
-from evedrop.model.outcomes import closed_form, eavesdropper_outcomes, legitimate_outcomes
+from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
@@ -207,12 +207,12 @@ def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) 
         scheme = scheme_of(_ANY_PROCESS, EncodingTable.model_validate(encoding).spec)
         if name == LEGITIMATE:
             link = LinkTable.model_validate(receiver["link"])
-            if closed_form(encoding["scheme"], LEGITIMATE) is None and legitimate_outcomes(scheme) is None:
+            if LEGITIMATE not in scheme.closed_forms and legitimate_outcomes(scheme) is None:
                 return f"no closed form is known for the scheme {encoding['scheme']}"
         else:
             table = EavesdropperTable.model_validate(receiver)
             link = table.pool
-            closed = closed_form(encoding["scheme"], table.strategy) is not None
+            closed = table.strategy in scheme.closed_forms
             if not closed and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
                 return f"no closed form is known for the strategy {table.strategy} of {name}"
         if law_of(LinkSchedule(link.settings(1.0), int(receiver.get("window", 0)))) is None:

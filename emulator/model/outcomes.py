@@ -15,21 +15,6 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
-GENIE_SCHEMES = ("innovation", "plain")
-"""Schemes whose packets are states and innovations, so that nobody without the secret outdoes the genie."""
-
-
-_CLOSED = {
-    **{("acknowledged", reader): "reference" for reader in ("legitimate", "reference")},
-    ("encrypted-schedule", "selective"): "selective",
-    **{("scheduled", reader): "scheduled" for reader in ("legitimate", "naive", "reference", "selective")},
-}
-
-
-def closed_form(scheme: str, receiver: str) -> str | None:
-    """Which of `closed_forms` is a receiver's, whose slots are not alike; receiver: a strategy, or `legitimate`."""
-    return _CLOSED.get((scheme, receiver))
-
 
 def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
     """From the quality of its link to what the legitimate estimator does with a slot; None: no such closed form."""

@@ -12,14 +12,15 @@ import numpy as np
 from pydantic import ValidationError
 
 from evedrop.kernels.elementary import semidefinite_factor
+from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.local_filter import MOST_STATES, FilterStep, settled
 from evedrop.model.process import Floats, Process
+from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.plant import PlantTable, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.table import numbers
 
 FILTER = "filter"
-_INVERTS_NOISE = ("bayesian", "genie", "likelihood", "tracker")
 
 
 def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
@@ -118,14 +119,21 @@ def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
                     "and plant.noise must move every state, or it trusts no measurement any more"
                 )
         encoding = tables.get("encoding")
-        if isinstance(encoding, Mapping) and encoding.get("scheme") == "twin-track":
-            yield "plant.output_matrix: is there, but the scheme twin-track decides x_0 itself; expected another scheme"
+        name = str(encoding.get("scheme")) if isinstance(encoding, Mapping) else ""
+        scheme = SCHEMES.get(name)
+        if scheme is not None and scheme.decides_initial_state:
+            yield f"plant.output_matrix: is there, but the scheme {name} decides x_0 itself; expected another scheme"
     if process.get("singular_noise") is True:
         eavesdroppers = tables.get("eavesdroppers")
         for name, table in (eavesdroppers if isinstance(eavesdroppers, Mapping) else {}).items():
             for entry in ("strategy", "reads_as"):
-                if isinstance(table, Mapping) and table.get(entry) in _INVERTS_NOISE:
+                if isinstance(table, Mapping) and _inverts_noise(table.get(entry)):
                     yield (
                         f"eavesdroppers.{name}.{entry}: is {table[entry]}, which reckons with the inverse of Q, and Q may be "
                         "singular; expected another strategy, or a Q that is not"
                     )
+
+
+def _inverts_noise(strategy: object) -> bool:
+    kind = STRATEGIES.get(strategy) if isinstance(strategy, str) else None
+    return kind is not None and kind.inverts_noise

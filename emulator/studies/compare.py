@@ -28,10 +28,7 @@ from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.memory.montecarlo import Merger, News, Plan, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
-from evedrop.model.process import MARGINAL, Floats
 from evedrop.model.schemes import scheme_of
-from evedrop.model.theory.closed_forms import twin_track_bound
-from evedrop.model.theory.covariances import state_covariances
 from evedrop.names import LEGITIMATE
 from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
 from evedrop.results.resolved_scenario import resolved
@@ -45,7 +42,6 @@ from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.signals import stop_on_signals
 from evedrop.studies.matchups import Group, Match, Matchups
 
-_SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
 _WRITE_SECONDS, _WRITE_SHARE = 3.0, 50.0  # from one compare.json to the next, and as a multiple of what one takes
 _ALIKE = 1e-6  # share by which two errors of theory may differ and be called equal: rounding, and no more
 
@@ -406,31 +402,13 @@ def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory 
     if known is not None:
         traces = known.traces(scenario.slots)
         return Theory(float(np.mean(traces)), float(traces[-1]), known.limit, known is not expected)
-    floor = _floor(scenario, receiver)
-    if floor is None:
-        return None
-    return Theory(float(np.mean(floor)), float(floor[-1]), math.inf if _grows(scenario) else None, True)
-
-
-def _floor(scenario: Scenario, receiver: str) -> Floats | None:
-    """What holds against everybody without the secret, of the schemes that the genie's bound is not for, (slots,)."""
-    process, scheme = scenario.process.process, scenario.encoding.scheme
     if receiver == LEGITIMATE or receiver in scenario.leaks:
         return None
-    if scheme == "cipher":
-        traces: Floats = np.trace(state_covariances(process, scenario.slots), axis1=1, axis2=2)
-        return traces
-    return twin_track_bound(process, scenario.slots) if scheme == "twin-track" else None
-
-
-def _grows(scenario: Scenario) -> bool:
-    """Whether that floor grows without bound: with powers of A, or, of the cipher, with all noise that A never forgets."""
-    process = scenario.process.process
-    if scenario.encoding.scheme == "cipher":
-        return process.spectral_radius >= 1.0 - MARGINAL
-    with np.errstate(over="ignore", invalid="ignore"):
-        soon, late = (np.abs(np.linalg.matrix_power(process.A, power)).max() for power in (_SOON, _LATE))
-    return not late <= _GROWN * soon
+    found = scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
+    if found is None:
+        return None
+    floor, grows = found
+    return Theory(float(np.mean(floor)), float(floor[-1]), math.inf if grows else None, True)
 
 
 def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:

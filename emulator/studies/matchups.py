@@ -12,10 +12,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.errors import ScenarioError, UsageError
+from evedrop.errors import NotRegistered, ScenarioError, UsageError
 from evedrop.loading import checked
 from evedrop.loading.mistakes import lacking_streams
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.registry import Registry
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
@@ -24,27 +25,6 @@ from evedrop.scenario.words import listed, near
 ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}
 """Adversary → its attack on acknowledgements."""
 
-_BEST_READER = {
-    "acknowledged": "reference",
-    "cipher": "constant",
-    "encrypted-schedule": "selective",
-    "innovation": "bayesian",
-    "twin-track": "tracker",
-}
-_ANY_READER = "naive"  # of every other scheme: whatever is sent is the state, or cannot be told from it
-
-_MEANT_FOR = {
-    "bayesian": ("innovation", "weighs states against innovations, and there are none: it is naive here"),
-    "genie": ("innovation", "uses what innovations leak, and there are none"),
-    "likelihood": ("innovation", "tests states against innovations, and there are none: it is naive here"),
-    "reference": ("acknowledged", "follows references, and there are none: it is naive here"),
-    "selective": (
-        "encrypted-schedule",
-        "heeds a header that says what is encrypted, and there is none: it is naive here",
-    ),
-    "tracker": ("twin-track", "goes half-way between two tracks, and there is one"),
-}
-_CHANCES = {"use_state": 0.8, "use_innovation": 0.2}  # of a suspicious one that the scenario says nothing of
 _WAY_BACK = {"link": {"quality": 1.0}}
 
 Tables = dict[str, Any]
@@ -83,7 +63,8 @@ class Group:
     def name(self) -> str:
         """Of its scenario's file."""
         attacker = next((match.adversary for match in self.matches if match.attack != "none"), None)
-        return self.scheme if attacker is None else f"{self.scheme}-{attacker}"
+        scheme = self.scheme.replace(":", ".")
+        return scheme if attacker is None else f"{scheme}-{attacker}"
 
 
 @dataclass(frozen=True)
@@ -140,34 +121,40 @@ def _chosen(
     chosen = []
     for what, names, known in (("scheme", schemes, tuple(SCHEMES)), ("adversary", adversaries, adversaries_of())):
         wanted = known if names is None else tuple(dict.fromkeys(names))
-        found += _strange(what, wanted, known)
+        found += _strange(what, wanted, known, SCHEMES if what == "scheme" else STRATEGIES)
         if not wanted:
             found.append(f"no {what} is named; expected {listed(known)}")
         chosen.append(wanted)
     for key in parameters:
-        scheme, _, name = key.partition(".")
-        if scheme not in SCHEMES or name not in SCHEMES[scheme].parameters:
-            parts = [f"{one}.{entry}" for one in SCHEMES for entry in SCHEMES[one].parameters]
+        scheme, _, name = key.rpartition(".")
+        if scheme not in chosen[0] or name not in getattr(SCHEMES.get(scheme), "parameters", ()):
+            parts = [f"{one}.{entry}" for one in chosen[0] if one in SCHEMES for entry in SCHEMES[one].parameters]
             found.append(f"{key} is no parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
     if found:
         raise UsageError("\n  ".join(["nothing was compared:", *found]))
     return chosen[0], chosen[1]
 
 
-def _strange(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:
-    return [
-        f"{name or 'nothing'} is no {what}; expected {listed(known)}{near(name, known)}"
-        for name in names
-        if name not in known
-    ]
+def _strange(what: str, names: Iterable[str], known: Sequence[str], registry: Registry[Any]) -> list[str]:
+    """What is wrong with names of schemes or adversaries; each may be a class of a plug-in."""
+    found = []
+    for name in names:
+        if name in known:
+            continue
+        try:
+            _ = registry[name]
+        except NotRegistered as error:
+            why = error.why or f"; expected {listed(known)}{near(name, known)}"
+            found.append(f"{name or 'nothing'} is no {what}{why}")
+    return found
 
 
 def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
     attack = ATTACKERS.get(adversary, "none")
     if attack != "none" and not SCHEMES[scheme].needs_acknowledgements:
         return Match(scheme, adversary, not_defined="there are no acknowledgements to meddle with")
-    strategy = adversary if attack == "none" else _BEST_READER.get(scheme, _ANY_READER)
-    where, why = _MEANT_FOR.get(strategy, (scheme, ""))
+    strategy = adversary if attack == "none" else SCHEMES[scheme].best_reader
+    where, why = STRATEGIES[strategy].only_against or (scheme, "")
     if scheme != where:
         return Match(scheme, adversary, not_defined=why)
     table = _eavesdropper(scenario, scheme, strategy)
@@ -230,14 +217,17 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
         made.setdefault("links", [{name: link[name] for name in ("quality", "loss") if name in link}] * 2)
     else:
         made.setdefault("link", link)
-    made |= {name: value for name, value in _CHANCES.items() if name in kind.parameters and name not in made}
     if "reads_as" in kind.parameters:
         # As each scheme is read best, whatever the scenario's own scheme is: what it says would mean nothing for most.
-        made = {name: value for name, value in made.items() if name not in _CHANCES}
-        made["reads_as"] = _BEST_READER.get(scheme, _ANY_READER)
+        made = {
+            name: value
+            for name, value in made.items()
+            if name in {*kind.parameters, "strategy", "window", "link", "links"}
+        }
+        made["reads_as"] = SCHEMES[scheme].best_reader
     if "learns_at" in kind.parameters:
         made.setdefault("learns_at", scenario.slots // 2)
-    return _alone(made)
+    return _alone({**kind.parameters, **made})
 
 
 def _alone(table: Tables) -> Tables:

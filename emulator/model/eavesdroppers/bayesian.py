@@ -38,6 +38,9 @@ class Bayesian(PacketReader):
     `Belief.memory` is its `Mixture`.
     """
 
+    only_against = ("innovation", "weighs states against innovations, and there are none: it is naive here")
+    inverts_noise = True
+
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.state_probability

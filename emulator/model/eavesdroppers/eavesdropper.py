@@ -39,6 +39,10 @@ class Eavesdropper(Receiver):
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     pools_links: ClassVar[bool] = False
     """Whether it has several links in place of one: what any of them delivers, it hears."""
+    only_against: ClassVar[tuple[str, str] | None] = None
+    """The only scheme that `evedrop compare` sets it against, and what it would be against any other; None: all schemes."""
+    inverts_noise: ClassVar[bool] = False
+    """Whether it uses the inverse of Q, so that Q must not be singular."""
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge.process, batch.trials)

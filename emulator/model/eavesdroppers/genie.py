@@ -23,6 +23,9 @@ class Genie(PacketReader):
     Source: docs/mathematics.md, genie.
     """
 
+    only_against = ("innovation", "uses what innovations leak, and there are none")
+    inverts_noise = True
+
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)

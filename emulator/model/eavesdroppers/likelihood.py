@@ -25,6 +25,9 @@ class Likelihood(PacketReader):
     `Belief.memory` is P's factors, (n (n−1)/2, R) and (n, R).
     """
 
+    only_against = ("innovation", "tests states against innovations, and there are none: it is naive here")
+    inverts_noise = True
+
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.state_probability

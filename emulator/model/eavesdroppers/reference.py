@@ -19,6 +19,8 @@ class Reference(PacketReader):
     Source: docs/mathematics.md, acknowledged references.
     """
 
+    only_against = ("acknowledged", "follows references, and there are none: it is naive here")
+
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._reader = ReferenceReceiver(knowledge.process, batch.trials)

@@ -17,6 +17,11 @@ class Selective(PacketReader):
     Source: docs/mathematics.md, schedules by holding time.
     """
 
+    only_against = (
+        "encrypted-schedule",
+        "heeds a header that says what is encrypted, and there is none: it is naive here",
+    )
+
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is in clear."""
         # The codes 0 and 1 of `Action` are γ itself: the state where anything arrives.

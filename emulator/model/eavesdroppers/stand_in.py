@@ -40,11 +40,20 @@ class StandIns:
         said = {
             "parameters": parameters,
             "pools_links": facts.get("pools_links") is True,
+            "inverts_noise": facts.get("inverts_noise") is True,
+            "only_against": _only_against(facts.get("only_against")),
             "_own_outcomes": facts.get("own_outcomes") is not False,
             "_ask": staticmethod(lambda do, *given: self.answers.ask(name, do, self._registry, *given)),
             "__module__": __name__,
         }
         return type(name.rpartition(":")[2], (base,), said)
+
+
+def _only_against(found: Any) -> tuple[str, str] | None:
+    """A scheme and a reason, if that is what the class says."""
+    if isinstance(found, list) and len(found) == 2 and all(isinstance(one, str) for one in found):
+        return found[0], found[1]
+    return None
 
 
 def _wrong(what: str, found: Any, expected: str) -> NoAnswer:

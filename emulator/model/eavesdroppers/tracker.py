@@ -63,6 +63,9 @@ class Tracker(PacketReader):
     the two are further apart than the noise between two packets. `Belief.memory` is its `FollowedTracks`, 2R columns as (2, R).
     """
 
+    only_against = ("twin-track", "goes half-way between two tracks, and there is one")
+    inverts_noise = True
+
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
         super().__init__(knowledge, batch)
         self._capacity = capacity

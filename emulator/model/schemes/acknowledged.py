@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
@@ -49,6 +50,8 @@ class Acknowledged(Scheme):
     Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
     """
 
+    best_reader = "reference"
+    closed_forms = MappingProxyType({"legitimate": "reference", "reference": "reference"})
     needs_acknowledgements = True
     reads_packets = True
     header = ("slot t of the reference; −1: none, z is the state",)

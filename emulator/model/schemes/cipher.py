@@ -8,10 +8,10 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.numeric.masking import Mask
-from evedrop.model.process import Floats, Process
+from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.covariances import Outcomes, state_covariances
 from evedrop.streams import Batch
 
 
@@ -54,6 +54,7 @@ class Cipher(Scheme):
     Source: docs/mathematics.md, stream cipher.
     """
 
+    best_reader = "constant"
     secret_streams = ("mask",)
     estimator_streams = ("mask",)
     secret_words = (0, 1)
@@ -67,6 +68,14 @@ class Cipher(Scheme):
             lambda: CipherEncoder(mask),
             lambda: CipherEstimator(self.process, batch.trials, mask),
         )
+
+    def error_floor(self, slots: int) -> tuple[Floats, bool]:
+        """Tr Σ_k, (slots,): nothing can be learnt from packets. It grows unless A forgets.
+
+        Source: docs/mathematics.md, model.
+        """
+        traces: Floats = np.trace(state_covariances(self.process, slots), axis1=1, axis2=2)
+        return traces, self.process.spectral_radius >= 1.0 - MARGINAL
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet."""

@@ -71,6 +71,8 @@ class EncryptedSchedule(Scheme):
     Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, schedules by holding time.
     """
 
+    best_reader = "selective"
+    closed_forms = MappingProxyType({"selective": "selective"})
     parameters = MappingProxyType({"threshold": 2})
     secret_streams = ("mask",)
     estimator_streams = ("mask",)

@@ -102,6 +102,8 @@ class InnovationEstimator(Receiver):
 class Innovation(Scheme):
     """The paper's scheme; needs no acknowledgements. `state_probability` is μ_d."""
 
+    best_reader = "bayesian"
+    sends_states_and_innovations = True
     parameters = MappingProxyType({"state_probability": 0.6})
     secret_streams = ("schedule", "noise")
     estimator_streams = ("schedule", "noise")

@@ -42,6 +42,7 @@ class Scheduled(Scheme):
     Source: Leong, Quevedo, Dolz, Dey (2019); docs/mathematics.md, schedules by holding time.
     """
 
+    closed_forms = MappingProxyType(dict.fromkeys(("legitimate", "naive", "reference", "selective"), "scheduled"))
     parameters = MappingProxyType({"threshold": 4})
     needs_acknowledgements = True
     may_be_silent = True

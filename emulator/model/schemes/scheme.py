@@ -117,6 +117,14 @@ class Scheme(ABC):
     """64-bit words of shared secret that a slot uses: so many, and so many more for each state."""
     initial_secret_words: ClassVar[tuple[int, int]] = (0, 0)
     """The same, of what a trial uses once."""
+    best_reader: ClassVar[str] = "naive"
+    """The strategy that, without the secret, reads its packets best. `evedrop compare` has attackers read with it."""
+    sends_states_and_innovations: ClassVar[bool] = False
+    """Whether every packet is a state or an innovation, so that no eavesdropper without the secret does better than the genie."""
+    decides_initial_state: ClassVar[bool] = False
+    """Whether the secret decides x_0 (`initial_state`), so that no filter at the sensor can."""
+    closed_forms: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Receiver (a strategy, or `legitimate`) → the closed form in `evedrop.expected.closed_forms` for slots that differ."""
 
     def __init__(self, process: Process, state_probability: float = 1.0) -> None:
         self.process = process
@@ -171,6 +179,14 @@ class Scheme(ABC):
 
         Acknowledgements, where they are needed, may be lost or blocked at will, but not forged.
         """
+
+    def error_floor(self, slots: int) -> tuple[Floats, bool] | None:
+        """A lower bound on tr E[e_k e_kᵀ] of every receiver without the secret, (slots,), and whether it grows without bound.
+
+        None: no bound is known, or the genie's is (`sends_states_and_innovations`).
+        """
+        del slots
+        return None
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes | None:
         """What a user of packets, with P(b=1 | ν), does with a slot; None: no such closed form."""

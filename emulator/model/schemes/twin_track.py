@@ -11,8 +11,11 @@ from evedrop.model import update
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch, BlockReader
+
+_SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
 
 
 class TwinTracks:
@@ -102,6 +105,8 @@ class TwinTrack(Scheme):
     Source: docs/mathematics.md, twin track.
     """
 
+    best_reader = "tracker"
+    decides_initial_state = True
     secret_streams = ("start", "track")
     estimator_streams = ("start", "track")
     secret_words = (1, 0)
@@ -120,6 +125,15 @@ class TwinTrack(Scheme):
     def initial_state(self, keys: Mapping[str, bytes], batch: Batch) -> Floats:
         """x_0, (n, R), by the stream `start`."""
         return TwinTracks(self.process, keys, batch).initial
+
+    def error_floor(self, slots: int) -> tuple[Floats, bool]:
+        """Half the error of who knows nothing of x_0, (slots,): it grows with the powers of A.
+
+        Source: docs/mathematics.md, twin track.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            soon, late = (np.abs(np.linalg.matrix_power(self.process.A, power)).max() for power in (_SOON, _LATE))
+        return twin_track_bound(self.process, slots), bool(not late <= _GROWN * soon)
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet, and x_0 without any."""
