@@ -124,7 +124,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return _importable(name, targets[0], said), said
 
     def _checked(self, name: str, found: Any, said: str) -> type[T]:
-        wanted = f"a class that inherits from {self.base.__module__}.{self.base.__name__}"
+        wanted = f"a class that inherits from evedrop.extend.{self.base.__name__}"
         if not isinstance(found, type) or not issubclass(found, self.base):
             raise NotRegistered(name, f"{said}, which is no {self.base.__name__}; expected {wanted}")
         lacking = sorted(getattr(found, "__abstractmethods__", ()))

@@ -8,6 +8,7 @@ Source: docs/compare.md.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,7 @@ from evedrop.scenario.words import listed, near
 ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}
 """Adversary → its attack on acknowledgements."""
 
+_NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
 _WAY_BACK = {"link": {"quality": 1.0}}
 
 Tables = dict[str, Any]
@@ -44,7 +46,7 @@ class Match:
     @property
     def receiver(self) -> str:
         """Its name in the scenario: that of its strategy, so that it meets the same losses whatever else it does."""
-        return str(self.strategy)
+        return receiver_name(str(self.strategy))
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,11 @@ class Matchups:
     groups: tuple[Group, ...]
     """By scheme; of each scheme the one without an attack first."""
     undefined: tuple[Match, ...]
+
+
+def receiver_name(strategy: str) -> str:
+    """The name of a receiver with this strategy in a scenario."""
+    return _NOT_IN_NAMES.sub("-", strategy.lower())[:_LONGEST_NAME]
 
 
 def adversaries_of() -> tuple[str, ...]:
@@ -125,6 +132,13 @@ def _chosen(
         if not wanted:
             found.append(f"no {what} is named; expected {listed(known)}")
         chosen.append(wanted)
+    receivers = {name: receiver_name(name) for name in chosen[1]}
+    for name, receiver in receivers.items():
+        other = next(one for one, its in receivers.items() if its == receiver)
+        if other != name:
+            found.append(
+                f"{name} and {other} would both be called {receiver} in a scenario; compare them one after the other"
+            )
     for key in parameters:
         scheme, _, name = key.rpartition(".")
         if scheme not in chosen[0] or name not in getattr(SCHEMES.get(scheme), "parameters", ()):
@@ -145,7 +159,7 @@ def _strange(what: str, names: Iterable[str], known: Sequence[str], registry: Re
             _ = registry[name]
         except NotRegistered as error:
             why = error.why or f"; expected {listed(known)}{near(name, known)}"
-            found.append(f"{name or 'nothing'} is no {what}{why}")
+            found.append(f"{name or 'nothing'} is not the name of a class for a {what}{why}")
     return found
 
 
@@ -183,7 +197,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
     tables |= {
         "title": f"{scenario.title} ({scheme}{under})",
         "encoding": encoding,
-        "eavesdroppers": {one.receiver: _eavesdropper(scenario, scheme, one.receiver) for one in matches},
+        "eavesdroppers": {one.receiver: _eavesdropper(scenario, scheme, str(one.strategy)) for one in matches},
         "event": [
             table
             for event, table in zip(scenario.event, tables["event"], strict=True)

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from evedrop import extend
 from evedrop.errors import ScenarioError
 from evedrop.loading import load
 from evedrop.loading.amended import with_event
@@ -167,13 +168,9 @@ def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: 
 
 HEAD = """
 import numpy as np
-from evedrop.model.schemes.plain import Plain, PlainEncoder
-from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme
-from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.eavesdroppers.eavesdropper import PacketReader
-from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.delays.constant import ConstantDelay
-from evedrop.model.schemes.plain import PlainEstimator
+from evedrop.extend import (
+    Bernoulli, ConstantDelay, Naive, NoInnovations, Packet, PacketReader, Plain, PlainEncoder, PlainEstimator, Scheme,
+)
 
 
 class Sends(Plain):
@@ -204,7 +201,7 @@ MISTAKES = {
             "reaches for the key of 'noise', and has asked for none"),
     "abstract": ("scheme", "Mine(Scheme):\n    def outcomes(self, mu): return None",
                  "which lacks shared; expected a class with this method"),
-    "other": ("scheme", "Mine(Naive):\n    pass", "which is no Scheme; expected a class that inherits from evedrop.model"),
+    "other": ("scheme", "Mine(Naive):\n    pass", "which is no Scheme; expected a class that inherits from evedrop.extend"),
     "absent": ("scheme", "Mein(Plain):\n    pass", "has no Mine; did you mean case_absent:Mein?"),
     "syntax": ("scheme", "Mine(Plain)\n    pass", "cannot be imported (SyntaxError: "),
     "fails": ("scheme", "Mine(Plain):\n    pass\n\nimport nowhere_at_all",
@@ -455,3 +452,42 @@ def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:
     paper = ("--set", 'encoding={scheme = "innovation", state_probability = 0.5}')
     done = tutorial("design", "three.toml", *paper, "--set", "eavesdroppers.tracker.link={quality = 0.9}", "--json")
     assert json.loads(done.out)["left_out"] == {"tracker": "tracker:Tracker"}
+
+
+def test_a_plug_in_needs_one_module(tutorial: Evedrop) -> None:
+    """The tutorial imports `evedrop.extend` and nothing else of Evedrop; every name there is documented and can be had."""
+    text = PAGE.read_text(encoding="utf-8")
+    assert set(re.findall(r"^(?:from|import) (evedrop[\w.]*)", text, flags=re.MULTILINE)) == {"evedrop.extend"}
+    assert set(re.findall(r"evedrop\.(?:model|kernels|streams|live|memory)[\w.]*", text)) == set()
+    assert all(
+        getattr(extend, name).__doc__
+        for name in extend.__all__
+        if name not in {"Floats", "Flags", "Codes", "OutcomesAt"}
+    )
+    assert tutorial("check", "three.toml").status == 0
+
+
+def test_classes_of_a_plug_in_are_compared(tutorial: Evedrop) -> None:
+    """A comparison takes a scheme and an eavesdropper of one's own among the built-in ones."""
+    words = (
+        "--schemes",
+        "flipped:Flipped,plain",
+        "--adversaries",
+        "naive,tracker:Tracker",
+        "--trials",
+        "20",
+        "--slots",
+        "60",
+        "--json",
+    )
+    done = tutorial("compare", "three.toml", *words, "--out", "found")
+    assert done.status == 0, done.err
+    found = json.loads(done.out)
+    assert [*found["schemes"]] == ["flipped:Flipped", "plain"]
+    for scheme in found["schemes"].values():
+        assert scheme["against"]["tracker:Tracker"]["eavesdropper"]["mean"] > 0.0
+        assert scheme["against"]["naive"]["eavesdropper"]["mean"] > 0.0
+    assert (tutorial.folder / "found" / "scenarios" / "flipped.Flipped.toml").is_file()
+    wrong = tutorial("compare", "three.toml", "--schemes", "flipped:Flop", "--out", "wrong")
+    assert wrong.status == 2
+    assert "has no Flop; expected one of Sender, Reader, Flipped" in wrong.err
