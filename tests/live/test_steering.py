@@ -340,6 +340,19 @@ def test_what_was_said_is_said_once_more() -> None:
     assert run.conductor.told() == go(20, until=29)
 
 
+def test_a_router_that_missed_a_go_hears_it_while_the_sensor_holds_again() -> None:
+    """A router that was started again still waits at the hold before, when the sensor has gone on to the next."""
+    run = Run()
+    run.asks("pause")
+    run.holds(12)
+    run.asks("resume")
+    run.steering.carry_on(12)
+    assert run.conductor.told() == go(12)
+    run.steering.held(40)
+    run.steering.remind()
+    assert run.conductor.told() == go(12)
+
+
 def test_a_hold_that_is_told_once_more_is_one_hold() -> None:
     """The sensor may say twice that it holds; when the run has gone on since, that is no news."""
     run = Run()

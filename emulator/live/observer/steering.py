@@ -54,6 +54,8 @@ class Steering:
         self._step: OperatorStep | None = None
         self._last = -1
         self._changed: set[str] = set()
+        self._gone: dict[str, Any] | None = None
+        """The last go, as the sensor was told it."""
         self.paused = False
         """Whether the run stays held until the operator says otherwise."""
         self.events: list[dict[str, Any]] = []
@@ -230,8 +232,9 @@ class Steering:
         self._go()
 
     def _go(self) -> None:
-        self._conductor.command(ROUTER, "go", k=self._last)
-        self._conductor.command(SENSOR, "go", **self._gone)
+        if self._gone is not None:
+            self._conductor.command(ROUTER, "go", k=self._gone["k"])
+            self._conductor.command(SENSOR, "go", **self._gone)
 
     @property
     def changes(self) -> dict[str, list[dict[str, Any]]]:
@@ -240,10 +243,12 @@ class Steering:
         return {name: [_plain(one) for one in timeline[name]] for name in sorted(self._changed)}
 
     def remind(self) -> None:
-        """Say once more what was said last: it may have been lost with a connection. A hold may take as long as ever."""
+        """Repeat the last go: it may have been lost with a connection. A hold may take as long as ever.
+
+        Also while the sensor holds again: the router may still wait at the hold before.
+        """
         self._since = time.monotonic()
-        if self.at is None and self._last >= 0:
-            self._go()
+        self._go()
         if self._asked:
             self._conductor.command(SENSOR, "hold")
 
