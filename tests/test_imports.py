@@ -102,7 +102,7 @@ def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
     found = loaded_by("pytest", "evedrop.pytest_plugin")
     more = found["evedrop.pytest_plugin"] - found["pytest"]
     assert packages(more) == set()
-    assert ours(more) == {"evedrop.pytest_plugin", "evedrop.discovery"}
+    assert ours(more) == {"evedrop.pytest_plugin", "evedrop.discovery", "evedrop.files"}
 
 
 @pytest.mark.parametrize("room", ["model", "live", "memory", "scenario", "score", "results", "expected", "peers"])

@@ -1,9 +1,7 @@
 import re
 from pathlib import Path
 
-import evedrop
-
-ROOT = Path(evedrop.__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def test_every_cited_section_exists() -> None:
