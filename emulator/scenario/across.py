@@ -1,4 +1,4 @@
-"""Mistakes in links and events that only show across tables: names, slots, what may follow what.
+"""Mistakes in links and events that only show when tables are compared: names, slots, and the order of events.
 
 Source: docs/scenario.md, links and events.
 """
@@ -25,7 +25,7 @@ _STATES = {"cut": "cut", "kill": "down", "pause": "paused"}
 
 
 def link_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable]) -> Iterator[str]:
-    """What is wrong with correlations, delays in seconds and windows; links: receiver → its link, as far as it is one."""
+    """Mistakes in correlations, delays in seconds and windows; links: receiver → its link, for each link that is valid."""
     receivers = [LEGITIMATE, *_table(tables.get("eavesdroppers"))]
     for name, link in links.items():
         path = f"{LEGITIMATE}.link" if name == LEGITIMATE else f"eavesdroppers.{name}.link"
@@ -51,7 +51,7 @@ def _correlation_mistakes(
 
 
 def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], sentences: Sentences) -> Iterator[str]:
-    """What is wrong with events that are right by themselves, each with its number."""
+    """Mistakes across tables in events that are valid by themselves, each with the number of its event."""
     events = _events(tables)
     receivers = [LEGITIMATE, *_table(tables.get("eavesdroppers"))]
     slots = tables.get("slots")
@@ -75,7 +75,7 @@ def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], se
 
 
 def _events(tables: Mapping[str, Any]) -> list[tuple[int, EventTable]]:
-    """The events that are right by themselves, each with its number."""
+    """The events that are valid by themselves, each with its number."""
     events: list[tuple[int, EventTable]] = []
     for i, found in enumerate(tables.get("event", []) if isinstance(tables.get("event"), list) else []):
         try:
@@ -86,7 +86,7 @@ def _events(tables: Mapping[str, Any]) -> list[tuple[int, EventTable]]:
 
 
 def away_in(tables: Mapping[str, Any], name: str, slot: int) -> str | None:
-    """That a receiver is down or paused in a slot, by which event; None if it is there."""
+    """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
     acts = [(i, act) for i, event in _events(tables) for act in acts_of(event) if name in act.names]
     away: tuple[int, Act] | None = None
     for i, act in sorted(acts, key=lambda one: one[1].at):
@@ -122,7 +122,7 @@ def _jam_mistakes(path: str, event: EventTable, tables: Mapping[str, Any]) -> It
 
 
 def _jams_in_turn(events: Sequence[tuple[int, EventTable]]) -> Iterator[str]:
-    """Jams that begin while another one lasts."""
+    """Jams that begin before the previous one has ended."""
     jams = sorted(((event.first, event.to, i) for i, event in events if event.kind == "jam"), key=lambda one: one[0])
     for (_, to, _), (first, _, i) in pairwise(jams):
         if to is None or to > first:
@@ -130,7 +130,7 @@ def _jams_in_turn(events: Sequence[tuple[int, EventTable]]) -> Iterator[str]:
 
 
 def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
-    """Acknowledgements that the scheme needs and has not, or has and does not need; jammers that are nobody; silences."""
+    """Missing or needless acknowledgements, an unknown jammer, and link rates with a scheme that may be silent."""
     scheme = SCHEMES.get(str(_table(tables.get("encoding")).get("scheme")))
     name, found = _table(tables.get("encoding")).get("scheme"), tables.get("acknowledgements")
     if scheme is not None and scheme.needs_acknowledgements and found is None:
@@ -177,7 +177,7 @@ def _set_mistakes(
 def _pooled_mistakes(
     path: str, name: str, event: EventTable, tables: Mapping[str, Any], sentences: Sentences
 ) -> Iterator[str]:
-    """Of an event that changes links which are pooled: they become one, of a quality or a loss model of its own."""
+    """Mistakes in an event that changes pooled links: they become one link, with a quality or a loss model of its own."""
     if not {"quality", "loss"} & set(event.set or {}):
         yield f"{path}.set: {name} has several links; expected a quality or a loss, of the one link in place of them"
         return
@@ -185,7 +185,7 @@ def _pooled_mistakes(
 
 
 def _order_mistakes(events: Sequence[tuple[int, EventTable]], receivers: Sequence[str]) -> Iterator[str]:
-    """What ends that has not begun, and what begins while it, or another outage, goes on."""
+    """Events that end something that has not begun, or begin something during it or during another outage."""
     acts: list[tuple[int, Act]] = [(i, act) for i, event in events for act in acts_of(event)]
     acts.sort(key=lambda one: one[1].at)
     for name in receivers:

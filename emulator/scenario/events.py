@@ -1,4 +1,4 @@
-"""`[[event]]`: what happens while a run goes on, and in which slot.
+"""`[[event]]`: what happens during a run, and in which slot.
 
 Source: docs/scenario.md, events.
 """
@@ -14,16 +14,16 @@ from evedrop.scenario.table import Found, Table
 from evedrop.scenario.words import listed
 
 LASTING = ("set", "cut", "partition", "kill", "pause", "jam")
-"""What can last `from` a slot `to` another."""
+"""The kinds that can last `from` one slot `to` another."""
 KINDS = (*LASTING, "heal", "restart", "resume", "note")
-"""What can happen; an event is one of them."""
+"""All kinds; an event has exactly one of them."""
 
 Names = str | list[str]
 Slot = Annotated[int, Field(strict=True, ge=0, le=100_000_000, examples=[400])]
 
 
 class EventTable(Table):
-    """`[[event]]`: one thing that happens `at` a slot, or lasts `from` a slot `to` another."""
+    """`[[event]]`: one thing that happens `at` a slot, or lasts `from` one slot `to` another."""
 
     at: Slot | None = None
     start: Annotated[Slot | None, Field(alias="from")] = None
@@ -43,12 +43,12 @@ class EventTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """One thing that happens, and one way to say when."""
+        """Mistakes unless exactly one thing happens, at a time that is stated in one way."""
         return [*_what_mistakes(table), *_when_mistakes(table)]
 
     @property
     def kind(self) -> str:
-        """Which of `KINDS`."""
+        """The event's kind, one of `KINDS`."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
@@ -61,7 +61,7 @@ class EventTable(Table):
 
     @property
     def first(self) -> int:
-        """The slot it begins in."""
+        """The slot in which it begins."""
         slot = self.at if self.at is not None else self.start
         assert slot is not None  # noqa: S101 - checked when it was made
         return slot

@@ -1,4 +1,4 @@
-"""A sensor that measures and filters: what it makes of the network's process noise, and what is wrong with it.
+"""A sensor that measures and filters: the process noise that its filter gives the network, and mistakes in its entries.
 
 Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor.
 """
@@ -23,12 +23,12 @@ _INVERTS_NOISE = ("bayesian", "genie", "likelihood", "tracker")
 
 
 def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
-    """Put the covariance of the filter's innovations into the place of `Q = "filter"`; the mistakes, with their paths."""
+    """Replace `Q = "filter"` by the covariance of the filter's innovations. Returns the mistakes, with their paths."""
     process = tables.get("process")
     if not isinstance(process, dict) or process.get("Q") != FILTER:
         return []
     n = len(process["A"]) if isinstance(process.get("A"), list) else 1
-    process["Q"] = np.eye(max(1, n) if n <= MOST_STATES else 1).tolist()  # until it is known, or in its place
+    process["Q"] = np.eye(max(1, n) if n <= MOST_STATES else 1).tolist()  # a placeholder until Q is known
     plant = tables.get("plant")
     if not isinstance(plant, Mapping) or plant.get("output_matrix") is None:
         return [
@@ -39,7 +39,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
         step = settled_of(process, plant)
     except ValidationError:
         return []
-    except ValueError:  # the plant's own mistake
+    except ValueError:  # a mistake in the plant, reported elsewhere
         return []
     process["Q"] = step.innovation.tolist()
     process["singular_noise"] = is_singular(step.innovation)
@@ -47,7 +47,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
 
 
 def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterStep:
-    """The filter of tables in the end. Raises ValidationError or ValueError where they have none."""
+    """The steady state of the tables' filter. Raises ValidationError or ValueError if it does not exist."""
     made = ProcessTable.model_validate({**process, "Q": np.eye(len(process["A"])).tolist(), "singular_noise": False})
     table = PlantTable.model_validate(without_disturbances(plant))
     A, n = np.array(made.A), len(made.A)
@@ -58,7 +58,7 @@ def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterSt
 
 
 def without_disturbances(plant: Mapping[str, Any]) -> dict[str, Any]:
-    """A plant without its disturbances, which may be a day of numbers."""
+    """A plant without its disturbances, which may be numbers for a whole day."""
     return {name: value for name, value in plant.items() if not name.startswith("disturbance")}
 
 
@@ -68,7 +68,7 @@ def is_singular(Q: Floats) -> bool:
 
 
 def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
-    """What is wrong with what the sensor measures of n states."""
+    """Mistakes in the sensor's measurement of n states."""
     C, V = plant.get("output_matrix"), plant.get("measurement_noise")
     found = []
     if C is None or not numbers(C):
@@ -100,7 +100,7 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
 
 
 def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with the sensor's filter beside process, scheme and eavesdroppers."""
+    """Mistakes in the sensor's filter together with process, scheme and eavesdroppers."""
     process, plant = tables.get("process"), tables.get("plant")
     if not isinstance(process, Mapping):
         return

@@ -1,4 +1,4 @@
-"""`[household]`: which of a plant's quantities are a house's grid, load, sun and battery, and what makes it active.
+"""`[household]`: which of a plant's quantities are a house's grid, load, sun and battery, and when the house is active.
 
 Source: docs/scenario.md, household.
 """
@@ -14,9 +14,9 @@ from evedrop.scenario.table import Table
 from evedrop.scenario.words import as_toml, listed
 
 FIGURES = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
-"""Of the house."""
+"""The figures of the house."""
 RECEIVER_FIGURES = ("activity_area", "detection_rate")
-"""Of what a receiver can tell of it."""
+"""The figures of what a receiver can infer about the house."""
 HOUSEHOLD = "household"
 
 Name = Annotated[str, Field(strict=True, min_length=1)]
@@ -34,7 +34,7 @@ class HouseholdTable(Table):
     false_alarms: Annotated[float, Field(strict=True, gt=0.0, lt=1.0, examples=[0.05])] = 0.05
 
     def window(self, period_seconds: float) -> int:
-        """Decisions of a window, at least 1, of so many seconds each."""
+        """The number of decisions in a window, at least 1; a decision lasts period_seconds."""
         return max(1, round(self.window_seconds / period_seconds))
 
 
