@@ -1,4 +1,4 @@
-"""What can be said of a run before it starts: is the estimator bounded, and how much will be written."""
+"""Statements about a run before it starts: whether the estimator is bounded, and how much will be written."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.filter_noise import is_singular
 
 _LARGE_BYTES = 1e9
-_SHOWN_STATES = 3  # of a matrix that is written out
-_NEAR = 0.01  # of a covariance's largest entry
+_SHOWN_STATES = 3  # the largest matrix that is written out
+_NEAR = 0.01  # relative to a covariance's largest entry
 
 
 def warnings_of(scenario: Scenario) -> list[str]:
-    """What the user should know before the run; it goes on all the same.
+    """Warnings that the user should read before the run; the run starts regardless.
 
     Source: docs/mathematics.md, secrecy and design (stability bound).
     """
@@ -56,7 +56,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
 
 
 def _filter_warnings(scenario: Scenario) -> list[str]:
-    """What a sensor that filters does to Q, and what a singular Q does to the secret.
+    """Warnings about a Q that does not match the sensor's filter, and about a singular Q, which reveals packet types.
 
     Source: docs/mathematics.md, a filter at the sensor.
     """
@@ -80,7 +80,7 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
 
 
 def written_bytes(scenario: Scenario) -> float:
-    """Bytes the results folder will have, about, before compression."""
+    """The approximate size of the results folder in bytes, before compression."""
     n, receivers = len(scenario.process.A), len(scenario.receivers)
     recorded_row = 8 * (2 * n + n * n) + 40
     journal_row = scenario.trials / 8 + 60

@@ -17,9 +17,7 @@ from evedrop.model.process import Floats
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 
 CONFIDENCE = 0.99
-_ROUNDING = (
-    1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
-)
+_ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
 
 
 class Verdict(StrEnum):

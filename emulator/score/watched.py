@@ -45,7 +45,7 @@ def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots
 
 
 def _since(scenario: Scenario, expect: ExpectTable) -> int:
-    """The slot from which a receiver must come into step: as given, or the last slot before `by` in which an event ends for it."""
+    """The slot from which a receiver must come into step: as given, or that of the last event on it up to slot `by`."""
     if expect.since is not None:
         return expect.since
     by = scenario.slots if expect.by is None else expect.by
