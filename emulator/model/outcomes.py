@@ -1,4 +1,4 @@
-"""What a receiver does with a slot, by scheme and strategy, as far as the outcomes of one slot tell it.
+"""The outcomes of a slot at a receiver, by scheme and strategy, where one slot alone determines them.
 
 Source: docs/mathematics.md, eavesdroppers; docs/schemes.md.
 """
@@ -16,7 +16,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 GENIE_SCHEMES = ("innovation", "plain")
-"""Schemes whose packets are states and innovations, so that nobody without the secret outdoes the genie."""
+"""Schemes whose packets are states and innovations, so that no receiver without the secret outperforms the genie."""
 
 
 _CLOSED = {
@@ -27,23 +27,23 @@ _CLOSED = {
 
 
 def closed_form(scheme: str, receiver: str) -> str | None:
-    """Which of `closed_forms` is a receiver's, whose slots are not alike; receiver: a strategy, or `legitimate`."""
+    """The name in `closed_forms` for a receiver whose slots differ; receiver: a strategy, or `legitimate`."""
     return _CLOSED.get((scheme, receiver))
 
 
 def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
-    """From the quality of its link to what the legitimate estimator does with a slot; None: no such closed form."""
+    """Maps its link's quality to the outcomes of the legitimate estimator; None if there is no such closed form."""
 
     def at(quality: float) -> Outcomes:
         found = scheme.outcomes(quality)
-        assert found is not None  # noqa: S101 - asked below
+        assert found is not None  # noqa: S101 - checked below
         return found
 
     return None if scheme.outcomes(0.5) is None else at
 
 
 def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> OutcomesAt | None:
-    """The same of an eavesdropper's strategy with its parameters."""
+    """The same for an eavesdropper's strategy with its parameters."""
     kind = STRATEGIES[strategy]
     if kind.outcomes(parameters, scheme.state_probability) is None:
         return None
@@ -56,7 +56,7 @@ def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str
 
     def at(quality: float) -> Outcomes:
         found = scheme.eavesdropper_outcomes(quality, *uses)
-        assert found is not None  # noqa: S101 - asked below
+        assert found is not None  # noqa: S101 - checked below
         return found
 
     return None if scheme.eavesdropper_outcomes(0.5, *uses) is None else at

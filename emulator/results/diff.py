@@ -52,7 +52,7 @@ def difference(a: Results, b: Results) -> RunDifference:
 
 
 def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:
-    """(Receiver, first slot of a block) → the slot after the block: a multiple of 256, the next block's first, or the run's end."""
+    """(Receiver, first slot of a block) → the slot after the block: a multiple of 256, the next block, or the run's end."""
     starts: dict[str, set[int]] = {}
     for peer, _, block in blocks:
         starts.setdefault(peer, set()).add(block)

@@ -131,9 +131,9 @@ class ResultsWriter:
         self, at: str, figures: Callable[[], Mapping[str, Any]], before: Callable[[], None] = lambda: None
     ) -> None:
         """Write rows to disk if some seconds have passed since the last round, or if many are held back.
-at: how far the run came, in words; figures: returns the summary so far, called more rarely if it takes long;
+
+        at: how far the run came, in words; figures: returns the summary so far, called more rarely if it takes long;
         before: called before figures. Raises OSError if the disk is full or the folder is gone.
-        before figures. Raises OSError if the disk is full or the folder is gone.
         """
         self._at = at
         began = time.monotonic()

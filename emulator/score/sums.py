@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import final
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Delays as they were recorded on a real link, in their order."""
+"""Delays recorded on a real link, in their order."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from evedrop.model.delays.delay import LONGEST, DelayModel
 from evedrop.model.process import Floats
 
 MOST_DELAYS = 900_000
-"""Of all links of a scenario together: its results hold them in their copy of the scenario."""
+"""The most recorded delays of all links of a scenario together: the results contain them in their copy of the scenario."""
 
 
 class RecordedDelay(DelayModel):
-    """The packet of slot k takes `values[k]`, repeated without end; the same in every trial.
+    """The packet of slot k takes `values[k]`, repeated without end, and the same in every trial.
 
-    A scenario names a `file`, whose numbers are put in the place of `values` when it is loaded.
+    A scenario names a `file`; loading it replaces the name by its numbers, as `values`.
     """
 
     parameters = MappingProxyType({"values": [0.5, 2.0, 1.25]})
@@ -40,10 +40,10 @@ class RecordedDelay(DelayModel):
         return []
 
     def delays(self, first: int, numbers: Floats) -> Floats:
-        """By the slot alone."""
+        """The delays of these slots, the same in every trial."""
         places = np.arange(first, first + len(numbers)) % len(self._values)
         return np.repeat(self._values[places][:, None], numbers.shape[1], axis=1)
 
     def arrived(self, lag: int) -> float | None:  # noqa: ARG002 - slots differ
-        """Not alike for all slots."""
+        """None, because slots differ."""
         return None
