@@ -1,4 +1,4 @@
-"""The recording of a run that was made without a view, or in memory, from the tables of its results."""
+"""Makes the recording of a run without a view, or of a run in memory, from the tables of its results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evedrop.score.scorekeeper import event_line
 from evedrop.view.scene import PeerSlots, SceneSlots
 from evedrop.view.scored_slots import open_recording, showing_of
 
-_CHUNK = 1000  # slots handed over at once
+_CHUNK = 1000  # slots recorded at once
 _CODES = {
     "dropped": Action.LOST,
     "state": Action.STATE,
@@ -29,7 +29,7 @@ _CODES = {
 
 
 def replay(folder: Path, path: Path | None = None) -> Path:
-    """Write the recording of a results folder to a path, by default its recording.rrd; the path.
+    """Write the recording of a results folder to a path, by default its recording.rrd; returns the path.
 
     Raises UsageError if the folder's tables cannot be read, or hold no recorded trial.
     """
@@ -81,7 +81,7 @@ def _first_trial(results: Results, name: str) -> pa.Table:
 
 
 def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
-    """True states, ν and whether there was a packet."""
+    """True states, ν, and whether there was a packet."""
     rows = _first_trial(results, name)
     words = rows["sent"].cast(pa.string()).to_pylist()
     nu = np.array([word == "innovation" for word in words], np.bool_)

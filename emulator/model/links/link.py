@@ -129,6 +129,6 @@ class LossModel(ABC):
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """`Fate` of each packet of the next slots, (slots, R), from uniforms (slots, uniforms_per_slot, R).
 
-        first: the first of the slots, which follow those of the previous call. A model replaces its memory and never changes it in
-        place, so that a shallow copy of the model can continue from the same point.
+        first: the first of the slots, which follow those of the previous call. A model replaces its memory and never changes it
+        in place, so that a shallow copy of the model can continue from the same point.
         """

@@ -75,7 +75,7 @@ class Leak:
 
 @final
 class RemainingCovariances:
-    """M_k for k = 1, 2, … in this order, for the theory: fast and accurate to the rounding of Q, but not the same bits everywhere.
+    """M_k for k = 1, 2, … in this order, for the theory: fast, and accurate to the rounding of Q, but bits depend on the machine.
 
     From M_k = A (Σ_{k−1}⁻¹ + AᵀQ⁻¹A)⁻¹ Aᵀ and Σ_k⁻¹ = Q⁻¹ − Q⁻¹M_kQ⁻¹, which work even where Σ_k cannot be inverted.
     """
