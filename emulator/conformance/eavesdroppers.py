@@ -144,7 +144,7 @@ class EavesdropperChecks:
         both = list(zip(*(self._listening.steps(problem) for _ in range(2)), strict=True))
         for which in (0, 1):
             rows = [row_of(pair[which][1][2]) for pair in both]
-            said = "{0!r} by itself and {1!r} beside another one of its kind"
+            said = "{0!r} by itself and {1!r} with another one of its kind"
             expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
 
     def alone(self, problem: Problem) -> None:

@@ -62,12 +62,12 @@ def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterato
     for entry in parameters:
         if entry not in known:
             said = f"expected {', '.join(dict.fromkeys(known))}" if known else "they have no parameters; remove it"
-            raise UsageError(f"--set {entry}: is no parameter of {', '.join(names.values())}; {said}")
+            raise UsageError(f"--set {entry}: is not a parameter of {', '.join(names.values())}; {said}")
     for option, one in classes.items():
         title = f"{one.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
         if option == "eavesdropper":
             beside = classes.get("scheme") or _beside(one)
-            yield Examined(f"{title}, beside the scheme {beside.name}", _listened(one, beside))
+            yield Examined(f"{title}, with the scheme {beside.name}", _listened(one, beside))
         else:
             yield Examined(title, _verdicts(option, one))
 
@@ -80,7 +80,7 @@ def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
         if "reads_as" in given:
             given = {**_given(READERS.imported(str(given["reads_as"])), parameters), **given}
     except NotRegistered as error:
-        why = error.why or f" is none; expected MODULE:CLASS, or {', '.join(registry.names)}"
+        why = error.why or f" is unknown; expected MODULE:CLASS, or {', '.join(registry.names)}"
         raise UsageError(f"--{option} {error.name}{why}") from error
     wrong = [f"{entry}: {what}" for entry, what in asked(kind, given)]
     if wrong:

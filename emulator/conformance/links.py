@@ -117,7 +117,7 @@ class LossChecks:
         for k in range(problem.slots):
             for model, found in zip(pair, each, strict=True):
                 found.append(self._fates(model, k, uniforms[k : k + 1]))
-        said = "{0!r} by itself and {1!r} beside another one of its kind, slot by slot"
+        said = "{0!r} by itself and {1!r} with another one of its kind, slot by slot"
         for found in each:
             self._same(once, np.concatenate(found), problem, said, "keep no state outside of the model")
 

@@ -158,4 +158,4 @@ def expect_belief(where: str, belief: Any, problem: Problem) -> None:
     expect_finite(f"{where}.P", belief.P, problem.batch.first_trial)
     for i, array in enumerate(belief.memory):
         if not isinstance(array, np.ndarray) or array.shape[-1:] != (trials,):
-            raise Broken(f"{where}.memory[{i}] is no array whose last axis is the {trials} trials")
+            raise Broken(f"{where}.memory[{i}] is not an array whose last axis is the {trials} trials")

@@ -71,7 +71,7 @@ class SchemeChecks:
         scheme = made(self._scheme_of, problem, self._kind)
         more = sorted(set(scheme.estimator_streams) - set(scheme.secret_streams))
         if more:
-            raise Broken(f"estimator_streams has {more}, which secret_streams has not; expected some of those")
+            raise Broken(f"estimator_streams has {more}, which secret_streams lacks; expected some of those")
         expect_probability("state_probability", scheme.state_probability)
         for apart in (False, True):
             for _ in played(self._scheme_of, problem, self._kind, apart=apart):
@@ -95,7 +95,7 @@ class SchemeChecks:
         both = list(zip(*pair, strict=True))
         for which in (0, 1):
             rows = [slots[which].row for slots in both]
-            said = "{0!r} by itself and {1!r} beside another one of its kind"
+            said = "{0!r} by itself and {1!r} with another one of its kind"
             expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
 
     def alone(self, problem: Problem) -> None:
@@ -156,8 +156,8 @@ class SchemeChecks:
             error = float(gain.std()) / float(np.sqrt(len(gain)))
             if gain.mean() < -SIGMAS * error - 1e-12:
                 raise Broken(
-                    f"slot {slot.k}: the mean squared error is {own.mean():.4g}, and {own.mean() + gain.mean():.4g} for who "
-                    "hears nothing; decode what encode() has made, with the same slot's numbers"
+                    f"slot {slot.k}: the mean squared error is {own.mean():.4g}, and {own.mean() + gain.mean():.4g} for a "
+                    "receiver that hears nothing; decode what encode() has made, with the same slot's numbers"
                 )
 
     def theory(self, problem: Problem) -> None:

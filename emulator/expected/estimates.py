@@ -51,7 +51,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
         )
     for module, source in sources_of(scenario.model_dump(mode="json")).items():
         if scenario.made_with.get(module, source) != source:
-            found.append(f"the {module} is not the one these results were made with; its digests may be others")
+            found.append(f"the {module} is not the one these results were made with; its digests may differ")
     return found
 
 
@@ -74,7 +74,7 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
     if process.singular_noise and is_singular(process.Q):
         found.append(
             "process.Q is singular: two states one after the other differ, but for A and what inputs and disturbances do, "
-            "within its range alone, and that gives the type of packets away to whoever looks"
+            "within its range alone, which reveals the type of packets to anybody who looks"
         )
     return found
 

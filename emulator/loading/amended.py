@@ -28,7 +28,7 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
     strange = [name for name in event if name not in (*ADDED, "link")]
     if strange:
         known = listed(["link with set", *ADDED[1:]])
-        raise ScenarioError("event", [f"{name}: is nothing that can be done now; expected {known}" for name in strange])
+        raise ScenarioError("event", [f"{name}: cannot be done now; expected {known}" for name in strange])
     if scenario.modules is None and any(named_in(event)):
         name = next(iter(named_in(event)))
         raise ScenarioError(

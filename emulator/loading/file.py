@@ -55,7 +55,7 @@ def write_new(path: Path) -> None:
                 Path(str(resources.files("evedrop.scenarios"))).joinpath("_new.toml").read_text(encoding="utf-8")
             )
     except FileExistsError as error:
-        raise UsageError(f"{path} is there already; give another name") from error
+        raise UsageError(f"{path} exists already; give another name") from error
     except OSError as error:
         raise UsageError(f"{path} cannot be written ({error.strerror}); give another place") from error
 
@@ -203,7 +203,7 @@ def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
     if isinstance(inner, list):
-        return UsageError(f"--set {dotted}: {name} is no entry of a list of {len(inner)}; give 0 to {len(inner)}")
+        return UsageError(f"--set {dotted}: {name} is not an entry of a list of {len(inner)}; give 0 to {len(inner)}")
     if isinstance(inner, dict):
         return UsageError(f"--set {dotted}: it has an empty part; give a dotted key such as legitimate.link.quality")
     return UsageError(f"--set {dotted}: {name} is not in a table or list; give the dotted key of a scenario entry")

@@ -97,7 +97,7 @@ def _sentence(detail: ErrorDetails, root: type[BaseModel]) -> str:
         things = "characters" if kind == "string_too_long" else "entries"
         few = kind == "too_short"
         limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
-        return f"has {limit} {things}; expected {'at least' if few else 'at most'} so many"
+        return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(found)}; expected {expected}{example}"
 
@@ -165,7 +165,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         try:
             _ = scenario.timeline
         except ValidationError as error:
-            found += [f"event: several of them together leave a link that is none: {line}" for line in sentences(error)]
+            found += [f"event: several of them together result in an invalid link: {line}" for line in sentences(error)]
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     sound = scenario if not found else None

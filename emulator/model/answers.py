@@ -65,7 +65,7 @@ class Answers:
         if "not_registered" in answer:
             raise NotRegistered(name, str(answer["not_registered"]))
         if "is" not in answer:
-            raise NoAnswer(str(answer.get("raised", "its answer was no answer")))
+            raise NoAnswer(str(answer.get("raised", "its answer was invalid")))
         return answer["is"]
 
     def of(self, names: Iterable[str]) -> dict[str, Any]:
@@ -139,7 +139,7 @@ class _Child:
             self._first = ""
             found = json.loads(_line(process.stdout.fileno(), deadline))
             if not isinstance(found, dict):
-                raise NoAnswer("its answer was no answer")
+                raise NoAnswer("its answer was invalid")
         except BaseException as error:
             self.end()
             status = process.returncode

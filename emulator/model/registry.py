@@ -120,14 +120,14 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             raise NotRegistered(name)
         if len(targets) > 1:
             both = " and ".join(targets)
-            raise NotRegistered(name, f", which two installed packages call so; expected one of {both} itself")
+            raise NotRegistered(name, f", a name that two installed packages use; expected one of {both} itself")
         said = f", which an installed package says is {targets[0]}"
         return _importable(name, targets[0], said), said
 
     def _checked(self, name: str, found: Any, said: str) -> type[T]:
         wanted = f"a class that inherits from {self.base.__module__}.{self.base.__name__}"
         if not isinstance(found, type) or not issubclass(found, self.base):
-            raise NotRegistered(name, f"{said}, which is no {self.base.__name__}; expected {wanted}")
+            raise NotRegistered(name, f"{said}, which is not a {self.base.__name__}; expected {wanted}")
         lacking = sorted(getattr(found, "__abstractmethods__", ()))
         if lacking:
             raise NotRegistered(
@@ -139,7 +139,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         if not isinstance(parameters, Mapping) or not all(isinstance(one, str) for one in parameters):
             raise NotRegistered(
                 name,
-                f"{said}, whose parameters are no table; expected the entries it takes, each with an example, "
+                f"{said}, whose parameters are not a table; expected the entries it takes, each with an example, "
                 'such as parameters = {"threshold": 3}',
             )
         return self._with_free_parameters(name, found, said)
@@ -171,7 +171,7 @@ def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
     except (Exception, SystemExit) as error:
         missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(str(error.name))
         wanted = (
-            "a module beside the scenario (or in its `modules`), or an installed one"
+            "a module in the scenario's folder (or in its `modules`), or an installed one"
             if missing
             else "one that can be imported"
         )

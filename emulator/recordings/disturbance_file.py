@@ -235,7 +235,7 @@ def _few(mistakes: Iterator[str], where: str) -> Iterator[str]:
     """The first of the mistakes, and a note if there are more."""
     for i, mistake in enumerate(mistakes):
         if i == _MOST_SAID:
-            yield f"and more of the kind, in {where}"
+            yield f"and more such mistakes, in {where}"
             return
         yield mistake
 

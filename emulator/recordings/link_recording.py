@@ -55,7 +55,7 @@ class LinkRecording:
             found.append(value == "1")
             if len(found) > MOST_OUTCOMES:
                 self._no(
-                    "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most so many, such as a part of it"
+                    "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most that many, such as a part of it"
                 )
         if not found:
             self._no("file", f"is empty; {_EXPECTED}")
@@ -153,7 +153,7 @@ class LinkRecording:
                 there = (
                     f"there are {_some(names)}" if names and not all(map(_is_number, names)) else "there are no names"
                 )
-                self._no("column", f"{_shown(column)} is no column of {self._path.name}; {there}")
+                self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
             return names.index(column)
         if len(names) != 1:
             if not any(names):

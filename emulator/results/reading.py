@@ -53,7 +53,7 @@ class Results:
         if not table.schema.equals(wanted):
             other = [field.name for field in wanted if field not in table.schema] or table.schema.names
             raise UsageError(
-                f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
+                f"{path} is not a table of this version (it differs in {', '.join(other)}); run the scenario again"
             )
         empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
         if empty:
@@ -122,16 +122,16 @@ def _read_summary(path: Path) -> dict[str, Any]:
         summary = json.loads(text_of(path, _MOST_BYTES))
     except Unreadable as error:
         raise UsageError(
-            f"{path.parent} is no results folder ({path.name}: {error}); give the --out of a run"
+            f"{path.parent} is not a results folder ({path.name}: {error}); give the --out of a run"
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
     parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
     if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
-        raise UsageError(f"{path} is no summary of a run; run the scenario again")
+        raise UsageError(f"{path} is not a run summary; run the scenario again")
     events = summary.get("events", [])
     if not isinstance(events, list) or not all(map(_is_event, events)):
-        raise UsageError(f"{path} has events that are none; run the scenario again")
+        raise UsageError(f"{path} has invalid events; run the scenario again")
     return summary
 
 

@@ -54,6 +54,6 @@ def unwritten(error: OSError) -> str:
             f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
         )
     return (
-        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; what was "
-        "measured before can be looked at"
+        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; the results "
+        "so far can be read"
     )

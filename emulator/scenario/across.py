@@ -60,7 +60,7 @@ def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], se
             yield from _when_mistakes(f"event.{i}", event, slots)
         for name in event.names:
             if name not in receivers:
-                hint = ": it is none of the receivers" if name in ("sensor", "router", "observer") else ""
+                hint = ": it is not a receiver" if name in ("sensor", "router", "observer") else ""
                 yield f"event.{i}.{_entry(event)}: names {as_toml(name)}{hint}; expected {listed(receivers)}"
         if event.kind == "jam":
             yield from _jam_mistakes(f"event.{i}", event, tables)
@@ -118,7 +118,7 @@ def _jam_mistakes(path: str, event: EventTable, tables: Mapping[str, Any]) -> It
     elif isinstance(scheme, str) and scheme in SCHEMES and not SCHEMES[scheme].needs_acknowledgements:
         yield f"{path}.jam: the scheme {scheme} has no acknowledgements that could be jammed; remove the event"
     elif _table(tables.get("acknowledgements")).get("attack", "none") == "none":
-        yield f'{path}.jam: no attack is described; expected acknowledgements.attack = "all", or another, beside it'
+        yield f'{path}.jam: no attack is described; expected acknowledgements.attack = "all", or another, as well'
 
 
 def _jams_in_turn(events: Sequence[tuple[int, EventTable]]) -> Iterator[str]:
@@ -139,7 +139,7 @@ def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
             "[acknowledgements] with link = { quality = 0.9 }"
         )
     if scheme is not None and not scheme.needs_acknowledgements and found is not None:
-        yield f"acknowledgements: is there, but the scheme {name} needs none; remove the table"
+        yield f"acknowledgements: is given, but the scheme {name} needs none; remove the table"
     jammer, eavesdroppers = _table(found).get("jammer"), list(_table(tables.get("eavesdroppers")))
     if isinstance(jammer, str) and jammer not in eavesdroppers:
         yield f"acknowledgements.jammer: is {as_toml(jammer)}; expected an eavesdropper" + (
@@ -151,7 +151,7 @@ def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
             entries = _table(tables.get(LEGITIMATE) if receiver == LEGITIMATE else tables["eavesdroppers"][receiver])
             if _table(entries.get("link")).get("rate") is not None:
                 yield (
-                    f"{path}.link.rate: is there, but the scheme {name} may stay silent, and a queue counts on a packet "
+                    f"{path}.link.rate: is given, but the scheme {name} may stay silent, and a queue counts on a packet "
                     "in every slot; remove the line"
                 )
 
@@ -162,7 +162,7 @@ def _set_mistakes(
     known = [name for name in LinkTable.model_fields if name != "correlation"]
     for name in event.set or {}:
         if name not in known:
-            yield f"{path}.set.{name}: is nothing that can be changed of a link; expected {listed(known)}"
+            yield f"{path}.set.{name}: is not a link setting that can be changed; expected {listed(known)}"
     try:
         changed = changed_link(link, {name: value for name, value in (event.set or {}).items() if name in known})
     except ValidationError as error:
@@ -171,7 +171,7 @@ def _set_mistakes(
     if changed.in_seconds and not tables.get("slot_seconds"):
         yield f"{path}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
     if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
-        yield f"{path}.set.loss.model: is another than at first, but the link's losses are tied to another link's"
+        yield f"{path}.set.loss.model: differs from the first one, but the link's losses are tied to another link's"
 
 
 def _pooled_mistakes(

@@ -32,7 +32,7 @@ def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
         return []
     if "disturbance_values" in plant:
         del plant["disturbance_file"]
-        return ["plant.disturbance_file: is there beside disturbance_values; expected one of them"]
+        return ["plant.disturbance_file: is given together with disturbance_values; expected one of them"]
     names = plant.get("disturbances")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         names = []

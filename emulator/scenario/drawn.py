@@ -75,7 +75,7 @@ def _mistakes(table: NemesisTable, scenario: Scenario, sentences: Sentences) -> 
                     f"{NEMESIS}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
                 )
             if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
-                lines.append(f"{NEMESIS}.set.loss.model: is another than that of {name}'s link, whose losses are tied")
+                lines.append(f"{NEMESIS}.set.loss.model: differs from that of {name}'s link, whose losses are tied")
         yield from (line for line in lines if line not in said)
         said.update(lines)
 

@@ -71,14 +71,14 @@ def _what_mistakes(table: Mapping[str, Any]) -> list[Found]:
     kinds = [kind for kind in KINDS if table.get(kind) is not None]
     found: list[Found] = []
     if len(kinds) != 1:
-        said = f"has {listed(kinds)} at once" if kinds else "says not what happens"
+        said = f"has {listed(kinds)} at once" if kinds else "does not say what happens"
         found.append(("event", f'{said}; expected one of {listed(KINDS)}, such as cut = "legitimate"'))
     if kinds == ["set"] and table.get("link") is None:
         found.append(("link", 'is missing; expected the link that is changed, such as link = "legitimate"'))
     if "set" not in kinds and table.get("link") is not None:
-        found.append(("link", "is there without set; expected what changes, such as set = { quality = 0.2 }"))
+        found.append(("link", "is given without set; expected what changes, such as set = { quality = 0.2 }"))
     if table.get("state") is not None and not {"kill", "restart"} & set(kinds):
-        found.append(("state", "is there without a restart; remove the line"))
+        found.append(("state", "is given without a restart; remove the line"))
     if table.get("set") == {}:
         found.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
     return found
@@ -90,11 +90,11 @@ def _when_mistakes(table: Mapping[str, Any]) -> list[Found]:
     if (at is None) == (start is None):
         return [("at", "and from are both there" if at is not None else "is missing; expected at = 400")]
     if start is None and to is not None:
-        return [("to", "is there without from; expected from and to, or at alone")]
+        return [("to", "is given without from; expected from and to, or at alone")]
     if start is not None and to is None:
-        return [("to", "is missing beside from; expected the slot in which it ends")]
+        return [("to", "is missing, but from is given; expected the slot in which it ends")]
     if type(start) is int and type(to) is int and to <= start:
         return [("to", f"is {to}, not after from, which is {start}; expected a later slot")]
     if start is not None and len(kinds) == 1 and kinds[0] not in LASTING:
-        return [("from", f"is there, but {kinds[0]} happens in one slot; expected at")]
+        return [("from", f"is given, but {kinds[0]} happens in one slot; expected at")]
     return []

@@ -100,7 +100,7 @@ class ExpectTable(Table):
             return [(kind, f"is missing; expected {_EXAMPLES[kind]}{others}")]
         if len(kinds) > 1:
             one_each = f"expected one of {', '.join(_ENTRIES)} in a table"
-            return [(kind, f"is there beside {kinds[0]}; {one_each}") for kind in kinds[1:]]
+            return [(kind, f"is given together with {kinds[0]}; {one_each}") for kind in kinds[1:]]
         (kind,) = kinds
         found = [
             (name, f"is set, but {kind} has no such entry; remove the line")
@@ -178,14 +178,14 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
     distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
     found: list[Found] = []
     if near is None and distances:
-        found.append((distances[0], "is set without near; expected near = 0.01 beside it"))
+        found.append((distances[0], "is set without near; expected near = 0.01 as well"))
     elif near is None and below is None and above is None:
         what = "and above are both missing; expected at least one, such as below = 0.01, or near and within"
         found.append(("below", what))
     elif near is not None and not distances:
-        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, beside near"))
+        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
     elif len(distances) > 1:
-        found.append(("within_relative", "is there beside within; expected one of them"))
+        found.append(("within_relative", "is given together with within; expected one of them"))
     elif near == 0 and distances == ["within_relative"]:
         found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
     if below is not None and above is not None and _number(below) and _number(above) and not above < below:

@@ -119,13 +119,13 @@ def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
                 )
         encoding = tables.get("encoding")
         if isinstance(encoding, Mapping) and encoding.get("scheme") == "twin-track":
-            yield "plant.output_matrix: is there, but the scheme twin-track decides x_0 itself; expected another scheme"
+            yield "plant.output_matrix: is given, but the scheme twin-track decides x_0 itself; expected another scheme"
     if process.get("singular_noise") is True:
         eavesdroppers = tables.get("eavesdroppers")
         for name, table in (eavesdroppers if isinstance(eavesdroppers, Mapping) else {}).items():
             for entry in ("strategy", "reads_as"):
                 if isinstance(table, Mapping) and table.get(entry) in _INVERTS_NOISE:
                     yield (
-                        f"eavesdroppers.{name}.{entry}: is {table[entry]}, which reckons with the inverse of Q, and Q may be "
+                        f"eavesdroppers.{name}.{entry}: is {table[entry]}, which uses the inverse of Q, and Q may be "
                         "singular; expected another strategy, or a Q that is not"
                     )

@@ -45,7 +45,7 @@ def household_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         return
     plant, process = tables.get("plant"), tables.get("process")
     if not isinstance(plant, Mapping) or not isinstance(tables.get("controller"), Mapping):
-        yield f"{HOUSEHOLD}: is there without a [plant] and a [controller], which it is about; expected both, or no such table"
+        yield f"{HOUSEHOLD}: is given without a [plant] and a [controller], which it is about; expected both, or no such table"
         return
     known = {
         "grid": ("plant.inputs", plant.get("inputs")),
@@ -60,6 +60,6 @@ def household_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         there = [one for one in names if isinstance(one, str)] if isinstance(names, list) else []
         if name not in there:
             choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(name)}, …]"
-            yield f"{HOUSEHOLD}.{entry}: is {as_toml(name)}, which is none of {where}; {choice}"
+            yield f"{HOUSEHOLD}.{entry}: is {as_toml(name)}, which is not among {where}; {choice}"
     if HOUSEHOLD in (tables.get("eavesdroppers") or {}):
         yield f"eavesdroppers.{HOUSEHOLD}: is a name that figures of the house have; expected another"

@@ -46,7 +46,7 @@ class LinkTable(Table):
         if table.get("quality") is None and table.get("loss") is None:
             found.append(("quality", "is missing; expected quality = 0.9, or a loss model"))
         elif table.get("quality") is not None and table.get("loss") is not None:
-            found.append(("quality", "is there beside loss, of which it is the short form; expected one of them"))
+            found.append(("quality", "is given together with loss, whose short form it is; expected one of them"))
         found += model_mistakes("loss", table.get("loss"), LOSS_MODELS)
         delay = table.get("delay")
         if isinstance(delay, Mapping):
@@ -55,10 +55,10 @@ class LinkTable(Table):
                 found.append(("delay.unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
         elif table.get("reorder"):
             found.append(
-                ("reorder", "is there without a delay, so that nothing can overtake; expected a delay beside it")
+                ("reorder", "is given without a delay, so that nothing can overtake; expected a delay as well")
             )
         if table.get("queue") is not None and table.get("rate") is None:
-            found.append(("queue", "is there without a rate, so that nothing queues; expected a rate beside it"))
+            found.append(("queue", "is given without a rate, so that nothing queues; expected a rate as well"))
         return found
 
     @classmethod

@@ -44,10 +44,12 @@ class NemesisTable(Table):
         faults = table.get("faults")
         if isinstance(faults, list):
             if "set" in faults and table.get("set") is None:
-                found.append(("set", "is missing beside the fault set; expected what changes: set = { quality = 0.2 }"))
+                found.append(
+                    ("set", "is missing, but the fault set is drawn; expected what changes: set = { quality = 0.2 }")
+                )
             for entry, fault in (("set", "set"), ("state", "kill")):
                 if fault not in faults and table.get(entry) is not None:
-                    found.append((entry, f'is there, but "{fault}" is not among faults; add it, or remove the line'))
+                    found.append((entry, f'is given, but "{fault}" is not among faults; add it, or remove the line'))
         for entry in ("faults", "targets"):
             names = table.get(entry)
             if isinstance(names, list) and len(set(map(str, names))) < len(names):

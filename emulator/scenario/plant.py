@@ -77,7 +77,7 @@ class PlantTable(Table):
         for one, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
             if table.get(one) is not None and table.get(other) is None:
                 example = as_toml((cls.model_fields[other].examples or [0])[0])
-                found.append((other, f"is missing beside {one}; expected {other} = {example}, or neither"))
+                found.append((other, f"is missing, but {one} is given; expected {other} = {example}, or neither"))
         rows, disturbances = table.get("disturbance_values"), table.get("disturbances") or []
         if isinstance(disturbances, list):
             if disturbances and rows is None:

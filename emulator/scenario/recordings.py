@@ -69,7 +69,7 @@ def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
     file, column = trace.pop("file", None), trace.pop("column", None)
     if entry in trace:
         extra = "file" if file is not None else "column" if column is not None else None
-        return [(extra, f"is there beside {entry}; expected one of them")] if extra else []
+        return [(extra, f"is given together with {entry}; expected one of them")] if extra else []
     trace[entry] = _STAND_IN if entry == "outcomes" else [0.0]
     if file is None:
         return [("file", 'is missing; expected file = "walk.csv"')]

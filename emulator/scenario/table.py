@@ -153,7 +153,7 @@ def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]
         if name not in given and name not in model.optional
     ]
     mistakes += [
-        (f"{entry}.{name}", f"is no parameter of {found['model']}; expected {listed(sorted(model.parameters))}")
+        (f"{entry}.{name}", f"is not a parameter of {found['model']}; expected {listed(sorted(model.parameters))}")
         for name in given
         if name not in model.parameters
     ]

@@ -53,7 +53,9 @@ class EncodingTable(Table):
             return []
         if scheme is None:
             anywhere = {name for one in SCHEMES.values() for name in one.parameters}
-            return [(name, "is no parameter of any scheme; remove the line") for name in given if name not in anywhere]
+            return [
+                (name, "is not a parameter of any scheme; remove the line") for name in given if name not in anywhere
+            ]
         found = [
             (name, f"is missing; the scheme {table['scheme']} needs it, such as {name} = {as_toml(example)}")
             for name, example in scheme.parameters.items()
@@ -252,7 +254,7 @@ class Scenario(Table):
         if not isinstance(folder, str):
             return []
         if not Path(folder).is_dir():
-            return [("modules", f'is "{folder}", which is no folder; expected the one that the modules are in')]
+            return [("modules", f'is "{folder}", which is not a folder; expected the folder that contains the modules')]
         absolute = str(Path(folder).absolute())
         wrong = [("modules", what) for what in elsewhere(absolute, table)]
         ANSWERS.folder = absolute

@@ -23,7 +23,7 @@ def unusable(tables: Any) -> Iterator[str]:
     """A sentence with a path for each of the first unusable values."""
     for number, sentence in enumerate(_unusable(tables)):
         if number == _MOST_TOLD:
-            yield f"and more of the kind: {_MOST_TOLD} are listed"
+            yield f"and more such mistakes: {_MOST_TOLD} are listed"
             return
         yield sentence
 

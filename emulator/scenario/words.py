@@ -15,7 +15,7 @@ def no_entry(name: str, known: Sequence[str]) -> str:
     """The message about an entry that a table does not have."""
     close = difflib.get_close_matches(name, known, 1)
     hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
-    return f"is no entry of this table; {hint}"
+    return f"is not an entry of this table; {hint}"
 
 
 def near(found: Any, names: Iterable[str]) -> str:

@@ -43,7 +43,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     _check_shapes(folder, len(scenario.process.A), x, peers)
     inputs, showing = _inputs(results), showing_of(scenario)
     if showing is not None and len(inputs) != len(x):
-        raise UsageError(f"{folder}: inputs.parquet has not the slots of trials.parquet; run the scenario again")
+        raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
     recording = open_recording(scenario, folder.name, path)
     for first in range(0, len(x), _CHUNK):
@@ -69,7 +69,7 @@ def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots
         )
     for name, peer in peers.items():
         if {len(x)} != {len(column) for column in (peer.x_hat, peer.squared_error)}:
-            raise UsageError(f"{folder}: its tables have not the same slots of {name}; run the scenario again")
+            raise UsageError(f"{folder}: its tables do not have the same slots of {name}; run the scenario again")
 
 
 def _first_trial(results: Results, name: str) -> pa.Table:

@@ -42,7 +42,7 @@ def choose(mode: str) -> str:
     if mode == "auto":
         return "native" if has_screen() else "web"
     if mode not in {"native", "web", "off"}:
-        raise UsageError(f"--view {mode} is no way to view a run; give auto, native, web or off")
+        raise UsageError(f"--view {mode} is not a way to view a run; give auto, native, web or off")
     if mode == "native" and not has_screen():
         raise UsageError(
             "--view native needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; give --view web, and open "
@@ -67,7 +67,7 @@ class WebAddress:
         except ValueError:
             number = 0
         if not 0 < number < 2**16 - 1:
-            raise UsageError(f"--serve {text} is no address and port; give one such as 127.0.0.1:17450")
+            raise UsageError(f"--serve {text} is not an address and port; give one such as 127.0.0.1:17450")
         return cls(str(address), number)
 
     @property

@@ -110,7 +110,7 @@ def test_a_folder_without_results_is_refused(tmp_path: Path, runs: dict[str, Res
     with pytest.raises(UsageError, match="is not JSON"):
         load_results(tmp_path)
     (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(UsageError, match="is no summary of a run"):
+    with pytest.raises(UsageError, match="is not a run summary"):
         load_results(tmp_path)
     (tmp_path / "summary.json").write_text((next(iter(runs.values())).folder / "summary.json").read_text())
     (tmp_path / "slots.parquet").write_text("PAR1")

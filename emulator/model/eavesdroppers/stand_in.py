@@ -36,7 +36,7 @@ class StandIns:
             raise NotRegistered(name, f", and {error}; expected a class that can be asked about itself") from error
         parameters = facts.get("parameters") if isinstance(facts, dict) else None
         if not isinstance(parameters, dict):
-            raise NotRegistered(name, ", whose answer is none; expected a class that says what its parameters are")
+            raise NotRegistered(name, ", whose answer is invalid; expected a class that declares its parameters")
         base = _TakerElsewhere if facts.get("takes") is True else _Elsewhere
         said = {
             "parameters": parameters,

@@ -123,7 +123,7 @@ def _square(rows: Any) -> TypeGuard[list[list[Any]]]:
 
 def _matrix_mistakes(rows: Any) -> list[str]:
     if not isinstance(rows, list) or not rows or any(not isinstance(row, list) for row in rows):
-        return ["is no matrix; expected a list of rows"]
+        return ["is not a matrix; expected a list of rows"]
     if len(rows) > _MOST_STATES or not _square(rows):
         return [f"is not square, or has more than {_MOST_STATES} rows; expected one row a state"]
     found = []

@@ -46,7 +46,7 @@ class RecordedLoss(LossModel):
         if not found and len(given.get("outcomes", "")) > MOST_OUTCOMES:
             found.append(("outcomes", f"are {len(given['outcomes'])}; expected at most {MOST_OUTCOMES}"))
         if given.get("once") is True and given.get("random_start") is True:
-            what = "is there beside once, so that trials would run out of the recording; expected one of the two"
+            what = "is given together with once, so that trials would run out of the recording; expected one of the two"
             found.append(("random_start", what))
         return found
 
