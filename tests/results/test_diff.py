@@ -104,7 +104,7 @@ def test_runs_without_a_trial_in_common_are_not_equal(runs: dict[str, Results]) 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path, runs: dict[str, Results]) -> None:
     """No folder, an empty one, a broken summary and a broken table each say what is wrong."""
-    with pytest.raises(UsageError, match="no results folder"):
+    with pytest.raises(UsageError, match="not a results folder"):
         load_results(tmp_path / "nowhere")
     (tmp_path / "summary.json").write_text("{")
     with pytest.raises(UsageError, match="is not JSON"):
