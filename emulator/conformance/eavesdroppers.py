@@ -161,7 +161,7 @@ class EavesdropperChecks:
 
     def lost(self, problem: Problem) -> None:
         """The value in place of a lost packet changes nothing."""
-        said = "{0!r} or {1!r}, by what stands in z where nothing was received"
+        said = "{0!r} or {1!r}, depending on z where nothing was received"
         remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
         rubbish = self._rows(problem, rubbish=1e30)
         expect_same(self._rows(problem), rubbish, slice(None), problem.batch.first_trial, said, remedy)

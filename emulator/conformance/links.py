@@ -34,9 +34,7 @@ from evedrop.model.receiver import Codes
 from evedrop.streams import BlockReader
 
 _COLUMN = "compute each trial from its own column of numbers alone"
-_PIECES = (
-    "let what comes of a slot depend on what was remembered and its numbers alone, not on how many slots are asked for"
-)
+_PIECES = "let a slot depend only on the model's memory and the slot's numbers, not on how many slots are asked for"
 
 
 @final

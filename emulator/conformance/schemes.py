@@ -127,7 +127,7 @@ class SchemeChecks:
         """The value in place of a lost packet changes nothing."""
         zeros = [row_of(slot.after) for slot in self._slots(problem)]
         rubbish = [row_of(slot.after) for slot in self._slots(problem, rubbish=1e30)]
-        said = "{0!r} or {1!r}, by what stands in z where nothing was received"
+        said = "{0!r} or {1!r}, depending on z where nothing was received"
         remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
         expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, said, remedy)
 

@@ -67,14 +67,14 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
         if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
             small = process.n <= _SHOWN_STATES
             found.append(
-                f"process.Q is {process.Q.tolist() if small else 'another'}, but what the sensor's filter adds a slot has the "
-                f"covariance {wanted.tolist() if small else 'of its innovations'}: "
-                f'process.Q = "filter" takes that; inputs and disturbances come to it'
+                f"process.Q is {process.Q.tolist() if small else 'another'}, but the sensor's filter adds, per slot, noise "
+                f"with the covariance {wanted.tolist() if small else 'of its innovations'}: "
+                f'process.Q = "filter" uses that; inputs and disturbances are not in it'
             )
     if process.singular_noise and is_singular(process.Q):
         found.append(
-            "process.Q is singular: two states one after the other differ, but for A and what inputs and disturbances do, "
-            "within its range alone, which reveals the type of packets to anybody who looks"
+            "process.Q is singular: apart from A, inputs and disturbances, consecutive states differ only "
+            "within its range, which reveals the type of packets to anybody who looks"
         )
     return found
 

@@ -86,7 +86,7 @@ class Fit:
                 f"it does NOT explain how long bursts and gaps last (chi-square, p = {shown}): the link has habits that none "
                 'of these models has; use the recording itself, model = "trace"'
             )
-        return f"bursts and gaps last as long as it would have them (chi-square, p = {shown})"
+        return f"bursts and gaps last as long as the model predicts (chi-square, p = {shown})"
 
     def as_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -155,7 +155,7 @@ def _check(path: Path, outcomes: Outcomes) -> None:
             str(path),
             "file",
             f"has {count} outcomes, all {all_or_none}: the quality is {bound} with 95 % confidence if losses are independent, "
-            "and nothing can be told of bursts; expected a recording with both, such as a longer one",
+            "and nothing can be said about bursts; expected a recording with both, such as a longer one",
         )
 
 
@@ -173,12 +173,12 @@ def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
 def lines(found: Fit) -> list[str]:
     """The fit as printed lines."""
     share = 100.0 * found.lost / found.count
-    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots in the mean"
+    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots on average"
     told = [
         f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}"
     ]
     told += _table(found.candidates, found.chosen, found.count)
-    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots in the mean")
+    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots on average")
     told.append(f"fit: {found.goodness}")
     if found.chosen_delay is not None:
         told.append(f"{found.delays} delays")

@@ -244,7 +244,7 @@ def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
             entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
             able = [one for one in READERS if not READERS[one].streams({})]
             found.append(
-                f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by what it knows of the "
+                f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by its knowledge of the "
                 f"{listed(lacking)}, and the scheme {chosen} has none; expected {listed(sorted(able))}"
             )
         betrayed = strategy.betrayed(table.parameters)
@@ -253,7 +253,7 @@ def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
         away = None if betrayed is None else away_in(tables, name, betrayed)
         if away is not None:
             found.append(
-                f"eavesdroppers.{name}.learns_at: is {betrayed}, when {away}; expected a slot in which it is there"
+                f"eavesdroppers.{name}.learns_at: is {betrayed}, when {away}; expected a slot in which it is present"
             )
     return found
 

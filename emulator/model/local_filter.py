@@ -24,9 +24,9 @@ _SOME = 4
 MOST_STATES = 16
 """The most states, and measurements, of a filter: it is computed in plain arithmetic, in a time that grows with their cube."""
 _JUDGED = 32_768  # slots after which a filter that does not even converge slowly is regarded as not settling
-_NEARER = (
-    0.45  # what is left of it by then, as 1/k: ½ of the last halving; as an exponential of any use: ⅓; as k: twice
-)
+# The change over the last doubling of slots, relative to the one before: ½ if it decays as 1/k, at most ⅓ if it decays as a
+# useful exponential, 2 if it grows as k.
+_NEARER = 0.45
 
 
 class FilterStep(NamedTuple):

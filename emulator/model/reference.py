@@ -110,7 +110,7 @@ class ReferenceReceiver(Receiver):
 
     def act(self, k: int, gamma: Flags) -> Codes:
         """Not available: the action depends on the packet's header."""
-        raise NotImplementedError("what becomes of a slot depends on the header; only packets themselves can tell")
+        raise NotImplementedError("the action in a slot depends on the packet's header; γ alone does not tell it")
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if no packet is read; otherwise (z, 0), or z plus the knowledge of the reference.

@@ -63,7 +63,7 @@ def read_disturbances(
         raise DisturbanceError(
             str(path),
             [
-                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or disturbances fewer"
+                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer disturbances"
             ],
         )
     limit = _ROWS_UNASKED if slots is None else max(0, slots)
@@ -216,7 +216,7 @@ def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column])
 def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float) -> Iterator[str]:
     """Mistakes where the time does not start at 0 or does not advance by one slot."""
     if times and times[0] != 0.0:
-        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, and every time less that"
+        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, with that subtracted from every time"
     for line, (before, time) in zip(lines[1:], pairwise(times), strict=True):
         if abs(time - before - slot_seconds) <= _TIME_ERROR * slot_seconds:
             continue

@@ -97,7 +97,7 @@ def _narrow(folder: Path) -> None:
         found = os.fstat(opened)
         if found.st_uid != os.geteuid():
             raise UsageError(
-                f"{folder} belongs to the user with the number {found.st_uid}, who could read the seed and the truth in it; "
+                f"{folder} belongs to the user with the id {found.st_uid}, who could read the seed and the truth in it; "
                 "give another --out, or a folder of your own"
             )
         if found.st_mode & 0o077:

@@ -30,7 +30,7 @@ def link_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable]) -> 
     for name, link in links.items():
         path = f"{LEGITIMATE}.link" if name == LEGITIMATE else f"eavesdroppers.{name}.link"
         if link.in_seconds and not tables.get("slot_seconds"):
-            yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02, what a slot lasts, at the top of the file"
+            yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02, the duration of a slot, at the top of the file"
         if link.correlation is not None:
             yield from _correlation_mistakes(path, name, link, links, receivers)
 
@@ -126,7 +126,7 @@ def _jams_in_turn(events: Sequence[tuple[int, EventTable]]) -> Iterator[str]:
     jams = sorted(((event.first, event.to, i) for i, event in events if event.kind == "jam"), key=lambda one: one[0])
     for (_, to, _), (first, _, i) in pairwise(jams):
         if to is None or to > first:
-            yield f"event.{i}.jam: begins in slot {first}, while another one lasts; expected that to end before"
+            yield f"event.{i}.jam: begins in slot {first}, while another one lasts; expected that one to end first"
 
 
 def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
@@ -179,7 +179,7 @@ def _pooled_mistakes(
 ) -> Iterator[str]:
     """Mistakes in an event that changes pooled links: they become one link, with a quality or a loss model of its own."""
     if not {"quality", "loss"} & set(event.set or {}):
-        yield f"{path}.set: {name} has several links; expected a quality or a loss, of the one link in place of them"
+        yield f"{path}.set: {name} has several links; expected a quality or a loss, for the one link that replaces them"
         return
     yield from _set_mistakes(path, event, LinkTable(quality=1.0), tables, sentences)
 
@@ -197,7 +197,7 @@ def _order_mistakes(events: Sequence[tuple[int, EventTable]], receivers: Sequenc
                 continue
             path = f"event.{i}"
             if act.kind == "cut" and cut is not None:
-                yield f"{path}.cut: {name} is cut already, from slot {cut.at} on; expected it to heal before"
+                yield f"{path}.cut: {name} is cut already, from slot {cut.at} on; expected a heal before"
             if act.kind == "heal" and cut is None:
                 yield f"{path}.heal: {name} is not cut at slot {act.at}; expected a cut before"
             cut = act if act.kind == "cut" else None if act.kind == "heal" else cut

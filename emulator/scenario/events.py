@@ -90,7 +90,7 @@ def _when_mistakes(table: Mapping[str, Any]) -> list[Found]:
     if (at is None) == (start is None):
         return [("at", "and from are both there" if at is not None else "is missing; expected at = 400")]
     if start is None and to is not None:
-        return [("to", "is given without from; expected from and to, or at alone")]
+        return [("to", "is given without from; expected from and to, or only at")]
     if start is not None and to is None:
         return [("to", "is missing, but from is given; expected the slot in which it ends")]
     if type(start) is int and type(to) is int and to <= start:

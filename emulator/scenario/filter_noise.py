@@ -76,7 +76,7 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
     if max(n, len(C)) > MOST_STATES:
         large = f"is of {len(C)} measurements of {n} states"
         return [
-            f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, for the filter is plain arithmetic"
+            f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, because the filter uses plain arithmetic"
         ]
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
@@ -114,8 +114,8 @@ def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         except ValueError:
             if not wrong:
                 yield (
-                    "plant.output_matrix: leaves the sensor's filter without an end: what it measures must show every state, "
-                    "and plant.noise must move every state, or it trusts no measurement any more"
+                    "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state, "
+                    "and plant.noise must move every state, or the filter ends up ignoring all measurements"
                 )
         encoding = tables.get("encoding")
         if isinstance(encoding, Mapping) and encoding.get("scheme") == "twin-track":

@@ -45,7 +45,7 @@ def household_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         return
     plant, process = tables.get("plant"), tables.get("process")
     if not isinstance(plant, Mapping) or not isinstance(tables.get("controller"), Mapping):
-        yield f"{HOUSEHOLD}: is given without a [plant] and a [controller], which it is about; expected both, or no such table"
+        yield f"{HOUSEHOLD}: is given without a [plant] and a [controller], which it describes; expected both, or no such table"
         return
     known = {
         "grid": ("plant.inputs", plant.get("inputs")),
@@ -62,4 +62,4 @@ def household_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
             choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(name)}, …]"
             yield f"{HOUSEHOLD}.{entry}: is {as_toml(name)}, which is not among {where}; {choice}"
     if HOUSEHOLD in (tables.get("eavesdroppers") or {}):
-        yield f"eavesdroppers.{HOUSEHOLD}: is a name that figures of the house have; expected another"
+        yield f"eavesdroppers.{HOUSEHOLD}: is a name that the house's figures use; expected another"

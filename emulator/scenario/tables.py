@@ -147,9 +147,7 @@ class EavesdropperTable(Table):
             entries = {name for name, value in link.items() if value} if isinstance(link, Mapping) else set()
             more = sorted(entries - {"quality", "loss"})
             if more:
-                found.append(
-                    (f"links.{i}", f"has {listed(more)}; links that are pooled have a quality or a loss alone")
-                )
+                found.append((f"links.{i}", f"has {listed(more)}; links that are pooled have only a quality or a loss"))
         return found
 
     @property
@@ -186,7 +184,7 @@ class AcknowledgementsTable(Table):
         attack, jammer = table.get("attack", "none"), table.get("jammer")
         if attack == "critical" and jammer is None:
             return [
-                ("jammer", "is missing; the attack critical needs the eavesdropper that blocks what it missed itself")
+                ("jammer", "is missing; the attack critical needs the eavesdropper that blocks the packets it missed")
             ]
         if attack != "critical" and jammer is not None:
             return [

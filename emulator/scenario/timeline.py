@@ -16,7 +16,7 @@ from evedrop.scenario.words import as_toml
 
 _REASONS = {"kill": Fate.DOWN, "pause": Fate.PAUSED}
 _ENDS = {"cut": "heal", "partition": "heal", "jam": "jammed", "kill": "restart", "pause": "resume"}
-_JAMMING = {"jam": "acknowledgements are attacked", "jammed": "acknowledgements are attacked no more"}
+_JAMMING = {"jam": "acknowledgements are attacked", "jammed": "acknowledgements are no longer attacked"}
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 """Maps a receiver and the changed entries of its link to the link's new settings."""

@@ -108,7 +108,7 @@ class Viewer:
         """A warning to the user if others can reach the viewer."""
         if served is None and not is_apart(process):
             self.warning = (
-                "other users of this machine can find the window's port, steer the window and take pictures of what it "
+                "other users of this machine can find the window's port, control the window and take pictures of what it "
                 "shows, for this system allows it no network of its own; --view web, whose address is a secret, or --view "
                 "off keep it from them (docs/view.md, who sees it)"
             )

@@ -164,7 +164,11 @@ SCHEME_RULES = {
     "a trial by itself": (plain_with(Centred), "slot 0, trial 0: Packet.z is ", "no sum over trials"),
     "the same scheme made twice": (plain_with(Counted), "with another one of its kind", "keep no state outside"),
     "a slot asked for again": (plain_with(estimator=Remembers), "when the slot is asked for again", "Belief.memory"),
-    "packets that were lost": (plain_with(estimator=Peeks), "by what stands in z", "where gamma is true alone"),
+    "packets that were lost": (
+        plain_with(estimator=Peeks),
+        "depending on z where nothing was received",
+        "where gamma is true alone",
+    ),
     "actions that γ tells": (
         plain_with(estimator=Discards),
         "act() says STATE and step() did DISCARDED",

@@ -96,7 +96,7 @@ def test_an_event_on_pooled_links_is_looked_at_too() -> None:
     found = mistakes(text)
     assert (
         found[0]
-        == "event.0.set: pool has several links; expected a quality or a loss, of the one link in place of them"
+        == "event.0.set: pool has several links; expected a quality or a loss, for the one link that replaces them"
     )
     assert found[1].startswith('event.1.set.loss.model: is "nope"; expected bernoulli')
     assert parse(BASE + POOLED + event("{ quality = 0.1 }", "pool"), "scenario.toml").slots == 50

@@ -93,7 +93,7 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
     ),
     "cut twice": (
         [{"from": 1, "to": 9, "cut": "eve"}, {"at": 3, "partition": ["eve"]}],
-        "event.1.cut: eve is cut already, from slot 1 on; expected it to heal before",
+        "event.1.cut: eve is cut already, from slot 1 on; expected a heal before",
     ),
     "back and gone at once": (
         [{"from": 1, "to": 5, "kill": "eve"}, {"at": 5, "pause": "eve"}],
@@ -279,4 +279,4 @@ def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | No
         assert right(event, eavesdroppers={"spy": spy}).leaks == {"spy": 15}
     else:
         (line,) = mistakes(event, eavesdroppers={"spy": spy})
-        assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is there"
+        assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is present"

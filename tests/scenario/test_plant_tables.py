@@ -192,7 +192,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "unseen": (
         {"plant__output_matrix": [[1.0, 0.0]], "plant__measurement_noise": [[0.01]]},
-        "plant.output_matrix: leaves the sensor's filter without an end: what it measures must show every state",
+        "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state",
     ),
     "inverse of Q": (
         {

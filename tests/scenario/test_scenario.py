@@ -218,7 +218,7 @@ def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entr
     table = {"strategy": strategy, "link": {"quality": 0.8}} if entry == "strategy" else {**POOL, "reads_as": strategy}
     (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
-        f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by what it knows of the schedule, and the scheme '
+        f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by its knowledge of the schedule, and the scheme '
         "plain has none; expected bayesian, constant, likelihood, naive, reference, selective or tracker"
     )
 

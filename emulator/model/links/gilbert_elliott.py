@@ -36,9 +36,7 @@ class GilbertElliott(LossModel):
         """All are probabilities, and p and r are not both 0."""
         found = probability_mistakes(given, "p", "r", "good", "bad")
         if not found and given.get("p") == 0.0 and given.get("r") == 0.0:
-            found.append(
-                ("p", "and r are both 0, so the link keeps a state that nothing tells; expected p or r above 0")
-            )
+            found.append(("p", "and r are both 0, so the link stays in an unknown state; expected p or r above 0"))
         return found
 
     @property

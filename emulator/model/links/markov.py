@@ -133,7 +133,7 @@ def _matrix_mistakes(rows: Any) -> list[str]:
         elif abs(sum(row) - 1.0) > _SUM:
             found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
     if not found and not _common(rows):
-        found.append("falls apart into states that never meet; expected one that can be reached from all")
+        found.append("has several recurrent classes; expected a state that can be reached from all others")
     return found
 
 
