@@ -116,7 +116,7 @@ def test_a_column_of_lists_does_not_hide_the_others(tmp_path: Path) -> None:
     """Names of columns, and the column of outcomes, are read; a column of lists is named as what it is."""
     columns = {"received": [1, 0], "nested": [[1], []], "note": ["a", "a"]}
     pq.write_table(pa.table(columns), tmp_path / "walk.parquet")
-    recording = Recording(tmp_path / "walk.parquet")
+    recording = LinkRecording(tmp_path / "walk.parquet")
     assert recording.columns() == [*columns]
     assert recording.outcomes("received").tolist() == [1, 0]
     with pytest.raises(TraceError, match="has lists or tables in the column"):
