@@ -1,4 +1,4 @@
-"""What a class must do to be used in a run: checked on small problems, for `evedrop check` and before every run.
+"""Rules for classes that are used in a run, checked on small problems, by `evedrop check` and before every run.
 
 Source: docs/your-own.md.
 """

@@ -1,7 +1,7 @@
-"""The process that answers for one class of an eavesdropper, so that it runs nowhere else; see `evedrop.model.answers`.
+"""The process that answers for one eavesdropper's class, so that the class runs nowhere else; see `evedrop.model.answers`.
 
-It is told where modules are, then one question a line, each a list: the name of a class, what is asked, and with what.
-It answers each in a line. It ends when nobody asks for some seconds, and when whoever asks is gone.
+It is told where modules are, then one question per line, each a list: the name of a class, the question, and arguments.
+Each answer is one line. The process ends when no question comes for some seconds, and when the asking process is gone.
 
 Source: docs/your-own.md, where a class runs.
 """
@@ -30,11 +30,11 @@ from evedrop.plugins import look_in
 from evedrop.streams import Batch
 
 _IDLE_SECONDS = 5.0
-_PROCESSOR_SECONDS = 600  # whoever asks has long given up
+_PROCESSOR_SECONDS = 600  # the asking process has given up long before
 
 
 def answer(folder: str | None) -> None:
-    """Answer questions from standard input on standard output, which what a class prints does not reach."""
+    """Answer questions from standard input on standard output, which is separate from the class's own output."""
     resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_SECONDS, _PROCESSOR_SECONDS))
     answers = os.dup(1)
     os.dup2(2, 1)
@@ -76,7 +76,7 @@ def _registry(name: str) -> Registry[Eavesdropper]:
 
 
 def _class(kind: type[Eavesdropper]) -> dict[str, Any]:
-    """What does not depend on parameters."""
+    """The facts that do not depend on parameters."""
     takes = issubclass(kind, PacketTaker)
     inherited = PacketTaker.outcomes.__func__ if takes else None  # type: ignore[attr-defined]
     return {
@@ -102,9 +102,9 @@ def _dry_run(
     process: tuple[Any, ...],
     batch: tuple[int, int, int],
 ) -> str | None:
-    """What breaks in some slots of a scenario. Source: docs/your-own.md, mistakes."""
-    del kind  # is what the strategy is, or what it reads as
-    from evedrop.conformance.eavesdroppers import EavesdropperChecks, Listening  # noqa: PLC0415 - asked last
+    """Report what breaks in some slots of a scenario. Source: docs/your-own.md, mistakes."""
+    del kind  # the class of the strategy, or of the strategy it reads as
+    from evedrop.conformance.eavesdroppers import EavesdropperChecks, Listening  # noqa: PLC0415 - needed last
     from evedrop.conformance.problems import Problem  # noqa: PLC0415 - the same
     from evedrop.conformance.rules import how_broken  # noqa: PLC0415 - the same
     from evedrop.model.schemes import SCHEMES, scheme_of  # noqa: PLC0415 - the same

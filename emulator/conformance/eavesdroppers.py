@@ -1,4 +1,4 @@
-"""What an eavesdropper must keep to.
+"""The rules for eavesdroppers.
 
 Source: docs/your-own.md.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -41,17 +41,17 @@ _STATE = "keep no state outside of Belief, and take random numbers from the stre
 
 @dataclass(frozen=True)
 class Listening:
-    """An eavesdropper of one class with its parameters, beside a scheme."""
+    """An eavesdropper's class with its parameters, and the scheme it hears."""
 
     name: str
-    """Of its class."""
+    """The class's name."""
     kind: type[Eavesdropper]
     parameters: Mapping[str, Any]
     scheme_of: SchemeOf
     scheme: type[Scheme]
 
     def made(self, problem: Problem) -> Eavesdropper:
-        """One for a problem."""
+        """An eavesdropper for a problem."""
         with calling("streams()", self.kind):
             streams = self.kind.streams(self.parameters)
         mu_d = made(self.scheme_of, problem, self.scheme).state_probability
@@ -61,7 +61,7 @@ class Listening:
 
     @cached_property
     def betrayed(self) -> int | None:
-        """The slot whose state it is told."""
+        """The slot whose state is betrayed to it."""
         with calling("betrayed()", self.kind):
             slot = self.kind.betrayed(self.parameters)
         if slot is not None and (type(slot) is not int or slot < 0):
@@ -69,7 +69,7 @@ class Listening:
         return slot
 
     def steps(self, problem: Problem, rubbish: float = 0.0) -> Iterator[tuple[Slot, Step]]:
-        """Every slot of the scheme, and what it makes of it."""
+        """Every slot of the scheme, and the eavesdropper's belief in it."""
         receiver = self.made(problem)
         with calling("prior()", self.kind):
             belief = receiver.prior()
@@ -85,7 +85,7 @@ class Listening:
 
 
 def eavesdropper_verdicts(listening: Listening) -> list[RuleVerdict]:
-    """Every rule for eavesdroppers, on small problems."""
+    """Check every rule for eavesdroppers, on small problems."""
     checks = EavesdropperChecks(listening)
     at = listening.betrayed
     slots = 0 if at is None else min(at + 3, 200)
@@ -100,8 +100,9 @@ def eavesdropper_verdicts(listening: Listening) -> list[RuleVerdict]:
     return judged((exact, small(slots)), ([("what it says to theory", checks.theory)], large()))
 
 
+@final
 class EavesdropperChecks:
-    """The rules, each of one problem. Final."""
+    """The rules, each checked on one problem."""
 
     def __init__(self, listening: Listening) -> None:
         self._listening = listening
@@ -113,7 +114,7 @@ class EavesdropperChecks:
         return [step for _, step in self._listening.steps(problem)]
 
     def shapes(self, problem: Problem) -> None:
-        """Everything has the shape and type that it must have, and no input is changed."""
+        """All results have the right shapes and types, and no input is changed."""
         kind, parameters = self._listening.kind, self._listening.parameters
         with calling("streams()", kind):
             streams = kind.streams(parameters)
@@ -138,16 +139,16 @@ class EavesdropperChecks:
         expect_bool("follows_gamma()", follows)
 
     def twice(self, problem: Problem) -> None:
-        """Two that work in turns do what one does by itself."""
+        """Two that take turns do the same as one alone."""
         once = self._rows(problem)
         both = list(zip(*(self._listening.steps(problem) for _ in range(2)), strict=True))
         for which in (0, 1):
             rows = [row_of(pair[which][1][2]) for pair in both]
-            said = "{0!r} by itself and {1!r} beside another one of its kind"
+            said = "{0!r} by itself and {1!r} with another one of its kind"
             expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
 
     def alone(self, problem: Problem) -> None:
-        """A trial alone is the same trial, to the bit."""
+        """A trial alone gives the same bits as among others."""
         among = self._rows(problem)
         for trial in (0, problem.batch.trials - 1):
             said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
@@ -155,25 +156,25 @@ class EavesdropperChecks:
             expect_same(among, self._rows(problem.part(trial, 1)), slice(trial, trial + 1), number, said, _COLUMN)
 
     def again(self, problem: Problem) -> None:
-        """It answers for a slot as it did, whatever came after."""
+        """It gives the same answer for a slot after later slots."""
         expect_pure(self._listening.made(problem), self._steps(problem), problem, self._listening.kind)
 
     def lost(self, problem: Problem) -> None:
-        """What stands in place of a packet that was lost changes nothing."""
-        said = "{0!r} or {1!r}, by what stands in z where nothing was received"
+        """The value in place of a lost packet changes nothing."""
+        said = "{0!r} or {1!r}, depending on z where nothing was received"
         remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
         rubbish = self._rows(problem, rubbish=1e30)
         expect_same(self._rows(problem), rubbish, slice(None), problem.batch.first_trial, said, remedy)
 
     def actions(self, problem: Problem) -> None:
-        """If it follows γ, γ alone tells what it does, and so what it believes."""
+        """If it follows γ, γ alone determines its actions, and so its beliefs."""
         kind = self._listening.kind
         if kind.follows_gamma(self._listening.parameters):
             remedy = "let follows_gamma() return False"
             expect_actions(self._listening.made(problem), self._steps(problem), problem, kind, remedy)
 
     def theory(self, problem: Problem) -> None:
-        """What `outcomes` says is what happens, if it says anything of this scheme."""
+        """The outcomes it states are the observed ones, if it states any for this scheme."""
         listening = self._listening
         scheme = made(listening.scheme_of, problem, listening.scheme)
         with calling("outcomes()", listening.kind):

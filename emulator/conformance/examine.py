@@ -1,4 +1,4 @@
-"""Classes by their names, and every rule for them: what `evedrop check --scheme NAME` and the like ask for.
+"""Checks classes by name against every rule, for `evedrop check --scheme NAME` and its like.
 
 Source: docs/your-own.md.
 """
@@ -33,7 +33,7 @@ _OWN_COIN = "coin"
 
 @dataclass(frozen=True)
 class Examined:
-    """One class, and what became of each rule."""
+    """One class, and the verdict on each rule."""
 
     title: str
     verdicts: list[RuleVerdict]
@@ -41,7 +41,7 @@ class Examined:
 
 @dataclass(frozen=True)
 class _Named:
-    """A class, its name, and the parameters that it is checked with."""
+    """A class, its name, and its parameters for the check."""
 
     name: str
     kind: Any
@@ -49,12 +49,12 @@ class _Named:
 
 
 def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterator[Examined]:
-    """Every class, one by one.
+    """Check every class, one by one.
 
     names: `scheme`, `eavesdropper`, `link` or `delay` → its name; modules are looked for in the current folder.
-    parameters: in place of the classes' own examples.
+    parameters: replace the classes' own examples.
 
-    Raises UsageError for names that are none, and for parameters that are none or wrong.
+    Raises UsageError for unknown names and for unknown or wrong parameters.
     """
     look_in(str(Path.cwd()))
     classes = {option: _named(option, name, parameters) for option, name in names.items()}
@@ -62,12 +62,12 @@ def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterato
     for entry in parameters:
         if entry not in known:
             said = f"expected {', '.join(dict.fromkeys(known))}" if known else "they have no parameters; remove it"
-            raise UsageError(f"--set {entry}: is no parameter of {', '.join(names.values())}; {said}")
+            raise UsageError(f"--set {entry}: is not a parameter of {', '.join(names.values())}; {said}")
     for option, one in classes.items():
         title = f"{one.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
         if option == "eavesdropper":
             beside = classes.get("scheme") or _beside(one)
-            yield Examined(f"{title}, beside the scheme {beside.name}", _listened(one, beside))
+            yield Examined(f"{title}, with the scheme {beside.name}", _listened(one, beside))
         else:
             yield Examined(title, _verdicts(option, one))
 
@@ -80,7 +80,7 @@ def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
         if "reads_as" in given:
             given = {**_given(READERS.imported(str(given["reads_as"])), parameters), **given}
     except NotRegistered as error:
-        why = error.why or f" is none; expected MODULE:CLASS, or {', '.join(registry.names)}"
+        why = error.why or f" is unknown; expected MODULE:CLASS, or {', '.join(registry.names)}"
         raise UsageError(f"--{option} {error.name}{why}") from error
     wrong = [f"{entry}: {what}" for entry, what in asked(kind, given)]
     if wrong:
@@ -89,7 +89,7 @@ def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
 
 
 def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The examples of a class's parameters, without those it can do without, and those given."""
+    """The examples of a class's parameters, without the optional ones, and the parameters given."""
     optional = getattr(kind, "optional", ())
     examples = {entry: example for entry, example in kind.parameters.items() if entry not in optional}
     return examples | {entry: value for entry, value in parameters.items() if entry in kind.parameters}
@@ -126,7 +126,7 @@ def _streams(one: _Named) -> list[str]:
 
 
 def _beside(one: _Named) -> _Named:
-    """The paper's scheme, or the first that has the keys which an eavesdropper asks for."""
+    """The paper's scheme, or the first scheme that has the keys the eavesdropper asks for."""
     needed = {*_streams(one)}
     for name in ("innovation", *SCHEMES):
         if needed <= {*SCHEMES[name].secret_streams}:

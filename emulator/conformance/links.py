@@ -1,4 +1,4 @@
-"""What loss models and delay models must keep to.
+"""The rules for loss models and delay models.
 
 Source: docs/your-own.md.
 """
@@ -9,6 +9,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 
@@ -33,19 +34,18 @@ from evedrop.model.receiver import Codes
 from evedrop.streams import BlockReader
 
 _COLUMN = "compute each trial from its own column of numbers alone"
-_PIECES = (
-    "let what comes of a slot depend on what was remembered and its numbers alone, not on how many slots are asked for"
-)
+_PIECES = "let a slot depend only on the model's memory and the slot's numbers, not on how many slots are asked for"
 
 
+@final
 class LossChecks:
-    """The rules for loss models, each of one problem. Final. model: makes one, fresh."""
+    """The rules for loss models, each checked on one problem. model: makes a new instance."""
 
     def __init__(self, model: Callable[[], LossModel], kind: type[LossModel]) -> None:
         self._model, self._kind = model, kind
 
     def verdicts(self) -> list[RuleVerdict]:
-        """Every rule, on small problems."""
+        """Check every rule, on small problems."""
         exact = [
             ("shapes and types", self.shapes),
             ("the same link made twice", self.twice),
@@ -85,7 +85,7 @@ class LossChecks:
         return self._fates(model, 0, self._uniforms(model, problem))
 
     def shapes(self, problem: Problem) -> None:
-        """Fates, and the numbers that it says of itself."""
+        """Fates, and the figures that the model states, have the right shapes and types."""
         self._whole(problem)
         model, slots = self._made(), range(problem.slots)
         with calling("quality, quality_at(), rate_variance()", self._kind):
@@ -107,7 +107,7 @@ class LossChecks:
             raise Broken("chain.law is not the stationary law of chain.transitions; correct them, or return None")
 
     def twice(self, problem: Problem) -> None:
-        """Two that work in turns do what one does by itself."""
+        """Two that take turns do the same as one alone."""
         once = self._whole(problem)
         pair = [self._made() for _ in range(2)]
         uniforms = self._uniforms(pair[0], problem)
@@ -115,12 +115,12 @@ class LossChecks:
         for k in range(problem.slots):
             for model, found in zip(pair, each, strict=True):
                 found.append(self._fates(model, k, uniforms[k : k + 1]))
-        said = "{0!r} by itself and {1!r} beside another one of its kind, slot by slot"
+        said = "{0!r} by itself and {1!r} with another one of its kind, slot by slot"
         for found in each:
             self._same(once, np.concatenate(found), problem, said, "keep no state outside of the model")
 
     def alone(self, problem: Problem) -> None:
-        """A trial alone is the same trial."""
+        """A trial alone gives the same fates as among others."""
         among = self._whole(problem)
         for trial in (0, problem.batch.trials - 1):
             one = self._whole(problem.part(trial, 1))
@@ -128,7 +128,7 @@ class LossChecks:
             self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
 
     def pieces(self, problem: Problem) -> None:
-        """Slots in one call or in several come to the same."""
+        """Slots give the same fates in one call and in several."""
         once, model = self._whole(problem), self._made()
         uniforms = self._uniforms(model, problem)
         bounds = [0, 1, 4, 5, problem.slots]
@@ -136,7 +136,7 @@ class LossChecks:
         self._same(once, np.concatenate(parts), problem, "{0!r} in one call and {1!r} in several", _PIECES)
 
     def copied(self, problem: Problem) -> None:
-        """A shallow copy goes on from where it was, whatever the original does meanwhile."""
+        """A shallow copy continues from where it was made, whatever the original does meanwhile."""
         once, model = self._whole(problem), self._made()
         uniforms = self._uniforms(model, problem)
         self._fates(model, 0, uniforms[:5])
@@ -147,7 +147,7 @@ class LossChecks:
         self._same(once, found, problem, "{0!r}, and {1!r} of a copy made before slot 5", remedy)
 
     def rate(self, problem: Problem) -> None:
-        """The fraction delivered is what it says, in the mean and in its scatter over trials."""
+        """The fraction delivered has the mean and the variance over trials that the model states."""
         delivered = (self._whole(problem) == Fate.DELIVERED).mean(axis=0)
         model, slots = self._made(), range(problem.slots)
         expected, variance = float(model.quality_at(slots).mean()), model.rate_variance(slots)
@@ -167,14 +167,15 @@ class LossChecks:
         expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
 
 
+@final
 class DelayChecks:
-    """The rules for delay models, each of one problem. Final. model: makes one, fresh."""
+    """The rules for delay models, each checked on one problem. model: makes a new instance."""
 
     def __init__(self, model: Callable[[], DelayModel], kind: type[DelayModel]) -> None:
         self._model, self._kind = model, kind
 
     def verdicts(self) -> list[RuleVerdict]:
-        """Every rule, on small problems."""
+        """Check every rule, on small problems."""
         exact = [
             ("shapes and types", self.shapes),
             ("a trial by itself", self.alone),
@@ -200,7 +201,7 @@ class DelayChecks:
         return np.concatenate(parts)
 
     def shapes(self, problem: Problem) -> None:
-        """Delays, and what it says of them."""
+        """Delays, and the probabilities that the model states, have the right shapes and types."""
         self._delays(problem)
         with calling("arrived()", self._kind):
             said = [self._model().arrived(lag) for lag in range(4)]
@@ -212,7 +213,7 @@ class DelayChecks:
             raise Broken(f"arrived() of 0 to 3 is {said}; expected probabilities that do not fall, or None always")
 
     def alone(self, problem: Problem) -> None:
-        """A trial alone is the same trial."""
+        """A trial alone gives the same delays as among others."""
         among = self._delays(problem)
         for trial in (0, problem.batch.trials - 1):
             one = self._delays(problem.part(trial, 1))
@@ -220,12 +221,12 @@ class DelayChecks:
             self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
 
     def pieces(self, problem: Problem) -> None:
-        """Slots in one call, or in several to models made afresh, come to the same."""
+        """Slots give the same delays in one call as in several calls to new instances."""
         once = self._delays(problem)
         self._same(once, self._delays(problem, (1, 4)), problem, "{0!r} in one call and {1!r} in several", _PIECES)
 
     def law(self, problem: Problem) -> None:
-        """As many packets are there in time as it says."""
+        """The fraction of packets in time is the stated one."""
         delays = self._delays(problem)
         for lag in range(4):
             said = self._model().arrived(lag)
@@ -239,5 +240,5 @@ class DelayChecks:
 
 
 def _long(problem: Problem) -> Problem:
-    """With more slots, for what has a memory."""
+    """The problem with more slots, for models with a memory."""
     return replace(problem, batch=replace(problem.batch, slots=60))

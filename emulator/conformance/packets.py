@@ -1,4 +1,4 @@
-"""A scheme at work on a problem: its packets and what its estimator makes of them, slot by slot."""
+"""Runs a scheme on a problem: its packets and its estimator's beliefs, slot by slot."""
 
 from __future__ import annotations
 
@@ -33,30 +33,30 @@ class Slot:
 
     @property
     def sent(self) -> dict[str, Any]:
-        """What is compared of the packet."""
+        """The parts of the packet that are compared."""
         found = {"Packet.z": self.packet.z, "Packet.nu": self.packet.nu}
         found |= {} if self.packet.header is None else {"Packet.header": self.packet.header}
         return found | ({} if self.packet.sent is None else {"Packet.sent": self.packet.sent})
 
     @property
     def row(self) -> Row:
-        """All that is compared."""
+        """Everything that is compared."""
         return {**self.sent, **row_of(self.after)}
 
 
 def frozen_belief(belief: Belief) -> Belief:
-    """A copy that cannot be changed."""
+    """A read-only copy."""
     memory = tuple(frozen(one) for one in belief.memory)
     return Belief(frozen(belief.x_hat), frozen(belief.P), frozen(belief.action), memory)
 
 
 def row_of(belief: Belief) -> dict[str, Any]:
-    """What is compared of a belief: what digests are of. Its memory may be as large as its company needs."""
+    """The parts of a belief that are compared, which are those that enter digests. Its memory may depend on other trials."""
     return {"Belief.x_hat": belief.x_hat, "Belief.P": belief.P, "Belief.action": belief.action}
 
 
 def made(scheme_of: SchemeOf, problem: Problem, kind: type[Scheme]) -> Scheme:
-    """The scheme of a problem's process."""
+    """The scheme for a problem's process."""
     with calling(f"{kind.__name__}(process, …)", kind):
         return scheme_of(problem.process)
 
@@ -66,8 +66,8 @@ def played(
 ) -> Iterator[Slot]:
     """Every slot of a problem.
 
-    apart: sensor and estimator are made by themselves, as processes of their own do it; rubbish: what a receiver finds in
-    place of a packet that it did not get. Everything handed over cannot be changed; everything that comes back is looked at.
+    apart: sensor and estimator are made separately, as in processes of their own; rubbish: the value that a receiver finds in
+    place of a lost packet. Everything passed in is read-only; everything returned is checked.
     """
     scheme, batch, n = made(scheme_of, problem, kind), problem.batch, problem.process.n
     encoder, estimator = _sides(scheme, problem, kind, apart)
@@ -118,14 +118,14 @@ def _sides(scheme: Scheme, problem: Problem, kind: type[Scheme], apart: bool) ->
 
 
 def heard_of(packet: Packet, gamma: Any, rubbish: float) -> Reception:
-    """What a receiver hears of a packet, that cannot be changed."""
+    """A receiver's reception of a packet, read-only."""
     gamma = gamma if packet.sent is None else gamma & packet.sent
     header = None if packet.header is None else frozen(np.where(gamma, packet.header, np.int64(min(rubbish, 2.0**40))))
     return Reception(frozen(gamma), frozen(np.where(gamma, packet.z, rubbish)), header)
 
 
 def expect_packet(k: int, packet: Any, scheme: Scheme, problem: Problem) -> None:
-    """Raise Broken unless this is a packet of a scheme."""
+    """Raise Broken unless this is a valid packet of a scheme."""
     n, trials = problem.process.n, problem.batch.trials
     if not isinstance(packet, Packet):
         raise Broken(f"slot {k}: encode() returned {type(packet).__name__}; expected a Packet")
@@ -147,7 +147,7 @@ def expect_packet(k: int, packet: Any, scheme: Scheme, problem: Problem) -> None
 
 
 def expect_belief(where: str, belief: Any, problem: Problem) -> None:
-    """Raise Broken unless this is a belief about a problem."""
+    """Raise Broken unless this is a valid belief for a problem."""
     n, trials = problem.process.n, problem.batch.trials
     if not isinstance(belief, Belief):
         raise Broken(f"{where} is {type(belief).__name__}; expected a Belief")
@@ -158,4 +158,4 @@ def expect_belief(where: str, belief: Any, problem: Problem) -> None:
     expect_finite(f"{where}.P", belief.P, problem.batch.first_trial)
     for i, array in enumerate(belief.memory):
         if not isinstance(array, np.ndarray) or array.shape[-1:] != (trials,):
-            raise Broken(f"{where}.memory[{i}] is no array whose last axis is the {trials} trials")
+            raise Broken(f"{where}.memory[{i}] is not an array whose last axis is the {trials} trials")

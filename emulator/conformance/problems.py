@@ -1,4 +1,4 @@
-"""Small problems on which classes are checked: a process, some slots, some trials, and who hears what in them."""
+"""Small problems on which classes are checked: a process, slots, trials, and the packets that are heard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evedrop.model.receiver import Flags
 from evedrop.streams import Batch, BlockReader
 
 QUALITY = 0.7
-"""Of the link of every problem."""
+"""The link quality of every problem."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,16 @@ class Problem:
         return f"{states}, spectral radius {self.process.spectral_radius:.2g}, {self.batch.trials} trials"
 
     def part(self, first: int, trials: int) -> Problem:
-        """The same with some of the trials alone; first: counted from the problem's own first one."""
+        """The problem with only some of its trials; first: counted from the problem's own first trial."""
         return replace(self, batch=Batch(self.batch.slots, trials, self.batch.first_trial + first))
 
     @property
     def slots(self) -> int:
-        """How many."""
+        """The number of slots."""
         return self.batch.slots
 
     def coins(self, name: str, quality: float = QUALITY) -> Flags:
-        """Heads with this probability in every slot and trial, (slots, R): the same for a trial in any company."""
+        """True with this probability in every slot and trial, (slots, R), independently of which other trials there are."""
         reader = BlockReader(key(f"coins/{name}"), self.batch, 1)
         return np.asarray(reader.uniforms(range(self.slots))[:, 0, :] < quality)
 
@@ -57,7 +57,7 @@ def _process(number: int, n: int, radius: float) -> Process:
 
 
 def small(slots: int = 0) -> list[Problem]:
-    """Problems of 1 to 3 states that fade, stay and grow, of at least so many slots.
+    """Problems of 1 to 3 states with decaying, constant and growing processes, with at least `slots` slots.
 
     The last one crosses the ends of blocks in which streams are read ahead, and its trials have large numbers.
     """
@@ -69,5 +69,5 @@ def small(slots: int = 0) -> list[Problem]:
 
 
 def large() -> list[Problem]:
-    """Problems of many trials, for what is true in the mean."""
+    """Problems with many trials, for statements about means."""
     return [Problem(_process(number, n, 0.9), Batch(10, 600)) for number, n in ((10, 1), (11, 2))]

@@ -1,4 +1,4 @@
-"""What every receiver must keep to, the legitimate estimator and eavesdroppers alike."""
+"""Rules for every receiver, the legitimate estimator and eavesdroppers alike."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from evedrop.model.receiver import Action, Belief, Receiver, Reception
 from evedrop.model.theory.covariances import ExpectedCovariance, OutcomesAt
 
 SIGMAS = 6.0
-"""Standard deviations that chance is allowed."""
+"""Standard deviations allowed for chance."""
 _SLACK = 0.02
 
 Step = tuple[Belief, Reception, Belief]
-"""Before a slot, what was heard in it, after it."""
+"""The belief before a slot, the reception in it, and the belief after it."""
 
 
 def expect_pure(receiver: Receiver, steps: Sequence[Step], problem: Problem, kind: type) -> None:
-    """Raise Broken unless a receiver, asked for slots backwards, answers as it did, and knows a prior for every slot."""
+    """Raise Broken unless a receiver, asked for slots backwards, answers as before, and has a prior for every slot."""
     rows = []
     for k, (before, heard, _) in reversed([*enumerate(steps)]):
         with calling(f"slot {k}: step(), asked for again after later slots,", kind):
@@ -39,7 +39,7 @@ def expect_pure(receiver: Receiver, steps: Sequence[Step], problem: Problem, kin
 
 
 def expect_actions(receiver: Receiver, steps: Sequence[Step], problem: Problem, kind: type, remedy: str) -> None:
-    """Raise Broken unless `act` says from γ what `step` does, and the covariance follows from it."""
+    """Raise Broken unless `act` predicts from γ what `step` does, and the covariance follows from it."""
     for k, (before, heard, after) in enumerate(steps):
         with calling(f"slot {k}: act()", kind):
             action = receiver.act(k, heard.gamma)
@@ -64,7 +64,7 @@ def _name(action: int) -> str:
 
 
 def expect_expected(problem: Problem, outcomes_at: OutcomesAt, errors: Sequence[Floats]) -> None:
-    """Raise Broken if squared errors (R,) of every slot are not in the mean what outcomes say; chance is allowed for."""
+    """Raise Broken if the mean squared errors (R,) of every slot contradict the outcomes beyond chance."""
     outcomes = outcomes_at(QUALITY)
     parts = (outcomes.predicted, outcomes.decoded, outcomes.leaked, outcomes.state, outcomes.misled)
     if abs(sum(parts) - 1.0) > 1e-9 or min(parts) < 0.0:

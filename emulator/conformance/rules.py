@@ -1,4 +1,4 @@
-"""Rules that a class keeps or breaks, and how what it does is written down, guarded and compared."""
+"""Rules that a class keeps or breaks, and tools to call its code, guard arrays and compare results."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,8 @@ from evedrop.streams import root_of_seed, stream_key
 
 Array = NDArray[Any]
 _ROOT = root_of_seed(0)
-_SHOWN = 60  # characters of a value that a message repeats
-_SLACK = 1e-9  # of a probability, for rounding
+_SHOWN = 60  # characters of a value that messages repeat
+_SLACK = 1e-9  # on a probability, for rounding
 
 
 class Broken(Exception):
@@ -26,24 +26,25 @@ class Broken(Exception):
 
 
 class _NotAskedFor(Exception):
-    """A class reached for a key that it has not named."""
+    """A class used a key that it has not named."""
 
 
 @dataclass(frozen=True)
 class RuleVerdict:
-    """What became of one rule."""
+    """The verdict on one rule."""
 
     rule: str
     broken: str | None
-    """How; None if it is kept on all problems."""
+    """How it is broken; None if it is kept on all problems."""
 
 
+@final
 class NamedKeys(dict[str, bytes]):
-    """NamedKeys of the streams that a class has named; reaching for any other is an error. Final."""
+    """The keys of the streams that a class has named; using any other is an error."""
 
     @classmethod
     def of(cls, streams: Sequence[str]) -> NamedKeys:
-        """Of these streams."""
+        """The keys of these streams."""
         return cls({name: stream_key(_ROOT, f"secret/{name}") for name in streams})
 
     def __missing__(self, name: str) -> bytes:
@@ -57,7 +58,7 @@ def key(name: str) -> bytes:
 
 @contextlib.contextmanager
 def calling(what: str, kind: type) -> Iterator[None]:
-    """Make any error of somebody's code one that says what was called, and where in that code it happened."""
+    """Turn any error of custom code into one that names the call, and the place in that code."""
     try:
         yield
     except Broken:
@@ -74,14 +75,14 @@ def calling(what: str, kind: type) -> Iterator[None]:
 
 
 def frozen(array: Array) -> Array:
-    """A copy that cannot be changed."""
+    """A read-only copy."""
     made = np.array(array)
     made.flags.writeable = False
     return made
 
 
 def expect_array(where: str, found: Any, dtype: Any, shape: tuple[int, ...], means: str) -> None:
-    """Raise Broken unless something is an array of this type and shape. where: such as `slot 3: Packet.z`."""
+    """Raise Broken unless a value is an array of this type and shape. where: such as `slot 3: Packet.z`."""
     if not isinstance(found, np.ndarray):
         raise Broken(
             f"{where} is {type(found).__name__}; expected an array of {np.dtype(dtype)}, shape {shape}: {means}"
@@ -95,7 +96,7 @@ def expect_array(where: str, found: Any, dtype: Any, shape: tuple[int, ...], mea
 
 
 def expect_finite(where: str, found: Array, first: int = 0) -> None:
-    """Raise Broken where a number is not finite; the last axis is the trials, from this first one on."""
+    """Raise Broken where a number is not finite; the last axis is the trials, from number `first` on."""
     bad = ~np.isfinite(found)
     if bad.any():
         trial = first + int(np.argwhere(bad)[0][-1])
@@ -103,30 +104,30 @@ def expect_finite(where: str, found: Array, first: int = 0) -> None:
 
 
 Row = Mapping[str, Array]
-"""What was done in one slot: name → array whose last axis is the trials."""
+"""The results of one slot: name → array whose last axis is the trials."""
 
 
 def expect_names(where: str, found: Any) -> None:
-    """Raise Broken unless something is a tuple of names, each once."""
+    """Raise Broken unless a value is a tuple of distinct names."""
     names = isinstance(found, (tuple, list)) and all(isinstance(name, str) and name for name in found)
     if not names or len(set(found)) < len(found):
         raise Broken(f"{where} is {_short(found)}; expected a tuple of names, each once, such as ('schedule',)")
 
 
 def expect_bool(where: str, found: Any) -> None:
-    """Raise Broken unless something is True or False."""
+    """Raise Broken unless a value is True or False."""
     if type(found) is not bool:
         raise Broken(f"{where} is {_short(found)}; expected True or False")
 
 
 def expect_probability(where: str, found: Any) -> None:
-    """Raise Broken unless something is a number from 0 to 1."""
+    """Raise Broken unless a value is a number from 0 to 1."""
     if isinstance(found, bool) or not isinstance(found, (int, float, np.floating)) or not 0.0 <= found <= 1.0:
         raise Broken(f"{where} is {_short(found)}; expected a number from 0 to 1")
 
 
 def expect_outcomes(where: str, found: Any) -> None:
-    """Raise Broken unless something is `Outcomes` of probabilities, or None."""
+    """Raise Broken unless a value is `Outcomes` of probabilities, or None."""
     if found is None:
         return
     if not isinstance(found, Outcomes):
@@ -149,7 +150,7 @@ def _short(value: Any) -> str:
 def expect_same(one: Sequence[Row], other: Sequence[Row], trials: slice, first: int, said: str, remedy: str) -> None:
     """Raise Broken at the first slot, array and trial in which two records differ by a bit.
 
-    trials: those of `one` that `other` has; first: the number of its first; said: with places for both values.
+    trials: those of `one` that `other` has; first: the number of the first of them; said: a text with places for both values.
     """
     for k, (row, again) in enumerate(zip(one, other, strict=True)):
         for name, found in row.items():
@@ -162,17 +163,17 @@ def expect_same(one: Sequence[Row], other: Sequence[Row], trials: slice, first: 
 
 
 def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
-    """Where bits differ: a NaN is itself, and 0 is not −0."""
+    """Where bits differ: a NaN equals itself, and 0 differs from −0."""
     width = f"u{one.dtype.itemsize}"
     return np.asarray(np.ascontiguousarray(one).view(width) != np.ascontiguousarray(other).view(width))
 
 
 Rule = tuple[str, Callable[[Any], None]]
-"""A title, and a check of one problem that raises Broken."""
+"""A title, and a check on one problem that raises Broken."""
 
 
 def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[RuleVerdict]:
-    """Every rule on every problem of its group, until one breaks it; once the very first is broken, no other is asked."""
+    """The verdict on every rule, on each problem of its group until one breaks it; if the very first is broken, no others."""
     verdicts: list[RuleVerdict] = []
     for rules, problems in groups:
         for title, check in rules:
@@ -195,6 +196,6 @@ def how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
     except Broken as error:
         return str(error)
     except Exception as error:
-        # What it gave us may break at any place, ours included.
+        # A value that the class returned may break any code, including ours.
         return f"what it returned led to {place_of(error)}; expected what the base class describes"
     return None

@@ -1,9 +1,11 @@
-"""What a scheme must keep to.
+"""The rules for schemes.
 
 Source: docs/your-own.md.
 """
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 
@@ -34,7 +36,7 @@ _STATE = "keep no state outside of what is made from the keys, and take random n
 
 
 def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict]:
-    """Every rule for schemes, on small problems; scheme_of makes the scheme of a process."""
+    """Check every rule for schemes, on small problems; scheme_of makes the scheme of a process."""
     checks = SchemeChecks(scheme_of, kind)
     exact = [
         ("shapes and types", checks.shapes),
@@ -50,8 +52,9 @@ def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict
     return judged((exact, small()), (in_the_mean, large()))
 
 
+@final
 class SchemeChecks:
-    """The rules, each of one problem. Final."""
+    """The rules, each checked on one problem."""
 
     def __init__(self, scheme_of: SchemeOf, kind: type[Scheme]) -> None:
         self._scheme_of, self._kind = scheme_of, kind
@@ -60,7 +63,7 @@ class SchemeChecks:
         return list(played(self._scheme_of, problem, self._kind, apart=apart, rubbish=rubbish))
 
     def shapes(self, problem: Problem) -> None:
-        """Everything has the shape and type that it must have, made together and apart, and no input is changed."""
+        """All results have the right shapes and types, made together and apart, and no input is changed."""
         for name in ("secret_streams", "estimator_streams", "header"):
             expect_names(name, getattr(self._kind, name))
         for name in ("needs_acknowledgements", "reads_packets", "may_be_silent"):
@@ -68,7 +71,7 @@ class SchemeChecks:
         scheme = made(self._scheme_of, problem, self._kind)
         more = sorted(set(scheme.estimator_streams) - set(scheme.secret_streams))
         if more:
-            raise Broken(f"estimator_streams has {more}, which secret_streams has not; expected some of those")
+            raise Broken(f"estimator_streams has {more}, which secret_streams lacks; expected some of those")
         expect_probability("state_probability", scheme.state_probability)
         for apart in (False, True):
             for _ in played(self._scheme_of, problem, self._kind, apart=apart):
@@ -86,17 +89,17 @@ class SchemeChecks:
             raise Broken(f"packet_bits, secret_bits and initial_secret_bits are {bits!r:.80}; expected whole numbers")
 
     def twice(self, problem: Problem) -> None:
-        """Two that work in turns do what one does by itself."""
+        """Two that take turns do the same as one alone."""
         once = [slot.row for slot in self._slots(problem)]
         pair = (played(self._scheme_of, problem, self._kind) for _ in range(2))
         both = list(zip(*pair, strict=True))
         for which in (0, 1):
             rows = [slots[which].row for slots in both]
-            said = "{0!r} by itself and {1!r} beside another one of its kind"
+            said = "{0!r} by itself and {1!r} with another one of its kind"
             expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
 
     def alone(self, problem: Problem) -> None:
-        """A trial alone is the same trial, to the bit."""
+        """A trial alone gives the same bits as among others."""
         among = [slot.row for slot in self._slots(problem)]
         for trial in (0, problem.batch.trials - 1):
             one = [slot.row for slot in self._slots(problem.part(trial, 1))]
@@ -105,7 +108,7 @@ class SchemeChecks:
             expect_same(among, one, slice(trial, trial + 1), number, said, _COLUMN)
 
     def apart(self, problem: Problem) -> None:
-        """Sensor and estimator that were made by themselves, as in a live run, do what they do in memory."""
+        """Sensor and estimator made separately, as in a live run, do the same as in memory."""
         together = [slot.row for slot in self._slots(problem)]
         said = "{0!r} made from shared() and {1!r} made from encoder() and estimator()"
         remedy = "make both sides from the keys alone, so that processes of their own agree"
@@ -113,7 +116,7 @@ class SchemeChecks:
         expect_same(together, rows, slice(None), problem.batch.first_trial, said, remedy)
 
     def again(self, problem: Problem) -> None:
-        """The estimator answers for a slot as it did, whatever came after."""
+        """The estimator gives the same answer for a slot after later slots."""
         slots = self._slots(problem)
         scheme = made(self._scheme_of, problem, self._kind)
         with calling("estimator()", self._kind):
@@ -121,22 +124,22 @@ class SchemeChecks:
         expect_pure(estimator, [(one.before, one.heard, one.after) for one in slots], problem, self._kind)
 
     def lost(self, problem: Problem) -> None:
-        """What stands in place of a packet that was lost changes nothing."""
+        """The value in place of a lost packet changes nothing."""
         zeros = [row_of(slot.after) for slot in self._slots(problem)]
         rubbish = [row_of(slot.after) for slot in self._slots(problem, rubbish=1e30)]
-        said = "{0!r} or {1!r}, by what stands in z where nothing was received"
+        said = "{0!r} or {1!r}, depending on z where nothing was received"
         remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
         expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, said, remedy)
 
     def first(self, problem: Problem) -> None:
-        """The packet of slot 0 is no innovation: there is no state before it."""
+        """The packet of slot 0 is not an innovation, because there is no state before it."""
         slot = next(iter(played(self._scheme_of, problem, self._kind)))
         if slot.packet.nu.any():
             trial = problem.batch.first_trial + int(np.argmax(slot.packet.nu))
             raise Broken(f"slot 0, trial {trial}: nu is true; expected false, for there is no state before the first")
 
     def actions(self, problem: Problem) -> None:
-        """Unless it reads packets, γ alone tells what the estimator does, and so what it believes."""
+        """Unless it reads packets, γ alone determines the estimator's actions, and so its beliefs."""
         scheme = made(self._scheme_of, problem, self._kind)
         if scheme.reads_packets:
             return
@@ -146,19 +149,19 @@ class SchemeChecks:
         expect_actions(estimator, steps, problem, self._kind, "set reads_packets = True if it depends on more than γ")
 
     def prediction(self, problem: Problem) -> None:
-        """The estimator is never farther from the state, in the mean, than who hears nothing."""
+        """The estimator's mean error never exceeds that of a receiver that hears nothing."""
         for slot in self._slots(problem):
             own = ((slot.x - slot.after.x_hat) ** 2).sum(axis=0)
             gain = (slot.x**2).sum(axis=0) - own
             error = float(gain.std()) / float(np.sqrt(len(gain)))
             if gain.mean() < -SIGMAS * error - 1e-12:
                 raise Broken(
-                    f"slot {slot.k}: the mean squared error is {own.mean():.4g}, and {own.mean() + gain.mean():.4g} for who "
-                    "hears nothing; decode what encode() has made, with the same slot's numbers"
+                    f"slot {slot.k}: the mean squared error is {own.mean():.4g}, and {own.mean() + gain.mean():.4g} for a "
+                    "receiver that hears nothing; decode what encode() has made, with the same slot's numbers"
                 )
 
     def theory(self, problem: Problem) -> None:
-        """What `outcomes` says is what happens, if it says anything."""
+        """The outcomes it states are the observed ones, if it states any."""
         scheme = made(self._scheme_of, problem, self._kind)
         outcomes_at = legitimate_outcomes(scheme)
         if outcomes_at is None:

@@ -1,1 +1,1 @@
-"""What theory expects of a scenario, and what can be said before it starts."""
+"""Theory's expectations of a scenario, and statements about a run before it starts."""

@@ -1,4 +1,4 @@
-"""Closed forms of receivers whose slots are not alike, because what is sent depends on acknowledgements.
+"""Closed forms for receivers whose slots differ, because the packets depend on acknowledgements.
 
 Source: docs/mathematics.md, acknowledged references and schedules by holding time.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -24,22 +25,23 @@ from evedrop.scenario import Scenario
 Split = tuple[float, float]
 
 
+@final
 @dataclass(frozen=True)
 class Closed:
-    """One receiver's expected error covariance over the slots of a run. Final."""
+    """One receiver's expected error covariance over the slots of a run."""
 
     process: Process
     slots: int
     received: float
-    """The probability that it hears a packet that is sent."""
+    """The probability that it receives a packet that is sent."""
     acknowledged: Split
-    """Probabilities that a packet is acknowledged and it heard it, and that it is acknowledged and it did not."""
+    """Probabilities that a packet is acknowledged and the receiver heard it, and that it is acknowledged and it did not."""
     chain: SensorChain | None
-    """What the sensor does; None of one that sends in every slot."""
+    """The sensor's behaviour; None if it sends in every slot."""
 
     @cached_property
     def traces(self) -> Floats:
-        """Of all slots, (slots,)."""
+        """The traces of all slots, (slots,)."""
         if self.chain is not None:
             found = self.chain.covariances(self.process, self.slots)
         else:
@@ -49,7 +51,7 @@ class Closed:
 
     @cached_property
     def limit(self) -> float:
-        """Trace of the limit; inf if it is unbounded, NaN if it is too large to work out."""
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
         if self.chain is not None:
             if len(self.chain.start) * self.process.n**2 > theory.LARGEST_OPERATOR:
                 return float("nan")
@@ -59,36 +61,37 @@ class Closed:
         return theory.limit_trace(self.process, Outcomes.plain(self.received))
 
 
+@final
 class ClosedStream:
-    """Its traces, the next slots at a time. Final."""
+    """The traces of a closed form, a number of slots at a time."""
 
     def __init__(self, closed: Closed) -> None:
         self._closed, self._next = closed, 0
 
     def next_traces(self, slots: int) -> Floats:
-        """Of the next slots, (slots,)."""
+        """The traces of the next slots, (slots,)."""
         self._next += slots
         return self._closed.traces[self._next - slots : self._next]
 
 
 def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
-    """Of a receiver; None where its scheme and strategy have none, or links are not as the closed forms assume them.
+    """A receiver's closed form; None if scheme and strategy have none, or the links violate its assumptions.
 
-    They assume links of independent losses without delay, and an attack that does not come and go.
+    It assumes links of independent losses without delay, and an attack that is always on or always off.
     """
     table = scenario.acknowledgements
     if table is None or (table.attack != "none" and scenario.timeline.jams is not None):
         return None
     needed = {LEGITIMATE, receiver} | ({table.jammer} if table.jammer is not None else set())
     threshold = scenario.encoding.parameters.get("threshold", 1)
-    long = type(threshold) is int and threshold > theory.LARGEST_OPERATOR  # one state of the chain for each slot of it
+    long = type(threshold) is int and threshold > theory.LARGEST_OPERATOR  # the chain has one state for each slot of it
     if long or not all(_independent(scenario, name) for name in needed):
         return None
     process, quality = scenario.process.process, scenario.quality
     split = _split(scenario, receiver)
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
     kind = SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
-    # Unless acknowledgements are forged the user never misses a reference, and what it does with a slot tells more.
+    # Unless acknowledgements are forged the user never misses a reference, so it knows more about each slot.
     told = receiver != LEGITIMATE or table.attack == "forge"
     if kind == "reference" and told and not ReferenceCode(process).decorrelates:
         return Closed(process, scenario.slots, quality[receiver], split, None)
@@ -115,7 +118,7 @@ def _split(scenario: Scenario, receiver: str) -> Split:
 
 
 def _independent(scenario: Scenario, receiver: str) -> bool:
-    """Whether a link loses packets each by itself, and neither delays nor changes; colluding links are one."""
+    """Whether a link loses packets independently, and neither delays nor changes; colluding links count as one."""
     course = scenario.course(receiver)
     law = law_of(course)
     if law is None or law.alike is None or course.correlation is not None or course.outages or course.changes:

@@ -1,4 +1,4 @@
-"""What can be said of a run before it starts: is the estimator bounded, and how much will be written."""
+"""Statements about a run before it starts: whether the estimator is bounded, and how much will be written."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.filter_noise import is_singular
 
 _LARGE_BYTES = 1e9
-_SHOWN_STATES = 3  # of a matrix that is written out
-_NEAR = 0.01  # of a covariance's largest entry
+_SHOWN_STATES = 3  # the largest matrix that is written out
+_NEAR = 0.01  # relative to a covariance's largest entry
 
 
 def warnings_of(scenario: Scenario) -> list[str]:
-    """What the user should know before the run; it goes on all the same.
+    """Warnings that the user should read before the run; the run starts regardless.
 
     Source: docs/mathematics.md, secrecy and design (stability bound).
     """
@@ -51,12 +51,12 @@ def warnings_of(scenario: Scenario) -> list[str]:
         )
     for module, source in sources_of(scenario.model_dump(mode="json")).items():
         if scenario.made_with.get(module, source) != source:
-            found.append(f"the {module} is not the one these results were made with; its digests may be others")
+            found.append(f"the {module} is not the one these results were made with; its digests may differ")
     return found
 
 
 def _filter_warnings(scenario: Scenario) -> list[str]:
-    """What a sensor that filters does to Q, and what a singular Q does to the secret.
+    """Warnings about a Q that does not match the sensor's filter, and about a singular Q, which reveals packet types.
 
     Source: docs/mathematics.md, a filter at the sensor.
     """
@@ -67,20 +67,20 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
         if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
             small = process.n <= _SHOWN_STATES
             found.append(
-                f"process.Q is {process.Q.tolist() if small else 'another'}, but what the sensor's filter adds a slot has the "
-                f"covariance {wanted.tolist() if small else 'of its innovations'}: "
-                f'process.Q = "filter" takes that; inputs and disturbances come to it'
+                f"process.Q is {process.Q.tolist() if small else 'another'}, but the sensor's filter adds, per slot, noise "
+                f"with the covariance {wanted.tolist() if small else 'of its innovations'}: "
+                f'process.Q = "filter" uses that; inputs and disturbances are not in it'
             )
     if process.singular_noise and is_singular(process.Q):
         found.append(
-            "process.Q is singular: two states one after the other differ, but for A and what inputs and disturbances do, "
-            "within its range alone, and that gives the type of packets away to whoever looks"
+            "process.Q is singular: apart from A, inputs and disturbances, consecutive states differ only "
+            "within its range, which reveals the type of packets to anybody who looks"
         )
     return found
 
 
 def written_bytes(scenario: Scenario) -> float:
-    """Bytes the results folder will have, about, before compression."""
+    """The approximate size of the results folder in bytes, before compression."""
     n, receivers = len(scenario.process.A), len(scenario.receivers)
     recorded_row = 8 * (2 * n + n * n) + 40
     journal_row = scenario.trials / 8 + 60

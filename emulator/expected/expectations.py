@@ -1,11 +1,11 @@
-"""What theory expects of each receiver of a scenario, as far as theory knows its link."""
+"""Theory's expectation for each receiver of a scenario, as far as theory covers its link."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Protocol, final
 
 import numpy as np
 
@@ -22,17 +22,18 @@ from evedrop.scenario import Scenario
 
 
 class ExpectedTraceStream(Protocol):
-    """Expected traces, the next slots at a time."""
+    """Expected traces, a number of slots at a time."""
 
     def next_traces(self, slots: int) -> Floats:
-        """Of the next slots, (slots,)."""
+        """The traces of the next slots, (slots,)."""
 
 
+@final
 class _Unknown:
-    """Of a receiver that no theory is for. Final."""
+    """The stream of a receiver for which there is no theory."""
 
     def next_traces(self, slots: int) -> Floats:
-        """Nothing, (slots,)."""
+        """NaN for each slot, (slots,)."""
         return np.full(slots, np.nan)
 
 
@@ -42,17 +43,17 @@ class Expectation:
 
     process: Process
     law: LinkLaw | None
-    """None: theory does not know the link."""
+    """None: theory does not cover the link."""
     outcomes_at: OutcomesAt | None
-    """From the quality of a link to what the receiver does with a slot; None: nobody knows how often it does what."""
+    """Maps a link's quality to the frequencies of the receiver's actions; None if these are unknown."""
     bound_at: OutcomesAt | None = None
-    """Of a receiver without the secret that has no theory of its own: the genie, which nobody outdoes."""
+    """For a receiver without the secret and without a theory of its own: the genie, which no such receiver outperforms."""
     closed: Closed | None = None
-    """Its own closed form, of a receiver whose slots are not alike."""
+    """The closed form of a receiver whose slots differ."""
 
     @property
     def known(self) -> bool:
-        """Whether there is a theory for the link and for what the receiver does."""
+        """Whether there is a theory for the link and for the receiver's actions."""
         return self.closed is not None or self._known is not None
 
     @property
@@ -61,7 +62,7 @@ class Expectation:
 
     @property
     def _outcomes(self) -> Outcomes | None:
-        """Of a link whose losses are independent, as in the paper."""
+        """The outcomes behind a link whose losses are independent, as in the paper."""
         if self._known is None:
             return None
         law, outcomes_at = self._known
@@ -70,7 +71,7 @@ class Expectation:
 
     @property
     def bound(self) -> Expectation | None:
-        """What the receiver's error cannot fall below, if that is all that theory knows of it."""
+        """A lower bound on the receiver's error, if theory knows only that."""
         if self.known or self.law is None or self.bound_at is None:
             return None
         return Expectation(self.process, self.law, self.bound_at)
@@ -89,7 +90,7 @@ class Expectation:
 
     @property
     def limit(self) -> float:
-        """Trace of the limit, behind the link as it is in the end; inf if unbounded, NaN where there is no theory."""
+        """Trace of the limit, for the link in its last state; inf if unbounded, NaN where there is no theory."""
         if self.closed is not None:
             return self.closed.limit
         if self._outcomes is not None:
@@ -112,7 +113,7 @@ class Expectation:
 
 
 def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
-    """From the quality of a receiver's link to what it does with a slot; None: nobody knows how often it does what."""
+    """Maps the quality of a receiver's link to the frequencies of its actions; None if these are unknown."""
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     if receiver == LEGITIMATE:
         return legitimate_outcomes(scheme)
@@ -121,7 +122,7 @@ def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
-    """The same of the genie behind a receiver's link, where it bounds the receiver: against the secret, and without it."""
+    """The same for the genie behind a receiver's link, where it bounds the receiver: for schemes it bounds, without leaks."""
     scheme = SCHEMES[scenario.encoding.scheme]
     if receiver == LEGITIMATE or receiver in scenario.leaks or not scheme.sends_states_and_innovations:
         return None
@@ -129,7 +130,7 @@ def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 
 
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
-    """Receiver → what theory expects of it."""
+    """Receiver → theory's expectation of it."""
     return {
         name: Expectation(
             scenario.process.process,

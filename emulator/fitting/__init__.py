@@ -1,4 +1,4 @@
-"""From a recording of a link to the model that a scenario can have for it.
+"""Finds the model of a recorded link for use in a scenario.
 
 Source: docs/mathematics.md, estimating a link; docs/links.md.
 """

@@ -1,4 +1,4 @@
-"""A model that might have made a recording, and how well it explains it."""
+"""A model that may have produced a recording, and how well it explains it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 Interval = tuple[float, float]
-_NORMAL = 1.959963984540054  # of 95 %
+_NORMAL = 1.959963984540054  # for 95 %
 
 
 @dataclass(frozen=True)
@@ -17,19 +17,19 @@ class Candidate:
 
     name: str
     spec: Mapping[str, Any]
-    """As a scenario has it: `model`, and the parameters."""
+    """The model as a scenario describes it: `model`, and the parameters."""
     log_likelihood: float
     parameters: int
-    """How many were estimated."""
+    """The number of parameters that were estimated."""
     intervals: Mapping[str, Interval] = field(default_factory=dict)
-    """95 % confidence intervals, for those parameters that have a simple one."""
+    """95 % confidence intervals, for parameters that have a simple one."""
 
     def bic(self, count: int) -> float:
-        """Schwarz's criterion for so many observations: the less, the better."""
+        """Schwarz's criterion for `count` observations; smaller is better."""
         return -2.0 * self.log_likelihood + self.parameters * math.log(count)
 
     def as_dict(self, count: int) -> dict[str, Any]:
-        """For programs."""
+        """The candidate as JSON values."""
         return {
             "name": self.name,
             "spec": dict(self.spec),
@@ -52,7 +52,7 @@ class Candidate:
 
 
 def wilson(hits: int, count: int) -> Interval:
-    """The 95 % confidence interval of a probability with so many hits of so many.
+    """The 95 % confidence interval of a probability, from the number of hits in `count` trials.
 
     Source: Wilson (1927).
     """
@@ -68,5 +68,5 @@ def normal_interval(value: float, error: float) -> Interval:
 
 
 def rounded(value: float) -> float:
-    """To four digits, as many as recordings are good for."""
+    """Rounded to four digits, which is the precision that recordings allow."""
     return float(f"{value:.4g}")

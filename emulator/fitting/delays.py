@@ -11,7 +11,7 @@ from evedrop.model.process import Floats
 
 
 def delay_candidates(delays: Floats) -> list[Candidate]:
-    """What delays in slots, (packets,), may be: constant if they are all alike, else normal, or Pareto if none is 0."""
+    """Models for delays in slots, (packets,): constant if all are equal, otherwise normal, or Pareto if none is 0."""
     count, least, mean = len(delays), float(delays.min()), float(delays.mean())
     if least == float(delays.max()):
         return [Candidate("constant", {"model": "constant", "value": rounded(least)}, 0.0, 1)]

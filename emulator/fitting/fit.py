@@ -1,4 +1,4 @@
-"""The whole of it: a recording's candidates, the one to take, how well it fits, and the line for the scenario."""
+"""The fit of a recording: candidates, the chosen model, its goodness of fit, and the line for the scenario."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evedrop.model.links.checks import toml_of
 from evedrop.recordings.link_recording import LinkRecording, Outcomes
 
 FEWEST = 100
-"""Outcomes from which something can be estimated."""
+"""The fewest outcomes from which a model can be estimated."""
 _FEWEST_DELAYS = 10
 _LEVEL = 0.01
 DELAY = "delay"
@@ -26,20 +26,20 @@ DELAY = "delay"
 
 @dataclass(frozen=True)
 class RunLengths:
-    """Bursts, or gaps: runs of lost, or delivered, packets that begin and end within the recording."""
+    """Bursts or gaps: runs of lost or delivered packets that begin and end within the recording."""
 
     count: int
     mean: float | None
-    """Slots, found; None if there are none."""
+    """Slots, observed; None if there are no runs."""
     fitted: float
-    """Slots, under the model chosen."""
+    """Slots, under the chosen model."""
     p_value: float | None
-    """None: too few to tell."""
+    """None: too few runs for a test."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What was found in a recording."""
+    """The result of fitting a recording."""
 
     trace: str
     count: int
@@ -63,7 +63,7 @@ class Fit:
 
     @property
     def link(self) -> dict[str, Any]:
-        """The link as a scenario has it."""
+        """The link as a scenario describes it."""
         delay = self.chosen_delay
         return {"loss": dict(self.chosen.spec)} | ({} if delay is None else {"delay": dict(delay.spec)})
 
@@ -74,22 +74,22 @@ class Fit:
 
     @property
     def goodness(self) -> str:
-        """How well the model chosen explains the lengths of bursts and gaps, in a sentence."""
+        """How well the chosen model explains the lengths of bursts and gaps, in a sentence."""
         told = {"bursts": self.bursts.p_value, "gaps": self.gaps.p_value}
         judged = {name: value for name, value in told.items() if value is not None}
         shown = " and ".join(f"{value:.2g} for {name}" for name, value in judged.items())
         if not judged:
             return f"too few bursts ({self.bursts.count}) to tell how well it fits"
-        # Each of two tests at half the level: both together are wrong about a right model once in a hundred recordings.
+        # Each of two tests has half the level: together they reject a correct model in one of a hundred recordings.
         if min(judged.values()) < _LEVEL / 2.0:
             return (
                 f"it does NOT explain how long bursts and gaps last (chi-square, p = {shown}): the link has habits that none "
                 'of these models has; use the recording itself, model = "trace"'
             )
-        return f"bursts and gaps last as long as it would have them (chi-square, p = {shown})"
+        return f"bursts and gaps last as long as the model predicts (chi-square, p = {shown})"
 
     def as_dict(self) -> dict[str, Any]:
-        """For programs."""
+        """The fit as JSON values."""
         delay = self.chosen_delay
         return {
             "trace": self.trace,
@@ -109,11 +109,11 @@ class Fit:
 
 
 def fit(path: Path, column: str | None = None, delay_column: str | None = None) -> Fit:
-    """The models that may have made a recording.
+    """Find the models that may have produced a recording.
 
-    column: of the outcomes, for a file of several; delay_column: of delays in slots, by default `delay` if there is one.
+    column: that of the outcomes, in a file with several; delay_column: that of delays in slots, by default `delay` if present.
 
-    Raises TraceError if the file is no recording, or nothing can be estimated from it.
+    Raises TraceError if the file is not a recording, or if nothing can be estimated from it.
     """
     recording = LinkRecording(path)
     names = recording.columns()
@@ -155,7 +155,7 @@ def _check(path: Path, outcomes: Outcomes) -> None:
             str(path),
             "file",
             f"has {count} outcomes, all {all_or_none}: the quality is {bound} with 95 % confidence if losses are independent, "
-            "and nothing can be told of bursts; expected a recording with both, such as a longer one",
+            "and nothing can be said about bursts; expected a recording with both, such as a longer one",
         )
 
 
@@ -171,14 +171,14 @@ def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
 
 
 def lines(found: Fit) -> list[str]:
-    """What is printed."""
+    """The fit as printed lines."""
     share = 100.0 * found.lost / found.count
-    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots in the mean"
+    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots on average"
     told = [
         f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}"
     ]
     told += _table(found.candidates, found.chosen, found.count)
-    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots in the mean")
+    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots on average")
     told.append(f"fit: {found.goodness}")
     if found.chosen_delay is not None:
         told.append(f"{found.delays} delays")

@@ -1,7 +1,7 @@
-"""Baum and Welch's expectation-maximisation for a hidden chain of two states and two outcomes.
+"""Baum and Welch's expectation-maximisation for a hidden chain with two states and two outcomes.
 
-The recording is cut into chunks that lie side by side, so that a step of the recursion is taken in all of them at once:
-first what a chunk makes of any state before it, then from chunk to chunk, then inside.
+The recording is cut into chunks, and each step of the recursion is computed for all of them at once: first the effect of
+each chunk on any state before it, then from chunk to chunk, then inside the chunks.
 
 Source: Baum, Petrie, Soules, Weiss (1970); Rabiner (1989) for the scaling; docs/mathematics.md, estimating a link.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,13 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.recordings.link_recording import Outcomes
 
-_SCOUTED = 50_000  # outcomes by which starts are compared
+_SCOUTED = 50_000  # outcomes on which starting points are compared
 _SCOUTING, _MOST = 40, 400  # steps
-_ENOUGH = 0.002  # of log-likelihood that is still to be gained
-_NOTHING = 2e-5  # of log-likelihood in a step
-_IN_A_ROW = 4  # steps that find so: while a fast gain gives way to a slow one, the estimate is too small
+_ENOUGH = 0.002  # remaining gain in log-likelihood at which to stop
+_NOTHING = 2e-5  # gain in log-likelihood of a step that counts as none
+_IN_A_ROW = 4  # such steps before stopping: while a fast gain gives way to a slow one, the estimate is too small
 _LEAST = 1e-9
-_RESCALED = 8  # steps that a product of probabilities goes without
+_RESCALED = 8  # steps between rescalings of a product of probabilities
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,11 @@ class TwoStates:
         return np.array([self.good, self.bad])
 
     def ordered(self) -> TwoStates:
-        """The same with the names such that bad loses more."""
+        """The same model with the states named such that bad loses more."""
         return self if self.good <= self.bad else TwoStates(self.r, self.p, self.bad, self.good)
 
     def log_likelihood_of_states(self, bad: Flags) -> float:
-        """Of a recording that shows the states themselves, (packets,)."""
+        """The log-likelihood of a recording that shows the states themselves, (packets,)."""
         law = np.array([1.0 - self.in_bad, self.in_bad])
         at = bad.astype(np.intp)
         counts = np.bincount(2 * at[:-1] + at[1:], minlength=4).reshape(2, 2)
@@ -67,7 +68,7 @@ class TwoStates:
 def most_likely(outcomes: Outcomes, starts: Iterable[TwoStates]) -> tuple[TwoStates, float]:
     """The best of the local maxima that expectation-maximisation reaches, and its log-likelihood.
 
-    All starts go some steps on the first part of the recording; the best two go on to the end on all of it.
+    All starting points take some steps on the first part of the recording; the best two continue to the end on all of it.
     """
     some = _Chunks(outcomes[:_SCOUTED])
     scouted = sorted((_climb(some, start, _SCOUTING) for start in starts), key=lambda found: -found[1])
@@ -77,14 +78,14 @@ def most_likely(outcomes: Outcomes, starts: Iterable[TwoStates]) -> tuple[TwoSta
 
 
 def log_likelihood(outcomes: Outcomes, model: TwoStates) -> float:
-    """Of a recording under a model that starts in its stationary law."""
+    """The log-likelihood of a recording under a model that starts in its stationary law."""
     return _Chunks(outcomes).step(model)[1]
 
 
 def _climb(chunks: _Chunks, model: TwoStates, steps: int) -> tuple[TwoStates, float]:
-    """Expectation and maximisation in turn, until little is to be gained: the best model met, its log-likelihood.
+    """Alternate expectation and maximisation until little can be gained; returns the best model and its log-likelihood.
 
-    What each step gains shrinks like a geometric series, whose rest is estimated from two gains (Aitken).
+    The gains of the steps decrease like a geometric series, whose remainder is estimated from two gains (Aitken).
     """
     best, reached, before, done = model, -np.inf, np.inf, 0
     for _ in range(steps):
@@ -99,20 +100,21 @@ def _climb(chunks: _Chunks, model: TwoStates, steps: int) -> tuple[TwoStates, fl
     return best, float(reached)
 
 
+@final
 class _Chunks:
-    """A recording in chunks side by side: step t of all chunks is row t. Final."""
+    """A recording divided into chunks: step t of all chunks is row t."""
 
     def __init__(self, outcomes: Outcomes) -> None:
         self._count = len(outcomes)
-        self._length = max(8, int(0.16 * self._count**0.5))  # as much time between chunks as inside them
+        self._length = max(8, int(0.16 * self._count**0.5))  # balances the time between chunks and inside them
         chunks = -(-self._count // self._length)
-        padded = np.full(chunks * self._length, 2, np.uint8)  # 2: not known
+        padded = np.full(chunks * self._length, 2, np.uint8)  # 2: unknown
         padded[: self._count] = outcomes
         self._symbols = np.ascontiguousarray(padded.reshape(chunks, self._length).T)
-        self._rest = self._count - (chunks - 1) * self._length  # steps of the last chunk that are known
+        self._rest = self._count - (chunks - 1) * self._length  # known steps of the last chunk
 
     def step(self, model: TwoStates) -> tuple[TwoStates, float]:
-        """The model that one step of expectation-maximisation leads to, and the log-likelihood of the one given."""
+        """The model after one step of expectation-maximisation, and the log-likelihood of the given model."""
         emission = np.array([model.loss, 1.0 - model.loss, np.ones(2)])[self._symbols]  # (steps, chunks, 2)
         in_good, in_bad = np.ascontiguousarray(emission[..., 0]), np.ascontiguousarray(emission[..., 1])
         starts, ends = self._between(model, in_good, in_bad)
@@ -121,7 +123,7 @@ class _Chunks:
         return _maximised(counts), float(np.log(scale).sum())
 
     def _between(self, model: TwoStates, in_good: Floats, in_bad: Floats) -> tuple[Floats, Floats]:
-        """P(bad) before each chunk, (chunks,), and how likely what follows it is from good and bad, (2, chunks), up to scale."""
+        """P(bad) before each chunk, (chunks,), and the likelihood of the rest from good and bad, (2, chunks), up to scale."""
         T, steps, chunks = model.transitions, len(in_good), in_good.shape[1]
         product = np.tile(np.eye(2)[:, :, None], (1, 1, chunks))
         for t in range(steps):
@@ -163,7 +165,7 @@ class _Chunks:
     def _backward(
         self, model: TwoStates, in_good: Floats, in_bad: Floats, bad: Floats, scale: Floats, ends: Floats
     ) -> Floats:
-        """How often good and bad went to good and bad, and had a loss, as expected given all: gg, gb, bg, bb, g lost, b lost."""
+        """Expected counts given all outcomes: transitions gg, gb, bg, bb, losses in good, losses in bad."""
         (p, r), steps, chunks = (model.p, model.r), len(in_good), in_good.shape[1]
         after_good, after_bad = ends / (ends[0] * (1.0 - bad[steps]) + ends[1] * bad[steps])
         counts = np.zeros((6, chunks))

@@ -12,7 +12,7 @@ from evedrop.recordings.link_recording import Outcomes
 
 
 def bernoulli(outcomes: Outcomes) -> Candidate:
-    """Every packet alike."""
+    """The same quality for every packet."""
     count, hits = len(outcomes), int(outcomes.sum())
     quality = hits / count
     likelihood = hits * math.log(quality) + (count - hits) * math.log1p(-quality)
@@ -26,12 +26,12 @@ def bernoulli(outcomes: Outcomes) -> Candidate:
 
 
 def gilbert(outcomes: Outcomes) -> Candidate:
-    """Gilbert's: good loses nothing and bad everything, so that the outcomes are the states and their changes are counted."""
+    """Gilbert's model: good loses nothing and bad everything, so outcomes are states, and their changes are counted."""
     before, after = outcomes[:-1] == 0, outcomes[1:] == 0
     from_bad = int(before.sum())
     from_good = len(before) - from_bad
     worse, better = int((~before & after).sum()), int((before & ~after).sum())
-    # A recording that ends in the only burst, or begins in it, has not seen one of the changes: as if half of one.
+    # A recording that ends or begins in its only burst lacks one of the changes, which then counts as half a change.
     p, r = (worse or 0.5) / max(1, from_good), (better or 0.5) / max(1, from_bad)
     model = TwoStates(min(p, 1.0), min(r, 1.0), 0.0, 1.0)
     return Candidate(
@@ -44,7 +44,7 @@ def gilbert(outcomes: Outcomes) -> Candidate:
 
 
 def gilbert_elliott(outcomes: Outcomes) -> Candidate:
-    """Gilbert and Elliott's with all four parameters, by expectation-maximisation."""
+    """Gilbert and Elliott's model with all four parameters, by expectation-maximisation."""
     model, likelihood = most_likely(outcomes, _starts(outcomes))
     spec = {"model": "gilbert-elliott", "p": rounded(model.p), "r": rounded(model.r)}
     spec |= {"good": rounded(model.good), "bad": rounded(model.bad)}
@@ -52,7 +52,7 @@ def gilbert_elliott(outcomes: Outcomes) -> Candidate:
 
 
 def _starts(outcomes: Outcomes) -> list[TwoStates]:
-    """Where to begin: Gilbert's own answer, softened, and regimes of some tens, hundreds and thousands of slots."""
+    """Starting points: Gilbert's own solution, softened, and regimes of tens, hundreds and thousands of slots."""
     loss = 1.0 - float(outcomes.mean())
     own = gilbert(outcomes).spec
     mild, harsh = 0.5 * loss, min(0.95, 0.5 + 0.5 * loss)

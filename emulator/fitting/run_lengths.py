@@ -1,4 +1,4 @@
-"""Bursts and gaps: how long they are in a recording, and how long a model would have them.
+"""Bursts and gaps: their lengths in a recording, and under a model.
 
 Source: docs/mathematics.md, estimating a link.
 """
@@ -27,7 +27,7 @@ def lengths_of(within: Flags) -> NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class RunLaw:
-    """The law of the runs of one outcome under a chain with these transitions (states, states) and stationary law (states,)."""
+    """The law of the runs of one outcome, for a chain with these transitions (states, states) and stationary law (states,)."""
 
     transitions: Floats
     law: Floats
@@ -36,7 +36,7 @@ class RunLaw:
 
     @classmethod
     def of(cls, spec: Mapping[str, Any], lost: bool) -> RunLaw:
-        """Of the bursts (lost) or gaps of a loss model that was fitted."""
+        """The law of the bursts (lost) or gaps of a fitted loss model."""
         if spec["model"] == "bernoulli":
             T, law, loss = np.ones((1, 1)), np.ones(1), np.array([1.0 - spec["quality"]])
         else:
@@ -54,7 +54,7 @@ class RunLaw:
 
     @property
     def mean(self) -> float:
-        """Of the lengths."""
+        """Mean length."""
         stay = self.transitions * self.chance
         return float(self._opening @ np.linalg.solve(np.eye(len(self.law)) - stay, np.ones(len(self.law))))
 
@@ -69,9 +69,9 @@ class RunLaw:
 
 
 def p_value(lengths: NDArray[np.intp], law: RunLaw, parameters: int) -> float | None:
-    """How likely runs that are as unlike the law's, or more, are under it: Pearson's test. None for too few runs.
+    """Probability of runs at least as unlikely under the law, by Pearson's test. None for too few runs.
 
-    parameters: how many of those that shape the law were estimated from the recording.
+    parameters: the number of parameters of the law that were estimated from the recording.
     """
     if len(lengths) < _FEWEST:
         return None
@@ -87,6 +87,6 @@ def p_value(lengths: NDArray[np.intp], law: RunLaw, parameters: int) -> float | 
     expected = -np.diff([*longer[bounds], 0.0]) * len(lengths)
     found = np.bincount(np.searchsorted(bounds, lengths, side="left") - 1, minlength=len(bounds))
     statistic = float(((found - expected) ** 2 / expected).sum())
-    from scipy.stats import chi2  # noqa: PLC0415 - a second that who reads a recording need not wait for
+    from scipy.stats import chi2  # noqa: PLC0415 - takes a second, which reading recordings does not need
 
     return float(chi2.sf(statistic, max(1, len(bounds) - 1 - parameters)))

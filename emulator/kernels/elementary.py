@@ -1,7 +1,7 @@
-"""Functions that give the same bits on every machine: + − × ÷ √, comparisons and tables only.
+"""Functions that give the same bits on every machine: only + − × ÷ √, comparisons and tables.
 
-numpy's log and exp, LAPACK and BLAS change with the processor and with the size of the batch; whatever enters a digest
-goes through here instead. All functions work elementwise, so a trial alone and among a thousand is the same number.
+numpy's log and exp, LAPACK and BLAS depend on the processor and on the size of the batch; everything that enters a digest
+uses these functions instead. All functions work elementwise, so a trial gives the same numbers alone and among a thousand.
 """
 
 from __future__ import annotations
@@ -153,11 +153,11 @@ def cholesky(M: Floats) -> Floats:
     return np.array(rows)
 
 
-_NO_VARIANCE = 1e-12  # what is left of a diagonal entry that rounding explains
+_NO_VARIANCE = 1e-12  # relative remainder of a diagonal entry that counts as rounding
 
 
 def semidefinite_factor(M: Floats) -> Floats:
-    """Lower triangular L with L Lᵀ = M; M is (n, n), symmetric and positive semidefinite: what has no variance is a column of 0.
+    """Lower triangular L with L Lᵀ = M, M (n, n) symmetric positive semidefinite; a direction without variance is a 0 column.
 
     Raises ValueError when M is not positive semidefinite.
     """
@@ -183,8 +183,8 @@ def semidefinite_factor(M: Floats) -> Floats:
 def triangular_factor(rows: Rows) -> Rows:
     """Lower triangular L with L Lᵀ = M Mᵀ and a non-negative diagonal, for M (n, m) with m ≥ n, by Givens rotations.
 
-    This is Rᵀ of the QR decomposition of Mᵀ, with its signs fixed. It never forms M Mᵀ, so it holds where a Cholesky
-    decomposition of the covariance fails. Plain Python floats: 4 µs for n = 2, and the same bits everywhere.
+    This is Rᵀ of the QR decomposition of Mᵀ, with its signs fixed. It never forms M Mᵀ, so it works where a Cholesky
+    decomposition of the covariance fails. Plain Python floats: 4 µs for n = 2, and the same bits on every machine.
 
     Source: docs/mathematics.md, encoding noise.
     """

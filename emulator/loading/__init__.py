@@ -1,4 +1,4 @@
-"""A scenario file, read and checked: all its mistakes are reported at once.
+"""Read and check a scenario file; all its mistakes are reported at once.
 
 Source: docs/scenario.md.
 """

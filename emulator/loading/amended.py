@@ -1,4 +1,4 @@
-"""A scenario with one more event, which somebody adds while it runs.
+"""A scenario with one more event, added by an operator while it runs.
 
 Source: docs/control.md.
 """
@@ -15,20 +15,20 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 
 ADDED = ("set", "cut", "heal")
-"""What can be added to a run that goes on: what happens on links."""
+"""The kinds of event that can be added during a run: all of them concern links."""
 
 
 def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenario:
-    """The scenario in which the event, which says not when it is, happens at a slot too, after all else in that slot.
+    """The scenario with the event added at a slot, after everything else in that slot; the event itself states no time.
 
-    Raises ScenarioError with every mistake, in the words for events of a file but without the new one's number.
+    Raises ScenarioError with every mistake, worded as for the events of a file but without the new event's number.
     """
     tables = scenario.model_dump(mode="json", exclude_none=True)
     number = len(tables["event"])
     strange = [name for name in event if name not in (*ADDED, "link")]
     if strange:
         known = listed(["link with set", *ADDED[1:]])
-        raise ScenarioError("event", [f"{name}: is nothing that can be done now; expected {known}" for name in strange])
+        raise ScenarioError("event", [f"{name}: cannot be done now; expected {known}" for name in strange])
     if scenario.modules is None and any(named_in(event)):
         name = next(iter(named_in(event)))
         raise ScenarioError(
@@ -36,7 +36,7 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
         )
     tables["event"].append({**event, "at": at})
     try:
-        # What float64 can follow depends on no event, and was asked when the run was started.
+        # The horizon does not depend on events, and was checked when the run was started.
         return checked(tables, "event", beyond_horizon=True)
     except ScenarioError as error:
         mistakes = [line.removeprefix(f"event.{number}.") for line in error.mistakes]

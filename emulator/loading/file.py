@@ -1,4 +1,4 @@
-"""Scenario files: found by name or path, read, changed by dotted keys, checked.
+"""Scenario files: found by name or path, read, changed by dotted keys, and checked.
 
 Source: docs/scenario.md.
 """
@@ -32,11 +32,11 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.values import unusable
 
 MOST_BYTES = 2**28
-"""Of a scenario file: room for the outcomes of millions of packets inside it."""
+"""The largest scenario file: room for the outcomes of millions of packets."""
 MOST_VALUES = 1_000_000
-"""In lists of a scenario file: more would take longer to read than anybody waits."""
+"""The most values in the lists of a scenario file: reading more would take too long."""
 _MOST_DOTS = 32
-# Python's reader of TOML takes a time that grows with the square of a key's parts.
+# Python's TOML reader takes time that grows with the square of the number of a key's parts.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
 _DOTTED = re.compile(rf"""(?<![A-Za-z0-9_"'.-])(?:{_PART}){{{_MOST_DOTS}}}""")
 
@@ -48,27 +48,27 @@ def shipped() -> dict[str, Path]:
 
 
 def write_new(path: Path) -> None:
-    """Write the commented scenario to start from. Raises UsageError if the file is there or cannot be written."""
+    """Write the commented scenario to start from. Raises UsageError if the file exists or cannot be written."""
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(
                 Path(str(resources.files("evedrop.scenarios"))).joinpath("_new.toml").read_text(encoding="utf-8")
             )
     except FileExistsError as error:
-        raise UsageError(f"{path} is there already; give another name") from error
+        raise UsageError(f"{path} exists already; give another name") from error
     except OSError as error:
         raise UsageError(f"{path} cannot be written ({error.strerror}); give another place") from error
 
 
 def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False) -> Scenario:
-    """The scenario of a shipped name or a file, with changes by dotted key.
+    """Load a shipped scenario by name, or a file, with changes by dotted key.
 
-    beyond_horizon: allow more slots than float64 can follow exactly, for what does not follow states.
+    beyond_horizon: allow more slots than float64 can follow exactly, for commands that do not follow states.
 
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
     path = shipped().get(str(source), Path(source))
-    # A shipped scenario names nothing in its folder: what a change names is in the current one.
+    # A shipped scenario names no files beside it, so the names in a change refer to the current folder.
     folder = Path() if str(source) in shipped() else path if is_folder(path) else path.parent
     return parse(read(source), shown(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 
@@ -102,7 +102,7 @@ def parse(
 ) -> Scenario:
     """The scenario in a TOML text. Raises ScenarioError with every mistake.
 
-    folder: where the files are that it names; those that a change names are in the current one.
+    folder: where the files are that the text names; files that a change names are in the current folder.
     """
     if (values := text.count(",")) > MOST_VALUES:
         large = f"has about {values} values; expected at most {MOST_VALUES}"
@@ -113,7 +113,7 @@ def parse(
         raise ScenarioError(source, [f"{long}; expected one such as legitimate.link.quality"])
     try:
         tables = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables in tables without end
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables nested without end
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     if mistakes := list(unusable(tables)):
         raise ScenarioError(source, mistakes)
@@ -133,9 +133,9 @@ def checked(
     beyond_horizon: bool = False,
     folder: Path = Path(),
 ) -> Scenario:
-    """The scenario that tables describe, changed, its recordings read. Raises ScenarioError with every mistake.
+    """The scenario that tables describe, with changes made and recordings read. Raises ScenarioError with every mistake.
 
-    folder: where modules of anybody's own are, if the tables name any and no folder of modules.
+    folder: where custom modules are, if the tables name any and name no folder of modules.
     """
     for key, value in (changes or {}).items():
         _set(tables, key, value)
@@ -151,7 +151,7 @@ def checked(
     except ValidationError as error:
         raise ScenarioError(source, [*sentences(error), *recordings, *_across(tables, beyond_horizon, None)]) from error
     broken = dry_run(scenario)
-    # A class that breaks in a dry run breaks again when it is asked about itself: that is not told twice.
+    # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
     mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
     if scenario.nemesis is not None:
         tables, found = with_faults(tables, scenario, sentences)
@@ -167,7 +167,7 @@ def checked(
 def _across(
     tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None, silent: bool = False
 ) -> list[str]:
-    """What only shows across tables; an error of somebody's class that is asked on the way is a mistake too, unless silent."""
+    """Mistakes across tables; an error that a custom class raises when asked is a mistake too, unless silent."""
     try:
         return across_tables(tables, beyond_horizon, scenario)
     except Exception as error:
@@ -179,7 +179,7 @@ def _across(
 
 
 def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
-    """Put a value at a dotted key: names of tables that may be new, and numbers of list entries, the next one included."""
+    """Put a value at a dotted key. Tables may be new; list entries are given by number, including the next one."""
     names = dotted.split(".")
     inner: Any = tables
     for name, after in pairwise(names):
@@ -203,14 +203,14 @@ def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
     if isinstance(inner, list):
-        return UsageError(f"--set {dotted}: {name} is no entry of a list of {len(inner)}; give 0 to {len(inner)}")
+        return UsageError(f"--set {dotted}: {name} is not an entry of a list of {len(inner)}; give 0 to {len(inner)}")
     if isinstance(inner, dict):
         return UsageError(f"--set {dotted}: it has an empty part; give a dotted key such as legitimate.link.quality")
     return UsageError(f"--set {dotted}: {name} is not in a table or list; give the dotted key of a scenario entry")
 
 
 def value_of(text: str) -> Any:
-    """A value on the command line: as TOML, else as a string."""
+    """A value on the command line, read as TOML, or otherwise as a string."""
     try:
         tables = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):

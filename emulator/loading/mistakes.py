@@ -1,4 +1,4 @@
-"""The mistakes of a scenario in words: a line each, with path, what was found, what was expected, an example."""
+"""The mistakes of a scenario in words: a line each, with path, value found, value expected and an example."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ from evedrop.scenario.tables import (
 )
 from evedrop.scenario.words import as_toml, listed, no_entry
 
-_ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # whether there is a theory does not depend on it
+_ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
 _ROOTS: Mapping[str, type[BaseModel]] = {LinkTable.__name__: LinkTable}
-"""Tables that are checked by themselves, by the name that an error has of them; any other error is of a scenario."""
+"""Tables that are checked by themselves, by the name that their errors carry; all other errors are of a scenario."""
 _EXPECTED: Mapping[str, str] = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -97,13 +97,13 @@ def _sentence(detail: ErrorDetails, root: type[BaseModel]) -> str:
         things = "characters" if kind == "string_too_long" else "entries"
         few = kind == "too_short"
         limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
-        return f"has {limit} {things}; expected {'at least' if few else 'at most'} so many"
+        return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(found)}; expected {expected}{example}"
 
 
 def _field(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel] | None, Any]:
-    """The table an error is in, and the field's description if it is a field; root: the table that was checked."""
+    """The table that contains an error, and the field's description if it is a field; root: the table that was checked."""
     table: type[BaseModel] | None = root
     field = None
     inner: Mapping[str, type[BaseModel]] = {
@@ -133,9 +133,9 @@ def _field(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[B
 
 
 def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None) -> list[str]:
-    """What only shows across tables, asked as far as a faulty file allows it: horizon, trials, figures.
+    """Mistakes that only show across tables, as far as a faulty file can be checked: horizon, trials, figures.
 
-    scenario: what the tables are, if no table by itself has a mistake.
+    scenario: the tables as a scenario, if no table by itself has a mistake.
     """
     found: list[str] = []
     slots, trials, recorded = (tables.get(name, 1) for name in ("slots", "trials", "record_trials"))
@@ -165,7 +165,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         try:
             _ = scenario.timeline
         except ValidationError as error:
-            found += [f"event: several of them together leave a link that is none: {line}" for line in sentences(error)]
+            found += [f"event: several of them together result in an invalid link: {line}" for line in sentences(error)]
     if isinstance(tables.get("secret_file"), str):
         found += _secret_mistakes(tables["secret_file"])
     sound = scenario if not found else None
@@ -188,7 +188,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
 
 
 def _links(tables: Mapping[str, Any]) -> dict[str, LinkTable]:
-    """Receiver → its link, of those whose link is one."""
+    """Receiver → its link, for each receiver whose link is valid."""
     eavesdroppers = tables.get("eavesdroppers")
     receivers = {LEGITIMATE: tables.get(LEGITIMATE), **(eavesdroppers if isinstance(eavesdroppers, dict) else {})}
     found = {}
@@ -199,9 +199,9 @@ def _links(tables: Mapping[str, Any]) -> dict[str, LinkTable]:
 
 
 def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) -> str | None:
-    """Why there is no theory for a receiver, as far as it is one; None if there is.
+    """Why there is no theory for a receiver, as far as it is valid; None if there is a theory.
 
-    sound: the scenario, if it has no mistake otherwise: then its events count as well.
+    sound: the scenario, if it has no other mistakes: its events are then considered too.
     """
     try:
         scheme = scheme_of(_ANY_PROCESS, EncodingTable.model_validate(encoding).spec)
@@ -219,7 +219,7 @@ def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) 
             return f"there is no theory for {name}'s link"
         if sound is None:
             return None
-        from evedrop.expected.expectations import expectations_of  # noqa: PLC0415 - of scenarios that have been checked so far
+        from evedrop.expected.expectations import expectations_of  # noqa: PLC0415 - for checked scenarios only
 
         known = expectations_of(sound)[name].known
         return None if known else f"there is no theory for {name} with these links, attacks and events together"
@@ -228,7 +228,7 @@ def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) 
 
 
 def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
-    """Strategies that need what the scheme does not have, what comes after the run, or while they are away."""
+    """Strategies that need something the scheme lacks, or a slot that is beyond the run or in which they are away."""
     found = []
     eavesdroppers, encoding = tables.get("eavesdroppers", {}), tables.get("encoding")
     chosen = encoding.get("scheme") if isinstance(encoding, dict) else None
@@ -244,7 +244,7 @@ def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
             entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
             able = [one for one in READERS if not READERS[one].streams({})]
             found.append(
-                f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by what it knows of the "
+                f"eavesdroppers.{name}.{entry}: is {as_toml(value)}, which is defined by its knowledge of the "
                 f"{listed(lacking)}, and the scheme {chosen} has none; expected {listed(sorted(able))}"
             )
         betrayed = strategy.betrayed(table.parameters)
@@ -253,18 +253,18 @@ def _strategy_mistakes(tables: Mapping[str, Any], slots: Any) -> list[str]:
         away = None if betrayed is None else away_in(tables, name, betrayed)
         if away is not None:
             found.append(
-                f"eavesdroppers.{name}.learns_at: is {betrayed}, when {away}; expected a slot in which it is there"
+                f"eavesdroppers.{name}.learns_at: is {betrayed}, when {away}; expected a slot in which it is present"
             )
     return found
 
 
 def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
-    """Of the streams whose keys a strategy must be given, those that a scheme has not."""
+    """The streams whose keys a strategy must be given but that a scheme does not have."""
     return [stream for stream in streams if stream != "coin" and stream not in scheme.secret_streams]
 
 
 def _secret_mistakes(file: str) -> list[str]:
-    """Why a file cannot hold a secret."""
+    """Reasons why a file cannot hold a secret."""
     try:
         size = len(contents(Path(file), MOST_SECRET_BYTES))
     except Unreadable as error:
@@ -275,7 +275,7 @@ def _secret_mistakes(file: str) -> list[str]:
 
 
 def _horizon_mistakes(process: Process, slots: int) -> list[str]:
-    """Why so many slots are too many, if they are (docs/mathematics.md, horizon)."""
+    """A mistake if float64 cannot follow the process for that many slots (docs/mathematics.md, horizon)."""
     last = horizon(process, slots)
     if last is None:
         return []

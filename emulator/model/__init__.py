@@ -1,1 +1,1 @@
-"""Mathematics: no I/O, no clock, no network, no view. Batches have the trials as last axis."""
+"""The mathematics: without I/O, clock, network or view. In batches the trials are the last axis."""

@@ -1,4 +1,4 @@
-"""Which acknowledgements reach the sensor: over a way back that loses some, and past a jammer that hears the packets too.
+"""Which acknowledgements reach the sensor: over a lossy way back, and past a jammer that also hears the packets.
 
 Source: docs/mathematics.md, attacks on acknowledgements.
 """
@@ -6,7 +6,7 @@ Source: docs/mathematics.md, attacks on acknowledgements.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -39,13 +39,14 @@ ATTACKS: Mapping[str, Attack] = {
     "critical": _block_critical,
     "forge": _forge,
 }
-"""critical blocks where γ = 1 and γᵉ = 0; forge sends one, in the user's name, where γ = 0."""
+"""critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0."""
 
 
+@final
 class AckChannel:
-    """Acknowledgements from user to sensor: each arrives with probability `quality`, if it is on the air. Final.
+    """Acknowledgements from user to sensor: each that is on the air arrives with probability `quality`.
 
-    spans: slots [from, to) in which the attack is on; None is always.
+    spans: slots [from, to) in which the attack is on; None: in all slots.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class AckChannel:
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
         """The acknowledgements of slot k that reach the sensor, (R,).
 
-        sent: `Packet.sent`; what was not sent is not acknowledged, whatever is forged. gamma: what the user received.
+        sent: `Packet.sent`; a packet that was not sent is never acknowledged, even by a forger. gamma: what the user received;
         gamma_e: what the jammer received.
         """
         if k not in self._slots:
@@ -82,15 +83,15 @@ class AcknowledgementRates(NamedTuple):
     """Probabilities, for a packet that is sent."""
 
     arrives: float
-    """That an acknowledgement of it reaches the sensor."""
+    """Probability that an acknowledgement of it reaches the sensor."""
     user: tuple[float, float]
-    """That one does and the user received the packet, and that one does and it did not: forged."""
+    """The same jointly with the user having received the packet, and having missed it (forged)."""
     eavesdropper: tuple[float, float]
-    """That one does and the jammer received the packet, and that one does and it did not: critical, or forged."""
+    """The same jointly with the jammer having received the packet, and having missed it (critical or forged)."""
 
 
 def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0) -> AcknowledgementRates:
-    """The rates under an attack, for independent links of qualities μ, μ_e and a way back of its own.
+    """The rates under an attack, for independent links of qualities μ and μ_e and an independent way back.
 
     Source: docs/mathematics.md, attacks on acknowledgements.
     """

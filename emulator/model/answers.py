@@ -1,10 +1,10 @@
-"""What classes that must not run in this process say of themselves: asked of them in a process of their own.
+"""Answers about classes that must not run in this process; each class is asked in a process of its own.
 
-An eavesdropper's class may be anybody's, and the launcher and the observer hold the seed and the truth. So neither imports
-it. A child process does, which has an empty environment and is told the class's name, the parameters that the scenario
-gives it and where modules are. Its answers are JSON, and whoever asks checks them.
+Anybody may write an eavesdropper's class, and launcher and observer hold the seed and the truth. So they do not import it.
+A child process imports it; the child has an empty environment and is told the class's name, its parameters in the
+scenario and where modules are. The answers are JSON, and the process that asks checks them.
 
-Every answer is kept: the same question is asked once, and a process that is given the answers need not ask at all.
+Every answer is kept: the same question is asked once, and a process that is given the answers need not ask.
 
 Source: docs/your-own.md, where a class runs.
 """
@@ -22,21 +22,22 @@ import threading
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.errors import NoAnswer
 
 _SECONDS = 60.0  # for an answer; a class may import much
-_MOST_BYTES = 2**20  # of an answer
+_MOST_BYTES = 2**20  # in one answer
 _MODULE = "evedrop.conformance.answering"
-# Libraries that are not where the system looks for them; nothing else of our environment.
+# Where libraries are, if not in the system's folders; nothing else of our environment is passed on.
 _NEEDED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH", "PYTHONHOME")
 
 
+@final
 class Answers:
-    """What classes have said of themselves, and the child processes that are asked. Final; usable from any thread.
+    """The known answers of classes, and the child processes that answer. Usable from any thread.
 
-    Children are asked one after the other, one for each class, and end by themselves when they are asked no more.
+    Children are asked one after the other, one for each class, and end by themselves when no more questions can come.
     """
 
     def __init__(self) -> None:
@@ -45,12 +46,12 @@ class Answers:
         self._folders: dict[str, str | None] = {}
         self._lock = threading.Lock()
         self.folder: str | None = None
-        """Where modules are looked for before all other places."""
+        """The folder in which modules are looked for first."""
 
     def ask(self, name: str, do: str, *given: Any) -> Any:
-        """The answer of the class `name` to one question, as JSON has it.
+        """The answer of the class `name` to one question, as decoded JSON.
 
-        Raises NotRegistered if the name stands for no class, NoAnswer if it has no answer.
+        Raises NotRegistered if there is no class of this name, NoAnswer if it gives no valid answer.
         """
         from evedrop.errors import NotRegistered  # noqa: PLC0415 - the registries ask us
 
@@ -64,25 +65,25 @@ class Answers:
         if "not_registered" in answer:
             raise NotRegistered(name, str(answer["not_registered"]))
         if "is" not in answer:
-            raise NoAnswer(str(answer.get("raised", "its answer was no answer")))
+            raise NoAnswer(str(answer.get("raised", "its answer was invalid")))
         return answer["is"]
 
     def of(self, names: Iterable[str]) -> dict[str, Any]:
-        """Every question that these classes have answered so far, with the answer: for `learn`."""
+        """All questions that these classes have answered so far, with the answers: the argument of `learn`."""
         wanted = set(names)
         return {question: answer for question, answer in self._known.items() if json.loads(question)[0] in wanted}
 
     def learn(self, known: Mapping[str, Any]) -> None:
-        """Take answers from somebody who has asked."""
+        """Add answers from a process that has asked."""
         with self._lock:
             self._known.update({str(question): dict(answer) for question, answer in known.items()})
 
     def folder_of(self, name: str) -> str | None:
-        """The folder in which a class was looked for first, if it was asked anything."""
+        """The folder that was searched first for a class, if the class was asked anything."""
         return self._folders.get(name)
 
     def forget(self) -> None:
-        """Ask anew from now on."""
+        """Forget all answers, so that questions are asked again."""
         with self._lock:
             for child in self._children.values():
                 child.end()
@@ -91,7 +92,7 @@ class Answers:
     def _asked(self, name: str, question: str) -> dict[str, Any]:
         child = self._children.get(name)
         if child is not None:
-            with contextlib.suppress(NoAnswer):  # it may have ended by itself
+            with contextlib.suppress(NoAnswer):  # the process may have ended by itself
                 return child.answer(question)
         child = self._children[name] = _Child(self._folders.setdefault(name, self.folder))
         try:
@@ -100,8 +101,9 @@ class Answers:
             return {"raised": str(error)}
 
 
+@final
 class _Child:
-    """A process that answers for one class. Final."""
+    """A process that answers for one class."""
 
     def __init__(self, folder: str | None) -> None:
         places = json.dumps([str(Path(place).absolute()) for place in sys.path])
@@ -128,16 +130,16 @@ class _Child:
         self._first = f"{places}\n{json.dumps(folder)}\n"
 
     def answer(self, question: str) -> dict[str, Any]:
-        """Its answer to a question. Raises NoAnswer, and ends it, if it gives none."""
+        """The class's answer to a question. Raises NoAnswer, and ends the process, if it gives none."""
         process = self._process
-        assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - they were asked for
+        assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - both are pipes
         try:
             deadline = time.monotonic() + _SECONDS
             _write(process.stdin.fileno(), f"{self._first}{question}\n".encode(), deadline)
             self._first = ""
             found = json.loads(_line(process.stdout.fileno(), deadline))
             if not isinstance(found, dict):
-                raise NoAnswer("its answer was no answer")
+                raise NoAnswer("its answer was invalid")
         except BaseException as error:
             self.end()
             status = process.returncode
@@ -149,7 +151,7 @@ class _Child:
         return found
 
     def end(self) -> None:
-        """End it."""
+        """End the process."""
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):

@@ -1,9 +1,9 @@
-"""What makes two runs comparable to the last bit: SHA-256 over all that a receiver received and believed.
+"""SHA-256 over all that a receiver received and believed: equal digests mean that two runs agree to the last bit.
 
-For each trial and each aligned block of 256 slots: over, slot by slot, γ (1 byte), x̂ (n) and P (n × n, row by row) as
-little-endian float64; of a controller over whether its decision failed (1 byte) and u (m). Where an outage of the receiver
-begins or ends a block ends too, since another process may go on. A receiver's digest is that of its block digests, ordered by
-trial, then block. A block is named by its first slot.
+For each trial and each aligned block of 256 slots, the digest covers, slot by slot, γ (1 byte), x̂ (n) and P (n × n, row by
+row) as little-endian float64; for a controller, whether its decision failed (1 byte) and u (m). A block also ends where an
+outage of the receiver begins or ends, since another process may continue. A receiver's digest is that of its block digests,
+ordered by trial, then block. A block is named by its first slot.
 
 Source: docs/results.md, digests.
 """
@@ -23,13 +23,13 @@ from evedrop.model.receiver import Action, Belief, Codes, Flags
 
 BLOCK_SLOTS = 256
 DIGEST_BYTES = 32
-_TILE = 64  # trials transposed at a time, so that a tile stays in the cache
+_TILE = 64  # trials transposed at a time, so that a tile fits into the cache
 
 Digests = NDArray[np.uint8]
 
 
 class Rows(NamedTuple):
-    """Beliefs of consecutive slots, one row a slot."""
+    """Beliefs of consecutive slots, one row for each slot."""
 
     x_hat: Floats
     """(c, n, R)."""
@@ -40,7 +40,7 @@ class Rows(NamedTuple):
 
 
 def block_starts(slots: int, cuts: Iterable[int] = ()) -> list[int]:
-    """The first slots of a run's blocks; cuts: where an outage of the receiver begins or ends."""
+    """The first slots of a run's blocks; cuts: slots in which an outage of the receiver begins or ends."""
     return sorted({*range(0, slots, BLOCK_SLOTS), *(cut for cut in cuts if 0 < cut < slots)})
 
 
@@ -53,11 +53,11 @@ class Blocks:
         self._bounds = [*block_starts(slots, cuts), slots]
 
     def end(self, k: int) -> int:
-        """The slot after the block in which slot k is."""
+        """The slot after the block that contains slot k."""
         return self._bounds[bisect_right(self._bounds, k)]
 
     def start(self, k: int) -> int:
-        """The first slot of the block in which slot k is."""
+        """The first slot of the block that contains slot k."""
         return self._bounds[bisect_right(self._bounds, k) - 1]
 
     def ended(self, first: int, end: int) -> list[int]:
@@ -67,9 +67,9 @@ class Blocks:
 
 
 class BeliefLog:
-    """A receiver's beliefs of the block at hand, and the digests of the blocks that are over.
+    """A receiver's beliefs in the current block, and the digests of finished blocks.
 
-    Final; slots must be added in order from the first, with which a block begins.
+    Slots must be added in order; a block must begin with the first one.
     """
 
     def __init__(self, n: int, trials: int, slots: int, cuts: Iterable[int] = (), first: int = 0) -> None:
@@ -81,7 +81,7 @@ class BeliefLog:
         self._action = np.empty((length, trials), np.uint8)
 
     def add(self, k: int, belief: Belief) -> tuple[int, Digests] | None:
-        """Take slot k; at the end of a block, its first slot and its digest for every trial, (R, 32)."""
+        """Add slot k. At the end of a block returns the block's first slot and its digest for every trial, (R, 32)."""
         if k in self._ends:
             self._start = k
         row = k - self._start
@@ -89,7 +89,7 @@ class BeliefLog:
         return (self._start, self._digest(row + 1)) if k + 1 in self._ends else None
 
     def rows(self, first: int, end: int) -> Rows:
-        """The beliefs of slots first … end−1, which must be of the block at hand; overwritten as the next one fills."""
+        """The beliefs of slots first … end−1 of the current block; overwritten by the next block."""
         rows = slice(first - self._start, end - self._start)
         return Rows(self._x_hat[rows], self._P[rows], self._action[rows])
 
@@ -100,9 +100,9 @@ class BeliefLog:
 
 
 class InputLog:
-    """A controller's inputs of the block at hand, and the digests of the blocks that are over.
+    """A controller's inputs in the current block, and the digests of finished blocks.
 
-    Final; slots must be added in order from 0.
+    Slots must be added in order from 0.
     """
 
     def __init__(self, inputs: int, trials: int, slots: int) -> None:
@@ -112,7 +112,7 @@ class InputLog:
         self._failed = np.empty((length, trials), np.bool_)
 
     def add(self, k: int, u: Floats, failed: Flags) -> tuple[int, Digests] | None:
-        """Take slot k, u (m, R) and failed (R,); at the end of a block, its first slot and its digest, (R, 32)."""
+        """Add slot k, u (m, R) and failed (R,). At the end of a block returns its first slot and its digest, (R, 32)."""
         row = k % BLOCK_SLOTS
         self._u[row], self._failed[row] = u, failed
         if row + 1 != BLOCK_SLOTS and k + 1 != self._slots:
@@ -122,19 +122,19 @@ class InputLog:
 
 @final
 class PartialDigests:
-    """The digests of one block whose slots come in parts."""
+    """The digests of one block whose slots are added in parts."""
 
     def __init__(self, trials: int) -> None:
         self._hashes = [sha256() for _ in range(trials)]
 
     def add(self, x_hat: Floats, P: Floats, action: Codes) -> None:
-        """Take the next slots: x̂ (c, n, R), P (c, n, n, R) and action (c, R)."""
+        """Add the next slots: x̂ (c, n, R), P (c, n, n, R) and action (c, R)."""
         c, n, trials = x_hat.shape
         for row, record in _records(action != Action.LOST, [x_hat, P.reshape(c, n * n, trials)]):
             self._hashes[row].update(record)
 
     def digests(self) -> Digests:
-        """Those of all slots so far, (R, 32)."""
+        """The digests of all slots so far, (R, 32)."""
         return np.array([np.frombuffer(one.digest(), np.uint8) for one in self._hashes])
 
 
@@ -147,7 +147,7 @@ def _digests(marks: Flags, numbers: Sequence[Floats]) -> Digests:
 
 
 def _records(marks: Flags, numbers: Sequence[Floats]) -> Iterator[tuple[int, memoryview]]:
-    """Trial and bytes to be digested, for every trial; the bytes are overwritten as the next tile of trials comes."""
+    """Each trial and its bytes to be digested; the bytes are overwritten by the next tile of trials."""
     length, trials = marks.shape
     width = sum(one.shape[1] for one in numbers)
     ordered = np.empty((_TILE, length, width), "<f8")
@@ -166,14 +166,15 @@ def _records(marks: Flags, numbers: Sequence[Floats]) -> Iterator[tuple[int, mem
             yield row, record.data
 
 
+@final
 class RunDigest:
-    """A receiver's digest of a whole run, from the block digests of its trials, added in trial order. Final."""
+    """A receiver's digest of a whole run, from the block digests of its trials, added in trial order."""
 
     def __init__(self) -> None:
         self._hash = sha256()
 
     def add(self, blocks: Mapping[int, Digests]) -> None:
-        """Take the next R trials: block → digests, (R, 32)."""
+        """Add the next R trials: block → digests, (R, 32)."""
         self._hash.update(np.stack([blocks[block] for block in sorted(blocks)], axis=1).tobytes())
 
     @property

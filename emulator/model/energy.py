@@ -1,4 +1,4 @@
-"""What a house buys and sells over a run, and by how much two runs of it differ: the price of a link, and of secrecy.
+"""The energy that a house buys and sells over a run, and its difference between two runs: the price of a link or of secrecy.
 
 Powers are in kW, positive where the house takes from the grid, slot by slot along the first axis; trials may follow.
 Source: docs/microgrid.md, energy.
@@ -7,6 +7,7 @@ Source: docs/microgrid.md, energy.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -17,19 +18,20 @@ _HOUR = 3600.0
 
 @dataclass(frozen=True)
 class EnergyDifference:
-    """By how much a run's grid power differs from another's, as shares of the other's, per trial (…)."""
+    """The difference of a run's grid power from another run's, as shares of the other's, per trial (…)."""
 
     net: Floats
-    """Of the net energy: |Σ P − Σ P′| / |Σ P′|."""
+    """Of net energy: |Σ P − Σ P′| / |Σ P′|."""
     total: Floats
-    """Of the energy that crosses the meter, either way: |Σ |P| − Σ |P′|| / Σ |P′|."""
+    """Of the energy through the meter in both directions: |Σ |P| − Σ |P′|| / Σ |P′|."""
     summed: Floats
-    """Slot by slot: Σ |P − P′| / Σ |P′|. Never below the two others, as shares of the same Σ |P′|."""
+    """Slot by slot: Σ |P − P′| / Σ |P′|. At least as large as the two others, as shares of the same Σ |P′|."""
 
 
+@final
 @dataclass(frozen=True)
 class Meter:
-    """Sums over slots of a run's grid power P, and of another's P′ beside it, (…) each, in kW. Final."""
+    """Sums over slots of a run's grid power P and of another run's P′, (…) each, in kW."""
 
     bought: Floats
     sold: Floats
@@ -40,16 +42,16 @@ class Meter:
 
     @classmethod
     def over(cls, grid_power: Floats, other: Floats) -> Meter:
-        """Of some slots; both (slots, …)."""
+        """The sums of some slots; both arguments (slots, …)."""
         return cls.zero(*grid_power.shape[1:]).then(grid_power, other)
 
     @classmethod
     def zero(cls, *shape: int) -> Meter:
-        """Of no slots; shape: that of (…)."""
+        """The sums of no slots; shape: that of (…)."""
         return cls(*(np.zeros(shape) for _ in range(5)))
 
     def then(self, grid_power: Floats, other: Floats) -> Meter:
-        """Of these slots and the next ones, both (slots, …): the same bits in whatever parts the slots come."""
+        """These sums plus those of the next slots, both (slots, …): the same bits however the slots are divided."""
         other = np.broadcast_to(other, grid_power.shape)
         more = (
             np.maximum(grid_power, 0.0),
@@ -58,13 +60,13 @@ class Meter:
             np.maximum(-other, 0.0),
             np.abs(grid_power - other),
         )
-        # A sum of numpy's adds up in an order of its own, and the differences of such sums are small.
+        # numpy's sum adds in an order of its own, and the differences between such sums are small.
         sums = (np.add.accumulate([mine, *rows])[-1] for mine, rows in zip(self._sums, more, strict=True))
         return Meter(*sums)
 
     @classmethod
     def of_all(cls, parts: list[Meter]) -> Meter:
-        """Of the trials of several, in order."""
+        """The sums of several sets of trials, in order."""
         return cls(*(np.concatenate(sums) for sums in zip(*(part._sums for part in parts), strict=True)))
 
     @property
@@ -73,7 +75,7 @@ class Meter:
 
     @property
     def difference(self) -> EnergyDifference:
-        """The three measures. Where the other's sum is 0 a share of it is infinite, or NaN if both are 0."""
+        """The three measures. A share of a sum that is 0 is infinite, or NaN if both sums are 0."""
         net, other_net = self.bought - self.sold, self.other_bought - self.other_sold
         total, other_total = self.bought + self.sold, self.other_bought + self.other_sold
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -85,5 +87,5 @@ class Meter:
 
 
 def energy(summed_power: Floats, slot_seconds: float) -> Floats:
-    """Energy in kWh of a sum over slots of a power in kW."""
+    """Energy in kWh from a sum over slots of a power in kW."""
     return summed_power * (slot_seconds / _HOUR)

@@ -1,4 +1,4 @@
-"""Flags of trials as bit masks, and back."""
+"""Converts flags of trials to bit masks and back."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""How long ago, as far as the sensor knows, the user last had the state."""
+"""The time since the user last had the state, as far as the sensor knows."""
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +12,11 @@ from evedrop.model.receiver import Flags
 _NEVER = -(2**62)
 
 
+@final
 class HoldingTime:
-    """h_k = k − t, t the last acknowledged slot, for every trial; without end before the first acknowledgement.
+    """h_k = k − t with the last acknowledged slot t, for every trial; infinite before the first acknowledgement.
 
-    Final. What is blocked or lost on the way back makes h too large, never too small.
+    Acknowledgements that are blocked or lost make h too large, never too small.
 
     Source: docs/mathematics.md, schedules by holding time.
     """
@@ -27,5 +30,5 @@ class HoldingTime:
         return flags
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Take the acknowledgements (R,) of slot k, in any order of slots."""
+        """Add the acknowledgements (R,) of slot k; slots may come in any order."""
         self._slot = np.where(acknowledged, np.maximum(self._slot, k), self._slot)

@@ -1,11 +1,13 @@
-"""The legitimate estimator that is told the inputs: over a slot without a packet it predicts A x̂ + B u instead of A x̂.
+"""The legitimate estimator that knows the inputs: in a slot without a packet it predicts A x̂ + B u instead of A x̂.
 
-A packet that is read has B u in it already, so nothing else changes; P is the same.
+A packet that is decoded already contains B u, so nothing else changes; P is the same.
 
 Source: docs/mathematics.md, closed loop.
 """
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 
@@ -15,15 +17,16 @@ from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Recep
 
 
 def guessed(action: Codes) -> Flags:
-    """Where an estimate is a prediction, (…, R), because no packet was read."""
+    """Whether an estimate is a prediction, (…, R), because no packet was decoded."""
     unread: Flags = (action == int(Action.LOST)) | (action == int(Action.DISCARDED))
     return unread
 
 
+@final
 class InputAwareEstimator(Receiver):
-    """A receiver that is told the inputs. Final.
+    """A receiver that knows the inputs.
 
-    window: slots by which a packet may be late, and so the inputs of as many slots are wanted once more.
+    window: the number of slots by which a packet may be late; the inputs of that many slots are kept.
     """
 
     def __init__(self, receiver: Receiver, plant: Plant, window: int = 0) -> None:
@@ -32,20 +35,20 @@ class InputAwareEstimator(Receiver):
         self._moved: dict[int, Floats] = {}
 
     def learn(self, k: int, u: Floats) -> None:
-        """Take the inputs of slot k, (m, R); all slots' in turn, each before the packet of the next slot."""
+        """Store the inputs of slot k, (m, R), for every slot in order, each before the packet of the next slot."""
         self._moved[k] = self._plant.moved(u)
         self._moved.pop(k - self._window - 1, None)
 
     def prior(self, first: int = 0) -> Belief:
-        """The receiver's."""
+        """The wrapped receiver's prior."""
         return self._receiver.prior(first)
 
     def act(self, k: int, gamma: Flags) -> Codes:
-        """The receiver's."""
+        """The wrapped receiver's action."""
         return self._receiver.act(k, gamma)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """The receiver's, and B u_{k−1} where no packet was read."""
+        """The wrapped receiver's belief, plus B u_{k−1} where no packet was decoded."""
         after = self._receiver.step(k, belief, heard)
         if k == 0:
             return after
@@ -53,10 +56,11 @@ class InputAwareEstimator(Receiver):
         return after._replace(x_hat=after.x_hat + moved)
 
 
+@final
 class Offset:
-    """How much the estimate that knows the inputs is ahead of the one that does not, from the same packets. Final.
+    """The difference between the estimates with and without knowledge of the inputs, from the same packets.
 
-    Both are the same linear recursion: c ← A c + B u where no packet was read, A c where an innovation was, 0 at a state.
+    Both are the same linear recursion: c ← A c + B u where no packet was decoded, A c at an innovation, 0 at a state.
     """
 
     def __init__(self, process: Process, plant: Plant, trials: int) -> None:
@@ -66,7 +70,7 @@ class Offset:
         self._moved: Floats = self._c
 
     def next(self, action: Codes, u: Floats) -> Floats:
-        """Of the next slot, (n, R), from what the estimator did in it (R,); u (m, R): the inputs of this slot."""
+        """The difference in the next slot, (n, R), from the estimator's action (R,); u (m, R): the inputs of this slot."""
         c = self._dynamics.product(self._c) + np.where(guessed(action), self._moved, 0.0)
         self._c = np.where(action == int(Action.STATE), 0.0, c)
         self._moved = self._plant.moved(u)

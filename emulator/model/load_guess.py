@@ -1,9 +1,9 @@
-"""A house's load as somebody guesses it who has an estimate of its storage levels, and all that is public.
+"""A guess of a house's load, from an estimate of its storage levels and public knowledge.
 
-Between two decisions the inputs are held, so the battery's level moves by what it would with these inputs, by what the sun
-adds, and by the load. The sun shines on the neighbour's roof too. The inputs are not seen; but plant and controller are public,
-so a copy of the controller, fed with the neighbour's own estimate, says what they are. What is missing in the level then is
-the load.
+Between two decisions the inputs are held, so the battery's level moves by the effect of these inputs, by the solar power and
+by the load. The solar power is the same on the neighbour's roof. The inputs are secret, but plant and controller are
+public, so a copy of the controller, fed with the neighbour's own estimate, reproduces them. The rest of the change in level
+is the load.
 
 Source: docs/microgrid.md, privacy.
 """
@@ -11,6 +11,7 @@ Source: docs/microgrid.md, privacy.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -19,23 +20,24 @@ from evedrop.model.controllers.lqr import held
 from evedrop.model.process import Floats, product
 
 _BELIEVED = 0.9
-"""Share of a guess that the copy of the controller is told. A controller that makes up for the load at once leaves nothing in the
-level, and a copy that is told all of a wrong guess would confirm it for ever."""
+"""The share of a guess that the copy of the controller is told. A controller that compensates the load at once leaves no
+trace in the level, and a copy that is told all of a wrong guess would confirm that guess for ever."""
 
 
 @dataclass(frozen=True)
 class HousePlaces:
-    """Where a house's quantities are in its plant: places of a state and of disturbances."""
+    """The places of a house's quantities in its plant: indices of a state and of disturbances."""
 
     battery: int
     load: int
     sun: int | None
 
 
+@final
 class LoadGuess:
-    """Guesses, a decision at a time. Final; decisions come in order from slot 0.
+    """Guesses, one for each decision; decisions come in order from slot 0.
 
-    controller: a copy of the house's, fresh; sun: known power in every slot, (slots,).
+    controller: a new copy of the house's; sun: known power in every slot, (slots,).
     """
 
     def __init__(self, assignment: Assignment, controller: Controller, house: HousePlaces, sun: Floats) -> None:
@@ -44,10 +46,10 @@ class LoadGuess:
         self._disturbed = held(assignment, assignment.plant.disturbance_matrix)[1]
         self._u: Floats = np.zeros((assignment.plant.inputs, controller.trials))
         self._level: Floats | None = None
-        """What the level will be without load, (R,)."""
+        """The level that would be reached without load, (R,)."""
 
     def take(self, k: int, x_hat: Floats) -> Floats | None:
-        """Mean load in kW of the period that ends with slot k, (R,); None at 0. x_hat: estimate of the state, (n, R)."""
+        """Mean load in kW of the period that ends with slot k, (R,); None at slot 0. x_hat: estimate of the state, (n, R)."""
         house, assignment = self._house, self._assignment
         guess = None
         d = np.zeros((assignment.plant.disturbance_matrix.shape[1], x_hat.shape[1]))

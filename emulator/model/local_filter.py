@@ -1,14 +1,14 @@
-"""The filter at the sensor: of noisy measurements y = C x + v it makes the estimate x̂ˢ that is transmitted in place of x.
+"""The sensor's filter: from noisy measurements y = C x + v it computes the estimate x̂ˢ that is transmitted instead of x.
 
-It knows the plant, its inputs and its disturbances, so its innovations are white, of covariance S_k, and what is transmitted
-follows x̂ˢ_{k+1} = A x̂ˢ_k + B u_k + B_d d_k + K_{k+1} ν_{k+1}: to the network, process noise of covariance K S Kᵀ.
+It knows the plant, its inputs and its disturbances, so its innovations are white, with covariance S_k, and the transmitted
+estimate follows x̂ˢ_{k+1} = A x̂ˢ_k + B u_k + B_d d_k + K_{k+1} ν_{k+1}: for the network, process noise of covariance K S Kᵀ.
 
 Source: docs/mathematics.md, a filter at the sensor.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -18,15 +18,15 @@ from evedrop.model.process import Floats, Process, product
 from evedrop.streams import Batch, BlockReader
 
 _SETTLED = 1e-14
-_LONGEST = 200_000  # slots after which a filter counts as never settled
-_LONGEST_OF_MANY = 4_000  # the same of one with more than some states or measurements, whose slots take longer
+_LONGEST = 200_000  # slots after which a filter is regarded as not settling
+_LONGEST_OF_MANY = 4_000  # the same for a filter with many states or measurements, whose slots take longer
 _SOME = 4
 MOST_STATES = 16
-"""Of a filter, and measurements: it is worked out in plain arithmetic, which takes time that grows with their cube."""
-_JUDGED = 32_768  # slots after which one that does not even come nearer does
-_NEARER = (
-    0.45  # what is left of it by then, as 1/k: ½ of the last halving; as an exponential of any use: ⅓; as k: twice
-)
+"""The most states, and measurements, of a filter: it is computed in plain arithmetic, in a time that grows with their cube."""
+_JUDGED = 32_768  # slots after which a filter that does not even converge slowly is regarded as not settling
+# The change over the last doubling of slots, relative to the one before: ½ if it decays as 1/k, at most ⅓ if it decays as a
+# useful exponential, 2 if it grows as k.
+_NEARER = 0.45
 
 
 class FilterStep(NamedTuple):
@@ -35,13 +35,14 @@ class FilterStep(NamedTuple):
     gain: Floats
     """K, (n, p)."""
     covariance: Floats
-    """Of x − x̂ˢ, (n, n)."""
+    """Covariance of x − x̂ˢ, (n, n)."""
     innovation: Floats
-    """K S Kᵀ, (n, n): of what the measurement adds to x̂ˢ."""
+    """K S Kᵀ, (n, n): the covariance of the measurement's contribution to x̂ˢ."""
 
 
+@final
 class Steps:
-    """The filter slot by slot from 0 on, until it has settled. Final; arithmetic that is the same everywhere."""
+    """The filter slot by slot from 0 on, until it has settled; the arithmetic is the same on every machine."""
 
     def __init__(self, process: Process, plant: Plant) -> None:
         if plant.output_matrix is None or plant.measurement_noise is None:
@@ -53,7 +54,7 @@ class Steps:
         self.settled = False
 
     def next(self) -> FilterStep:
-        """The next slot's. Raises ValueError where measurements have no noise and tell nothing new."""
+        """The filter in the next slot. Raises ValueError if measurements have no noise and contain nothing new."""
         if self.settled and self._last is not None:
             return self._last
         C, P = self._C, self._predicted
@@ -61,7 +62,7 @@ class Steps:
         S = product(C, PCt) + self._V
         K = product(PCt, inverse(S))
         rest = np.eye(len(P)) - product(K, C)
-        # Joseph's form stays a covariance however small it gets.
+        # Joseph's form remains a covariance however small it gets.
         after = product(product(rest, P), _transposed(rest)) + product(product(K, self._V), _transposed(K))
         after = 0.5 * (after + after.T)
         predicted = product(product(self._A, after), _transposed(self._A)) + self._W
@@ -73,7 +74,7 @@ class Steps:
 
 
 def settled(process: Process, plant: Plant) -> FilterStep:
-    """The filter in the end. Raises ValueError if it never settles, or is of no use: it trusts no measurement any more."""
+    """The filter's steady state. Raises ValueError if it never settles or ends up ignoring all measurements."""
     steps = Steps(process, plant)
     marks = []
     measured = 0 if plant.output_matrix is None else len(plant.output_matrix)
@@ -93,10 +94,11 @@ def settled(process: Process, plant: Plant) -> FilterStep:
     raise ValueError("the filter does not settle")
 
 
+@final
 class LocalFilter:
-    """The estimates of a batch, slot by slot. Final.
+    """The estimates of a batch, slot by slot.
 
-    key: of the stream `measurement`.
+    key: the key of the stream `measurement`.
     """
 
     def __init__(self, process: Process, plant: Plant, key: bytes, batch: Batch) -> None:
@@ -111,10 +113,10 @@ class LocalFilter:
         self.x: Floats = np.zeros((process.n, batch.trials))
         """x̂ˢ of the last slot, (n, R)."""
         self.predicted: Floats = self.x
-        """A x̂ˢ of the slot before, (n, R): what the innovation that is transmitted is measured against."""
+        """A x̂ˢ of the slot before, (n, R): the transmitted innovation is measured against it."""
 
     def take(self, k: int, x: Floats, pushed: Floats) -> Floats:
-        """x̂ˢ of slot k, (n, R), from its state x (n, R) and what has pushed it there, (n, R) or (n, 1)."""
+        """x̂ˢ of slot k, (n, R), from its state x (n, R) and the effect of inputs and disturbances on it, (n, R) or (n, 1)."""
         if k not in self._slots:
             self._slots = self._reader.block(k)
             self._noise = product(self._factor, self._reader.normals(self._slots))

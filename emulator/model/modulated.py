@@ -1,12 +1,12 @@
-"""Expected covariances behind a link whose quality follows a Markov chain, changes with time, or delays packets.
+"""Expected covariances behind a link whose quality follows a Markov chain or changes with time, or that delays packets.
 
 For each link state s, E_k(s) = E[P_k; state s in slot k], and with q(s) its quality and T the transitions
 
     E_k(s) = kept(q(s)) A (Σ_r T(r, s) E_{k−1}(r)) Aᵀ + π(s) (p_d(q(s)) Q + p_i(q(s)) f_k + p_l(q(s)) M_k),
 
-because the state of slot k alone decides what becomes of its packet. The sum over s is E P_k. Where packets may be late by
-up to W slots, the same runs from slot k − W, up to which all is settled, to slot k with q(s) times the probability that
-a packet of each slot is there by slot k: a late packet counts as if it had been in time.
+because the state in slot k alone decides the fate of its packet. The sum over s is E P_k. Where packets may be late by up
+to W slots, the same recursion runs from slot k − W, up to which everything is settled, to slot k, with q(s) times the
+probability that a packet of each slot has arrived by slot k: a late packet counts as if it had been in time.
 
 Source: docs/mathematics.md, losses in bursts and late packets.
 """
@@ -16,6 +16,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -35,8 +36,9 @@ from evedrop.model.theory.covariances import (
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
 
+@final
 class ModulatedCovariance:
-    """E P_k of a receiver behind such a link, the next slots at a time from k = 0. Final; as `ExpectedCovariance`."""
+    """E P_k of a receiver behind such a link, a number of slots at a time from k = 0, as `ExpectedCovariance`."""
 
     def __init__(self, process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> None:
         self._process, self._law = process, law
@@ -60,9 +62,9 @@ class ModulatedCovariance:
         return traces
 
     def _further(self) -> Floats:
-        """The traces of some more slots: a block of them, or slot by slot up to where a block may begin.
+        """The traces of some more slots: a block of them, or single slots up to the place where a block may begin.
 
-        How many these are depends on the law alone, so values do not depend on how many slots are asked for at a time.
+        Their number depends only on the law, so values do not depend on how many slots are asked for at a time.
         """
         k = self._k
         segment, stop = self._segment(k)
@@ -75,7 +77,7 @@ class ModulatedCovariance:
         return self._slot_by_slot(segment, 1 if k == segment.start else min(until - k, BLOCK))
 
     def _block_of(self, segment: Segment) -> LinearBlock | None:
-        """The operator of the segment's blocks; None where its slots are not alike, or too large to be worth it."""
+        """The operator of the segment's blocks; None where its slots differ, or where the operator is too large to be useful."""
         if self._law.window or self._remaining is not None or segment.quality_at is not None:
             return None
         if self._process.n**2 * (len(segment.chain.law) + 1) > _LARGEST:
@@ -87,8 +89,8 @@ class ModulatedCovariance:
         return self._blocks[segment.start]
 
     def _in_a_block(self, block: LinearBlock) -> Floats | None:
-        """The traces of a block; None, and nothing is changed, if something in it is beyond double precision."""
-        assert self._settled is not None  # noqa: S101 - a block does not begin with slot 0
+        """The traces of a block; None, without any change, if a value in it is beyond double precision."""
+        assert self._settled is not None  # noqa: S101 - a block never begins with slot 0
         assert self._before is not None  # noqa: S101 - the same
         with np.errstate(over="ignore", invalid="ignore"):
             traces, settled = block.ahead(self._settled, self._before)
@@ -109,7 +111,7 @@ class ModulatedCovariance:
         return traces
 
     def _segment(self, k: int) -> tuple[Segment, int]:
-        """The segment of a slot, and the first slot after it."""
+        """The segment that contains a slot, and the first slot after the segment."""
         starts = [one.start for one in self._law.segments] + [2**62]
         number = bisect_right(starts, k) - 1
         return self._law.segments[number], starts[number + 1]
@@ -135,15 +137,15 @@ class ModulatedCovariance:
         states = self._settled
         for one in self._window:
             states = self._step(states, one, k - one.k)
-        assert states is not None  # noqa: S101 - the window holds slot k
+        assert states is not None  # noqa: S101 - the window contains slot k
         return states
 
     def _odds(self, quality: Floats) -> dict[str, Floats]:
-        """The outcomes' probabilities in every state, (states,) each."""
+        """The probabilities of the outcomes in every state, (states,) each."""
         return {name: self._base[name] + self._slope[name] * quality for name in PARTS}
 
     def _step(self, states: Floats | None, slot: _Slot, lag: int) -> Floats:
-        """E(s) after a slot, from that before it, when the slot is so many slots ago."""
+        """E(s) after a slot, from E(s) before it, when the slot is `lag` slots ago."""
         A, chain = self._process.A, slot.segment.chain
         quality = slot.quality * slot.segment.arrived[lag]
         odds = {name: one[:, None, None] for name, one in self._odds(quality).items()}
@@ -152,7 +154,7 @@ class ModulatedCovariance:
             first: Floats = odds["initial"] * law * self._process.initial_covariance
             return first
         mixed = states.sum(axis=0)[None] * law if slot.fresh else np.tensordot(chain.transitions.T, states, axes=1)
-        # Without the mask 0 · inf would undo a bounded expectation once Σ_k leaves double precision.
+        # Without the mask, 0 · inf would spoil a bounded expectation once Σ_k exceeds double precision.
         grown = 2.0 * (A @ slot.before @ A.T)
         misled = np.where(odds["misled"] > 0.0, odds["misled"] * grown, 0.0)
         source = odds["predicted"] * self._process.Q + misled
@@ -162,26 +164,26 @@ class ModulatedCovariance:
         return kept
 
 
-_LARGEST = 160  # numbers that a block carries along: with more of them its operator costs more than it saves
+_LARGEST = 160  # numbers that a block carries along: beyond it the operator costs more than it saves
 
 
 @dataclass(frozen=True)
 class _Slot:
-    """What a step needs to know of its slot."""
+    """The data of a slot that a step needs."""
 
     k: int
     segment: Segment
     fresh: bool
-    """Whether a segment begins, whose chain starts in its stationary law."""
+    """Whether a segment begins here; its chain starts in its stationary law."""
     quality: Floats
     before: Floats | None
     """Σ_{k−1}."""
     remaining: Floats | None
-    """Of the genie."""
+    """The error of the genie."""
 
 
 def limit_of(process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> float:
-    """Trace of lim E P_k behind the link as it is in the end; inf if it has none, NaN if it is too large to work out."""
+    """Trace of lim E P_k for the link in its last state; inf if it has no limit, NaN if it is too large to compute."""
     chain = law.last
     if len(chain.law) * process.n**2 > LARGEST_OPERATOR:
         return float("nan")
@@ -198,7 +200,7 @@ def limit_of(process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> float:
 
 
 def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> float:
-    """Trace of lim E P_k; inf if it has none: the operator on (E(s)) does not contract, or misled errors grow."""
+    """Trace of lim E P_k; inf if it has no limit: the operator on (E(s)) does not contract, or misled errors grow."""
     states = limit_states(process, chain, outcomes_at)
     return float("inf") if states is None else float(np.trace(states.sum(axis=0)))
 
@@ -222,7 +224,7 @@ def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Flo
 
 
 def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> Floats:
-    """What a slot adds to E(s) in the limit, (states, n, n)."""
+    """The contribution of a slot to E(s) in the limit, (states, n, n)."""
     misled = any(one.misled > 0.0 for one in outcomes)
     f = 2.0 * (process.A @ lyapunov(process, 1.0) @ process.A.T) if misled else np.zeros_like(process.Q)
     M = remaining_limit(process) if any(one.leaked for one in outcomes) else np.zeros_like(process.Q)
@@ -243,7 +245,7 @@ def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states:
 
 
 def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
-    """A slot of an independent link whose errors last as long: `kept` is the rate at which the chain keeps an error.
+    """The outcomes of an independent link whose errors last equally long; `kept`: the rate at which the chain keeps errors.
 
     Source: docs/mathematics.md, losses in bursts.
     """

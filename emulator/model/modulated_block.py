@@ -1,7 +1,7 @@
-"""A block of slots behind a chain whose slots are alike, at once: the recursion of `modulated` as one linear operator.
+"""A block of equal slots behind a chain, computed at once: the recursion of `modulated` as one linear operator.
 
-With v = (E(1), …, E(S), Σ, 1) the recursion is v ← M v, so the trace of slot j of a block is t M^j v: of the block's operator
-only the rows t M^j and the last power are kept.
+With v = (E(1), …, E(S), Σ, 1) the recursion is v ← M v, so the trace of slot j of a block is t M^j v: only the rows t M^j
+and the last power of the block's operator are kept.
 
 Source: docs/mathematics.md, losses in bursts.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -17,25 +18,26 @@ from evedrop.model.links.link import Chain
 from evedrop.model.process import Floats, Process
 
 BLOCK = 128
-"""Slots of a block, a power of 2."""
+"""Slots in a block, a power of 2."""
 PARTS = ("kept", "predicted", "misled", "leaked", "initial")
-"""The outcomes of a slot that the recursion asks for."""
+"""The outcomes of a slot that the recursion needs."""
 
 
+@final
 @dataclass(frozen=True)
 class LinearBlock:
-    """Final."""
+    """The operator of a block of slots."""
 
     traces: Floats
     """t M^j for j = 1 … BLOCK, (BLOCK, D)."""
     last: Floats
     """M^BLOCK, (D, D)."""
     misleads: bool
-    """Whether v has Σ: only an error that may grow with it is told of it, for Σ may be beyond double precision."""
+    """Whether v contains Σ: only where an error may grow with it, because Σ may exceed double precision."""
 
     @classmethod
     def of(cls, process: Process, chain: Chain, odds: Mapping[str, Floats]) -> LinearBlock:
-        """Of a chain with the outcomes' probabilities in its states, (S,) each; nothing may leak."""
+        """The block of a chain with the probabilities of the outcomes in its states, (S,) each; leaks are not supported."""
         n, states = process.n, len(chain.law)
         size = n * n
         misleads = bool(np.any(odds["misled"] > 0.0))

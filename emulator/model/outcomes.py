@@ -1,4 +1,4 @@
-"""What a receiver does with a slot, by scheme and strategy, as far as the outcomes of one slot tell it.
+"""The outcomes of a slot at a receiver, by scheme and strategy, where one slot alone determines them.
 
 Source: docs/mathematics.md, eavesdroppers; docs/schemes.md.
 """
@@ -17,18 +17,18 @@ from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 
 def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
-    """From the quality of its link to what the legitimate estimator does with a slot; None: no such closed form."""
+    """Maps its link's quality to the outcomes of the legitimate estimator; None if there is no such closed form."""
 
     def at(quality: float) -> Outcomes:
         found = scheme.outcomes(quality)
-        assert found is not None  # noqa: S101 - asked below
+        assert found is not None  # noqa: S101 - checked below
         return found
 
     return None if scheme.outcomes(0.5) is None else at
 
 
 def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> OutcomesAt | None:
-    """The same of an eavesdropper's strategy with its parameters."""
+    """The same for an eavesdropper's strategy with its parameters."""
     kind = STRATEGIES[strategy]
     if kind.outcomes(parameters, scheme.state_probability) is None:
         return None
@@ -41,7 +41,7 @@ def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str
 
     def at(quality: float) -> Outcomes:
         found = scheme.eavesdropper_outcomes(quality, *uses)
-        assert found is not None  # noqa: S101 - asked below
+        assert found is not None  # noqa: S101 - checked below
         return found
 
     return None if scheme.eavesdropper_outcomes(0.5, *uses) is None else at

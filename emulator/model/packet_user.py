@@ -1,4 +1,4 @@
-"""The receivers that take a packet for the state or ignore it: the paper's class of eavesdroppers."""
+"""Receivers that use a packet as the state or ignore it: the paper's class of eavesdroppers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)
 
 
 class PacketUser(Receiver):
-    """Its covariance is what it believes; where it took an innovation for the state, the truth is another.
+    """Its covariance is its own belief; where it used an innovation as the state, the actual covariance differs.
 
     Source: Lemma V.1; docs/mathematics.md, eavesdroppers.
     """

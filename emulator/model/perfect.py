@@ -1,12 +1,14 @@
-"""The loop as it would be if the controller saw the truth: the same plant, noise and disturbances, no link in between.
+"""The loop in which the controller sees the truth: the same plant, noise and disturbances, without a link.
 
-It needs none of them twice. What both loops share cancels in the difference of their states, e ← A e + B (u − u′), so the
-other loop is known wherever the states and inputs of this one are: live as in memory.
+It does not simulate them again. All that both loops share cancels in the difference of their states,
+e ← A e + B (u − u′), so the other loop is known wherever the states and inputs of this one are, live and in memory.
 
 Source: docs/microgrid.md, energy.
 """
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 
@@ -15,10 +17,11 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 
 
+@final
 class PerfectLoop:
-    """The other loop, slot by slot. Final; slots come in order from 0.
+    """The other loop, slot by slot; slots come in order from 0.
 
-    controller: of its own, fresh; period: slots from one of its decisions to the next; disturbances: (slots, q).
+    controller: a new one, used by nothing else; period: slots between its decisions; disturbances: (slots, q).
     """
 
     def __init__(
@@ -32,7 +35,7 @@ class PerfectLoop:
         self._u: Floats = np.zeros((plant.inputs, controller.trials))
 
     def follow(self, x: Floats, u: Floats) -> Floats:
-        """The other loop's inputs of the next slot, (m, R), within their limits; x (n, R) and u (m, R) of this one's."""
+        """The other loop's inputs of the next slot, (m, R), within their limits; x (n, R) and u (m, R): those of this loop."""
         if self._next % self._period == 0:
             decided = self._controller.decide(self._next, x - self._e, self._disturbances[self._next])
             self._u = self._plant.limited(decided)

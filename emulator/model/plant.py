@@ -1,7 +1,7 @@
 """The plant behind a process: x_{k+1} = A x_k + B u_k + B_d d_k + w_k, moved by inputs and disturbances.
 
-States here are deviations from the public reference, as they are transmitted. The process's Q is what network, estimators
-and eavesdroppers believe of everything that moves the state; the plant's own noise w has a covariance of its own.
+States here are deviations from the public reference, as they are transmitted. The process's Q is the covariance that network,
+estimators and eavesdroppers assume for everything that moves the state; the plant's own noise w has its own covariance.
 
 Source: docs/mathematics.md, closed loop.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from evedrop.model.receiver import Flags
 
 @dataclass(frozen=True)
 class Plant:
-    """All of a plant but its A, which is the process's, and its disturbances; n states, m inputs, q disturbances."""
+    """A plant except A, which the process has, and the values of disturbances; n states, m inputs, q disturbances."""
 
     input_matrix: Floats
     """B, (n, m)."""
@@ -32,24 +32,24 @@ class Plant:
     start: Floats
     """Mean of x_0, (n,)."""
     input_lower: Floats
-    """(m,); −inf where there is no limit, and so below."""
+    """(m,); −inf where there is no limit. The limits below are the same."""
     input_upper: Floats
     state_lower: Floats
     """(n,)."""
     state_upper: Floats
     output_matrix: Floats | None = None
-    """C, (p, n), of a sensor that measures y = C x + v and filters; None of one that knows x."""
+    """C, (p, n), for a sensor that measures y = C x + v and filters; None for a sensor that knows x."""
     measurement_noise: Floats | None = None
     """Covariance of v, (p, p)."""
 
     @property
     def inputs(self) -> int:
-        """How many inputs there are."""
+        """The number of inputs."""
         return int(self.input_matrix.shape[1])
 
     @property
     def spec(self) -> dict[str, Any]:
-        """As plain numbers, None for a limit that is none."""
+        """The plant as plain numbers, with None for a limit that does not exist."""
         limits = {
             name: [value if np.isfinite(value) else None for value in getattr(self, name).tolist()]
             for name in ("input_lower", "input_upper", "state_lower", "state_upper")
@@ -60,7 +60,7 @@ class Plant:
 
     @classmethod
     def of(cls, spec: Mapping[str, Any]) -> Plant:
-        """From its `spec`."""
+        """The plant of a `spec`."""
         n = len(spec["start"])
         limits = {
             name: np.array([without if value is None else value for value in spec[name]], np.float64)
@@ -75,15 +75,15 @@ class Plant:
         return cls(**matrices, noise=np.array(spec["noise"]), start=np.array(spec["start"]), **limits, **measured)
 
     def limited(self, u: Floats) -> Floats:
-        """What the plant makes of inputs u (m, R): within its limits."""
+        """The inputs u (m, R), clipped to their limits."""
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def clips(self, u: Floats) -> Flags:
-        """Whether some input of u (…, m, R) is beyond its limits, (…, R)."""
+        """Whether any input of u (…, m, R) is beyond its limits, (…, R)."""
         return np.asarray(((u < self._lower) | (u > self._upper)).any(axis=-2))
 
     def moved(self, u: Floats) -> Floats:
-        """B u, (n, R), of inputs u (m, R) within their limits."""
+        """B u, (n, R), with the inputs u (m, R) clipped to their limits."""
         return product(self.input_matrix, self.limited(u))
 
     @cached_property
@@ -95,8 +95,9 @@ class Plant:
         return self.input_upper[:, None]
 
 
+@final
 class Drive:
-    """What moves the state of a plant from slot to slot besides A and w. Final.
+    """The effect of inputs and disturbances on a plant's state, from slot to slot.
 
     disturbances: d (slots, q).
     """
@@ -111,11 +112,11 @@ class Drive:
         self._u: Floats | None = None
 
     def hold(self, u: Floats) -> None:
-        """Have the inputs u (m, R) from now on, until others come."""
+        """Apply the inputs u (m, R) from now on, until others come."""
         self._u = self._plant.moved(u)
 
     def pushed(self, k: int) -> Floats:
-        """What moves the state into slot k, (n, R) or (n, 1): B u_{k−1} + B_d d_{k−1}; the start, where k = 0."""
+        """What is added to A x and w in slot k, (n, R) or (n, 1): B u_{k−1} + B_d d_{k−1}; for k = 0 the start."""
         if k == 0:
             return self._start
         drift: Floats = self._drift[k - 1, :, None]

@@ -1,9 +1,9 @@
-"""What somebody who follows a house's battery can tell about the house: when its people are at home, and at it.
+"""How much an observer of a house's battery can infer about the house: when people are at home and active.
 
-A day is cut into windows. In some the house is *active*: its mean load there is at or above a threshold, as it is when
-somebody cooks or washes, and hardly otherwise. Whoever has guessed the load of every window takes the larger guesses for
-activity. How well that works is the area under the curve of detections over false alarms: 1 if every active window's guess
-is above every quiet one's, ½ for a coin.
+A day is divided into windows. In some of them the house is *active*: its mean load is at or above a threshold, which hardly
+happens unless somebody cooks or washes. An observer that has guessed the load of every window takes the larger guesses
+for activity. The measure of success is the area under the curve of detections over false alarms: 1 if the guess for every
+active window is above that for every quiet one, ½ for a coin.
 
 Source: docs/microgrid.md, privacy.
 """
@@ -19,19 +19,19 @@ Flags = NDArray[np.bool_]
 
 
 def means(values: Floats, window: int) -> Floats:
-    """Means over each window, (windows, …), of values (slots, …). A last window that is not whole is left out."""
+    """Means over each window, (windows, …), of values (slots, …). An incomplete last window is left out."""
     windows = len(values) // window
     mean: Floats = values[: windows * window].reshape(windows, window, *values.shape[1:]).mean(axis=1)
     return mean
 
 
 def active(load: Floats, window: int, threshold: float) -> Flags:
-    """In which windows the house is active, (windows,); load: (slots,) in kW, as is the threshold."""
+    """Whether the house is active in each window, (windows,); load: (slots,) in kW, as is the threshold."""
     return np.greater_equal(means(load, window), threshold)
 
 
 def area(score: Floats, truth: Flags) -> float:
-    """Area under the curve: how often an active window scores above a quiet one, ties counted half; NaN if there are not both.
+    """Area under the curve: how often an active window scores above a quiet one, ties counted half; NaN without both kinds.
 
     score: (windows,), the larger the likelier active; truth: (windows,).
     """
@@ -43,10 +43,10 @@ def area(score: Floats, truth: Flags) -> float:
 
 
 def detection_rate(score: Floats, truth: Flags, false_alarms: float) -> float:
-    """Share of active windows that are found where the share `false_alarms` of the quiet ones is taken for active.
+    """Share of active windows that are detected if the share `false_alarms` of the quiet ones is taken for active.
 
-    Windows that score alike at the threshold are decided by a coin, so that whoever knows nothing finds `false_alarms`.
-    NaN if there are not both kinds.
+    A coin decides between windows with equal scores at the threshold, so that an observer without knowledge detects the
+    share `false_alarms`. NaN without both kinds of windows.
     """
     on, off = score[truth], np.sort(score[~truth])[::-1]
     if not len(on) or not len(off):

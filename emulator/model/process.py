@@ -1,7 +1,7 @@
 """The process x_{k+1} = A x_k + w_k, its checks, and its simulation over a batch of trials.
 
 Arrays of a batch have the trials as last axis: x is (n, R), P is (n, n, R). The two products below are elementwise over
-that axis, in a fixed order, so a trial's bits depend neither on the batch nor on the machine.
+that axis, in a fixed order, so a trial's bits do not depend on the batch or the machine.
 
 Source: docs/mathematics.md, model.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,10 @@ from evedrop.streams import Batch, BlockReader
 Floats = NDArray[np.float64]
 
 MARGINAL = 1e-7
-"""An eigenvalue of A this close to the unit circle is on it, computed: a double one has errors of 1e-8."""
+"""An eigenvalue of A within this distance of the unit circle counts as on it: computing a double one has errors of 1e-8."""
 MOST_STATES = 64
-"""Of a process: what is worked out of n states before a run takes time that grows with n³ and more."""
-_SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that rounding does not explain
+"""The most states of a process: some computations before a run take a time that grows with n³ or faster."""
+_SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mere rounding
 
 
 def product(M: Floats, x: Floats) -> Floats:
@@ -35,8 +36,9 @@ def product(M: Floats, x: Floats) -> Floats:
     return y
 
 
+@final
 class Dynamics:
-    """A as an operator on batches: the same sums as `product`, with A's columns laid out once. Final."""
+    """A as an operator on batches: the same sums as `product`, with A's columns laid out once."""
 
     def __init__(self, A: Floats) -> None:
         self._indices = range(1, A.shape[0])
@@ -65,13 +67,13 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class Process:
-    """A (n, n), Q (n, n), initial_covariance Σ0 (n, n): what everybody, eavesdroppers too, may know of the process."""
+    """A (n, n), Q (n, n), initial_covariance Σ0 (n, n): the process model, which is public, also to eavesdroppers."""
 
     A: Floats
     Q: Floats
     initial_covariance: Floats
     singular_noise: bool = False
-    """Whether Q may be singular, as that of a filter's innovations is."""
+    """Whether Q may be singular, as the covariance of a filter's innovations may be."""
 
     @cached_property
     def noise_factor(self) -> Floats:
@@ -109,10 +111,11 @@ class Process:
         return carried + self._Q_column
 
 
+@final
 class ProcessNoise:
-    """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`. Final.
+    """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`.
 
-    initial: x_0 (n, R), where a scheme's secret decides it; covariance: of w, (n, n), semidefinite, where it is not Q.
+    initial: x_0 (n, R), if a scheme's secret decides it; covariance: of w, (n, n), semidefinite, if it is not Q.
     """
 
     def __init__(
@@ -131,7 +134,7 @@ class ProcessNoise:
         self._noise: Floats
 
     def at(self, k: int) -> Floats:
-        """What slot k adds to A x_{k−1}, (n, R)."""
+        """The noise that slot k adds to A x_{k−1}, (n, R)."""
         if k == 0 and self._initial is not None:
             return self._initial
         if k not in self._slots:
@@ -145,10 +148,11 @@ class ProcessNoise:
         return noise
 
 
+@final
 class Trajectory:
-    """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Final. Must be read slot by slot.
+    """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Must be read slot by slot.
 
-    initial, covariance: as of `ProcessNoise`.
+    initial, covariance: as for `ProcessNoise`.
     """
 
     def __init__(
@@ -164,10 +168,10 @@ class Trajectory:
         self._next = 0
         self.x: Floats = np.zeros((process.n, batch.trials))
         self.predicted: Floats = self.x
-        """A x_{k−1}, (n, R): what the innovation of this slot is measured against."""
+        """A x_{k−1}, (n, R): the innovation of this slot is measured against it."""
 
     def advance(self, pushed: Floats | None = None) -> Floats:
-        """The next slot's state, (n, R); pushed: what else moves it there, (n, R) or (n, 1)."""
+        """The next slot's state, (n, R); pushed: the effect of inputs and disturbances on it, (n, R) or (n, 1)."""
         noise = self._noise.at(self._next)
         if self._next == 0:
             self.x = noise
@@ -180,10 +184,11 @@ class Trajectory:
         return self.x
 
 
+@final
 class StateFactors:
     """L_k with L_k L_kᵀ = Σ_k, lower triangular with positive diagonal, by QR of [A L_{k−1}, Q^½].
 
-    Final. Σ_k itself is never formed: in the unstable example its Cholesky factor cannot be taken from k = 45 on.
+    Σ_k itself is never formed: in the unstable example its Cholesky factorisation fails from k = 45 on.
 
     Source: docs/mathematics.md, encoding noise.
     """
@@ -221,7 +226,7 @@ class StateFactors:
 def mistakes_of(
     A: Floats, Q: Floats, initial_covariance: Floats, singular_noise: bool = False
 ) -> list[tuple[str, str]]:
-    """Everything that keeps the three from being a process: (entry, sentence) for each mistake, none if it is one.
+    """All reasons why the three are not a process: (entry, sentence) for each mistake.
 
     singular_noise: Q may be singular.
 
@@ -270,14 +275,14 @@ def _covariance_mistakes(M: Floats) -> list[str]:
         return [f"entry [{i}][{j}] is {M[i, j]} but [{j}][{i}] is {M[j, i]}; expected a symmetric matrix"]
     scale = np.sqrt(np.abs(np.diag(M)))
     lowest = float(np.linalg.eigvalsh(M)[0])
-    # Of the correlations, so that states in different units do no harm, and with room for rounding in a singular M.
+    # The eigenvalues of the correlations do not depend on the states' units; the limit allows for rounding in a singular M.
     if not np.all(np.diag(M) > 0.0) or np.linalg.eigvalsh(M / np.outer(scale, scale))[0] <= _SINGULAR:
         return [f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix, all eigenvalues above 0"]
     return []
 
 
 def _reachable(A: Floats, Q: Floats) -> int:
-    """Rank of [Q, A Q, …], by an orthonormal basis grown a power at a time (powers of A themselves overflow)."""
+    """Rank of [Q, A Q, …], from an orthonormal basis extended one power at a time (powers of A itself overflow)."""
     scale = max(1.0, float(np.abs(A).max()))
     basis = _range(Q)
     while 0 < basis.shape[1] < A.shape[0]:

@@ -1,4 +1,4 @@
-"""What every receiver shares: its belief, what it did with a slot, and the prediction between packets."""
+"""The base of every receiver: its belief, its action in a slot, and the prediction between packets."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ Codes = NDArray[np.uint8]
 
 
 class Action(IntEnum):
-    """What a receiver did in a slot, as far as it knows itself."""
+    """What a receiver did in a slot, as far as the receiver knows."""
 
     LOST = 0
     """Nothing was received: γ = 0."""
     STATE = 1
     """The packet was used as the state."""
     INNOVATION = 2
-    """The packet was read as an innovation: decoded with the secret, or without it for the little that it leaks."""
+    """The packet was read as an innovation: decoded with the secret, or used without it for the little that it leaks."""
     DISCARDED = 3
     """The packet was received and not used."""
 
 
 class Reception(NamedTuple):
-    """What a receiver got in a slot, for R trials."""
+    """What a receiver heard in a slot, for R trials."""
 
     gamma: Flags
     """γ_k: received or not, (R,)."""
     z: Floats
-    """The packets, (n, R); of any value where nothing was received."""
+    """The packets, (n, R); undefined where nothing was received."""
     header: NDArray[np.int64] | None = None
-    """What the scheme sends in clear beside each packet, (h, R); None for a scheme that has no header."""
+    """The unencrypted header that the scheme sends with each packet, (h, R); None for a scheme without a header."""
     truth: Floats | None = None
-    """x_k itself, (n, R), in the one slot whose state is betrayed to this receiver, received or not; else None."""
+    """x_k itself, (n, R), in the one slot whose state is betrayed to this receiver, received or not; otherwise None."""
 
 
 class Belief(NamedTuple):
-    """A receiver's knowledge after a slot, for R trials. Never changed: a slot makes a new one."""
+    """A receiver's knowledge after a slot, for R trials. Immutable: a slot makes a new one."""
 
     x_hat: Floats
     """Estimate, (n, R)."""
@@ -52,11 +52,11 @@ class Belief(NamedTuple):
     action: Codes
     """`Action` of the slot, (R,)."""
     memory: tuple[NDArray[Any], ...] = ()
-    """What a receiver knows besides: arrays whose last axis is the trials."""
+    """Further knowledge of a receiver: arrays whose last axis is the trials."""
 
 
 def select(flags: Flags, yes: Callable[[], Floats], no: Callable[[], Floats]) -> Floats:
-    """`yes()` in the trials where flags (R,) is true, `no()` in the others; what no trial needs is not computed."""
+    """`yes()` in the trials where flags (R,) is true, `no()` in the others; neither is called without need."""
     count = np.count_nonzero(flags)
     if count == flags.size:
         return yes()
@@ -66,7 +66,7 @@ def select(flags: Flags, yes: Callable[[], Floats], no: Callable[[], Floats]) ->
 
 
 def cleared(flags: Flags, shape: tuple[int, ...], value: Callable[[], Floats]) -> Floats:
-    """0 in the trials where flags (R,) is true, `value()`, of a shape (…, R), in the others."""
+    """0 in the trials where flags (R,) is true, `value()`, with shape (…, R), in the others."""
     count = np.count_nonzero(flags)
     if count == flags.size:
         return np.zeros(shape)
@@ -82,7 +82,7 @@ def trace_of(P: Floats) -> Floats:
 
 
 def prior(process: Process, trials: int, first: int = 0) -> Belief:
-    """Belief before slot `first` of who has heard nothing yet: x̂ = 0, P = Σ_{first−1}, and Σ0 before slot 0.
+    """Belief of a receiver before slot `first` if it has heard nothing: x̂ = 0, P = Σ_{first−1}, and Σ0 before slot 0.
 
     Source: docs/mathematics.md, legitimate estimator.
     """
@@ -93,14 +93,14 @@ def prior(process: Process, trials: int, first: int = 0) -> Belief:
 
 
 class Receiver(ABC):
-    """Turns deliveries into beliefs, a slot at a time. It keeps no state but what its secret streams read ahead."""
+    """Turns deliveries into beliefs, slot by slot. It keeps no state except what its secret streams read ahead."""
 
     def __init__(self, process: Process, trials: int) -> None:
         self.process = process
         self.trials = trials
 
     def prior(self, first: int = 0) -> Belief:
-        """Belief before slot `first` of this receiver if it has heard nothing yet."""
+        """Belief of this receiver before slot `first` if it has heard nothing."""
         return prior(self.process, self.trials, first)
 
     @abstractmethod
@@ -109,4 +109,4 @@ class Receiver(ABC):
 
     @abstractmethod
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """Belief after slot k, from the one before it and what was heard in it. Any slot may be asked for again."""
+        """Belief after slot k, from the belief before it and the reception in it. Any slot may be asked for again."""

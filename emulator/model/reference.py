@@ -1,7 +1,7 @@
-"""Packets that hold the state less a reference, and whoever reads them with what it knows of that reference.
+"""Packets that contain the state minus a reference, and receivers that read them from what they know of the reference.
 
-A packet is z = x_k − L^{k−t} x_t, with t in the header, or x_k itself with t = −1. What a receiver knows of x_t decides
-what it makes of the packet.
+A packet is z = x_k − L^{k−t} x_t, with t in the header, or x_k itself with t = −1. How a receiver reads the packet depends
+on its knowledge of x_t.
 
 Source: docs/mathematics.md, acknowledged references.
 """
@@ -9,6 +9,7 @@ Source: docs/mathematics.md, acknowledged references.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,22 +23,23 @@ from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 Slots = NDArray[np.int64]
 
 NONE = -1
-"""The reference slot of a packet that holds the state itself."""
+"""The reference slot of a packet that contains the state itself."""
 _DOUBLINGS = 60
 _MOST_SLOTS = 2**62
 
 
+@final
 class ReferenceCode:
-    """How a reference is carried from slot to slot: by L = A, or, for stable A, by L = Σ A⁻ᵀ Σ⁻¹. Final."""
+    """How a reference is carried from slot to slot: by L = A, or, for stable A, by L = Σ A⁻ᵀ Σ⁻¹."""
 
     def __init__(self, process: Process) -> None:
         self._process = process
         self.decorrelates = radius(process) < 1.0 and np.linalg.matrix_rank(process.A) == process.n
-        """Whether A is stable, and a packet therefore made independent of the state it leads to."""
+        """Whether A is stable, so that a packet is made independent of the state it leads to."""
 
     @cached_property
     def L(self) -> Floats:
-        """(n, n)."""
+        """The matrix L, (n, n)."""
         A = self._process.A
         if not self.decorrelates:
             return A
@@ -46,7 +48,7 @@ class ReferenceCode:
 
     @cached_property
     def longest(self) -> int:
-        """How many slots a reference may be old: then L^m x_t of a stable A is so large that x_k is lost in rounding."""
+        """The largest age of a reference in slots: beyond it, L^m x_t of a stable A is so large that x_k is lost in rounding."""
         if not self.decorrelates:
             return _MOST_SLOTS
         sigma = stationary_covariance(self._process)
@@ -72,7 +74,7 @@ class ReferenceCode:
 
 
 def stationary_covariance(process: Process) -> Floats:
-    """Σ = A Σ Aᵀ + Q of a stable process, (n, n), by doubling; the same bits everywhere."""
+    """Σ = A Σ Aᵀ + Q of a stable process, (n, n), by doubling, with the same bits on every machine."""
     sigma, power = process.Q, process.A
     for _ in range(_DOUBLINGS):
         added = product(product(power, sigma), power.T.copy())
@@ -84,14 +86,14 @@ def stationary_covariance(process: Process) -> Floats:
 
 
 class ReferenceReceiver(Receiver):
-    """The exact MMSE reader for L = A; for a decorrelating code one that decodes what it can and else predicts.
+    """The exact MMSE reader for L = A; for a decorrelating code, a reader that decodes what it can and otherwise predicts.
 
-    x_k = z + L^{k−t} x_t, so x̂_k = z + L^{k−t} x̂_t, with the error of x̂_t and no other. For L = A nothing heard after
-    slot t says more about x_t, and this is the best there is. Its memory, each carried to the slot at hand: the estimate
-    of the last slot it read a packet in, and its covariance; the same of that packet's reference; and both slots. An
+    x_k = z + L^{k−t} x_t, so x̂_k = z + L^{k−t} x̂_t, whose only error is that of x̂_t. For L = A nothing that is heard after
+    slot t adds knowledge of x_t, so this is optimal. Its memory, all carried to the current slot: the estimate of the last
+    slot in which it read a packet, with its covariance; the same for that packet's reference; and both slots. An
     acknowledged slot in between, in which it heard nothing, is predicted from the former.
 
-    Without forged acknowledgements the legitimate estimator never lacks a reference: it acknowledged it.
+    Unless acknowledgements are forged, the legitimate estimator always has the reference, because it acknowledged it.
     """
 
     def __init__(self, process: Process, trials: int) -> None:
@@ -100,18 +102,18 @@ class ReferenceReceiver(Receiver):
         self._terms: list[Floats] = [process.Q[:, :, None]]
 
     def prior(self, first: int = 0) -> Belief:
-        """x̂ = 0, P = Σ, known of the slot before, and before slot 0 of that; no reference."""
+        """x̂ = 0, P = Σ, as the estimate of the slot before, or before slot 0 of slot 0 itself; no reference."""
         belief = super().prior(first)
         none = np.full(self.trials, NONE, np.int64)
         last = np.full(self.trials, max(0, first - 1), np.int64)
         return belief._replace(memory=(belief.x_hat, belief.P, belief.x_hat, np.zeros_like(belief.P), last, none))
 
     def act(self, k: int, gamma: Flags) -> Codes:
-        """Not to be told: it depends on the packet's header."""
-        raise NotImplementedError("what becomes of a slot depends on the header; only packets themselves can tell")
+        """Not available: the action depends on the packet's header."""
+        raise NotImplementedError("the action in a slot depends on the packet's header; γ alone does not tell it")
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if nothing is read; else (z, 0), or z and what is known of the reference.
+        """(A x̂, A P Aᵀ + Q) if no packet is read; otherwise (z, 0), or z plus the knowledge of the reference.
 
         A packet without a header has no reference: it is taken for the state.
         """
@@ -151,14 +153,14 @@ class ReferenceReceiver(Receiver):
         if k == 0:
             return latest, spread, kept, kept_spread, last, named
         if self._code.decorrelates:
-            # What is too old to be named again is let go, before it grows beyond all numbers.
+            # A reference too old to be named again is dropped before it overflows.
             latest = np.where(k - last <= self._code.longest, latest, 0.0)
             kept = np.where(k - named <= self._code.longest, kept, 0.0)
         carry, widen = self._code.carry, self.process.carry
         return carry(latest), widen(spread), carry(kept), widen(kept_spread), last, named
 
     def _diffused_since(self, k: int, last: Slots, t: Slots, where: Flags) -> Floats:
-        """Σ A^j Q A^jᵀ over k−t ≤ j < k−last, (n, n, R): process noise up to slot t, carried to k; 0 where not asked."""
+        """Σ A^j Q A^jᵀ over k−t ≤ j < k−last, (n, n, R): process noise up to slot t, carried to k; 0 outside `where`."""
         n = self.process.n
         total = np.zeros((n, n, self.trials))
         if not np.any(where & (t > last)):

@@ -1,4 +1,4 @@
-"""Classes by their name in a scenario: built in, of an installed package, or anybody's own, named PACKAGE.MODULE:CLASS.
+"""Classes by their name in a scenario: built in, of an installed package, or custom, named PACKAGE.MODULE:CLASS.
 
 Source: docs/your-own.md.
 """
@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, final
 
 from evedrop.errors import NoAnswer, NotRegistered
 
@@ -24,12 +24,12 @@ _NOT_IN_CHILDREN = "__main__"
 
 
 def is_own(name: object) -> bool:
-    """Whether this names a module and a class in it, rather than something by a name of its own."""
+    """Whether a name has the form MODULE:CLASS, rather than being a registered name."""
     return isinstance(name, str) and ":" in name
 
 
 def place_of(error: BaseException, file: str | None = None) -> str:
-    """An error in somebody's module in some words: what, and the last line of that file, or of any, that led to it."""
+    """A short description of an error in a custom module: the error, and the last line of that file, or of any, before it."""
     if isinstance(error, NoAnswer):
         return str(error)
     frames = traceback.extract_tb(error.__traceback__)
@@ -45,7 +45,7 @@ def place_of(error: BaseException, file: str | None = None) -> str:
 
 
 def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a class says is wrong with parameters that it has, (entry, what), be the class anybody's."""
+    """A class's own mistakes in the given parameters, as (entry, sentence); the class may be custom."""
     entry = next(iter(given), "parameters")
     wanted = "expected it to return a list of (entry, what is wrong)"
     try:
@@ -58,12 +58,13 @@ def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(str(name), str(what)) for name, what in found]
 
 
+@final
 class Registry(Mapping[str, type[T]], Generic[T]):
-    """Name → class, of one kind. Final. To be gone through are the built-in ones alone; any other can be asked for.
+    """Name → class, for one kind of class. Iteration covers only the built-in classes; any other can be looked up.
 
-    kind: as a message calls it; base: what every class inherits from; group: of the entry points of installed packages;
-    reserved: entries that a scenario's table has beside the class's parameters; stand_in: makes what stands for a class
-    that is not built in, which then runs only where it is asked for by `imported`.
+    kind: its name in messages; base: the base class; group: the entry points of installed packages; reserved: entries that a
+    scenario's table has besides the class's parameters; stand_in: makes a stand-in for a class that is not built in, which is
+    itself loaded only by `imported`.
 
     `[name]` raises NotRegistered, which is a KeyError.
     """
@@ -95,23 +96,23 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return self._with_free_parameters(name, self._stand_in(name), "")
 
     def imported(self, name: str) -> type[T]:
-        """The class itself, whose module is imported into this process. Raises NotRegistered."""
+        """The class itself, imported into this process with its module. Raises NotRegistered."""
         if name in self._built_in:
             return self._built_in[name]
         target, said = self._target(name)
         return self._checked(name, *_imported(name, target, said))
 
     def foreign(self, name: str) -> bool:
-        """Whether a class of this name is not built in, be there one or not."""
+        """Whether a class of this name would not be built in; the class need not exist."""
         return name not in self._built_in
 
     @property
     def names(self) -> list[str]:
-        """All that can be given short: built in, and of installed packages."""
+        """All short names: of built-in classes and of those in installed packages."""
         return sorted({*self._built_in, *_entry_points(self.group, tuple(sys.path))})
 
     def _target(self, name: str) -> tuple[str, str]:
-        """The PACKAGE.MODULE:CLASS that a name stands for, and how messages begin."""
+        """The PACKAGE.MODULE:CLASS that a name stands for, and the beginning of messages about it."""
         if is_own(name):
             return _importable(name, name, ""), ""
         targets = _entry_points(self.group, tuple(sys.path)).get(name, ())
@@ -119,14 +120,14 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             raise NotRegistered(name)
         if len(targets) > 1:
             both = " and ".join(targets)
-            raise NotRegistered(name, f", which two installed packages call so; expected one of {both} itself")
+            raise NotRegistered(name, f", a name that two installed packages use; expected one of {both} itself")
         said = f", which an installed package says is {targets[0]}"
         return _importable(name, targets[0], said), said
 
     def _checked(self, name: str, found: Any, said: str) -> type[T]:
         wanted = f"a class that inherits from evedrop.extend.{self.base.__name__}"
         if not isinstance(found, type) or not issubclass(found, self.base):
-            raise NotRegistered(name, f"{said}, which is no {self.base.__name__}; expected {wanted}")
+            raise NotRegistered(name, f"{said}, which is not a {self.base.__name__}; expected {wanted}")
         lacking = sorted(getattr(found, "__abstractmethods__", ()))
         if lacking:
             raise NotRegistered(
@@ -138,7 +139,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         if not isinstance(parameters, Mapping) or not all(isinstance(one, str) for one in parameters):
             raise NotRegistered(
                 name,
-                f"{said}, whose parameters are no table; expected the entries it takes, each with an example, "
+                f"{said}, whose parameters are not a table; expected the entries it takes, each with an example, "
                 'such as parameters = {"threshold": 3}',
             )
         return self._with_free_parameters(name, found, said)
@@ -153,7 +154,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
 
 
 def _importable(name: str, target: str, said: str) -> str:
-    """A PACKAGE.MODULE:CLASS, if it is one that every process can import."""
+    """The PACKAGE.MODULE:CLASS, if every process can import it. Raises NotRegistered otherwise."""
     if not _OWN.fullmatch(target):
         raise NotRegistered(name, f"{said}; expected PACKAGE.MODULE:CLASS, such as mine:Masked")
     if target.partition(":")[0] == _NOT_IN_CHILDREN:
@@ -170,7 +171,7 @@ def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
     except (Exception, SystemExit) as error:
         missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(str(error.name))
         wanted = (
-            "a module beside the scenario (or in its `modules`), or an installed one"
+            "a module in the scenario's folder (or in its `modules`), or an installed one"
             if missing
             else "one that can be imported"
         )
@@ -193,9 +194,9 @@ def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
 
 @lru_cache(maxsize=32)
 def _entry_points(group: str, path: tuple[str, ...]) -> Mapping[str, tuple[str, ...]]:
-    """Name → what the entry points of this name stand for; path: `sys.path`, by which a later one is asked again."""
+    """Name → targets of the entry points of this name; path: `sys.path`, part of the cache's key."""
     del path
-    from importlib import metadata  # noqa: PLC0415 - who needs none starts sooner
+    from importlib import metadata  # noqa: PLC0415 - a process that needs no entry points starts faster
 
     found: dict[str, set[str]] = {}
     for point in metadata.entry_points(group=group):

@@ -1,15 +1,18 @@
-"""The secret schedule ν: which packets hold the state and which an innovation."""
+"""The secret schedule ν: which packets contain the state and which an innovation."""
 
 from __future__ import annotations
+
+from typing import final
 
 from evedrop.model.receiver import Flags
 from evedrop.streams import Batch, BlockReader
 
 
+@final
 class Schedule:
     """ν_k for every trial, from the stream `schedule`: P(ν_k = 0) = μ_d for k ≥ 1, and ν_0 = 0.
 
-    Final. Held by sensor and legitimate estimator, and by those eavesdroppers that are defined to know it.
+    Known to sensor and legitimate estimator, and to those eavesdroppers that are defined to know it.
 
     Source: docs/mathematics.md, model.
     """

@@ -1,8 +1,8 @@
-"""What is known of twin tracks before anything is known of the other one: its distance from a track that was heard.
+"""What one twin track tells about the other: the distribution of their distance.
 
 A track of slot k is a = F ξ + η, its twin b = F ξ' + η, with F = A^k L0 and the same noise η ~ N(0, N_k).
-Given a, the distance b − a has mean −A^k Σ0 A^kᵀ Σ_k⁻¹ a, whichever of the two is the process's own. One triangularisation
-has it all, without a difference and without Σ_k:
+Given a, the distance b − a has mean −A^k Σ0 A^kᵀ Σ_k⁻¹ a, whichever of the two is the true one. One triangularisation
+gives everything, without a difference and without Σ_k:
 
     [ F  N_k^½  0]   [L_k   0     ]
     [−F   0     F] = [G     R_k^½ ] U,   U orthogonal, L_k L_kᵀ = Σ_k; b − a given a: mean G L_k⁻¹ a, covariance R_k.
@@ -12,6 +12,8 @@ Source: docs/mathematics.md, twin track.
 
 from __future__ import annotations
 
+from typing import final
+
 import numpy as np
 
 from evedrop.kernels.elementary import Rows, cholesky, triangular_factor
@@ -19,8 +21,9 @@ from evedrop.model.numeric.factored import Factor
 from evedrop.model.process import Floats, Process, product
 
 
+@final
 class Apart:
-    """The distance to the twin, given one track of a slot. Final; every number of it depends on the process alone."""
+    """The distance to the twin, given one track of a slot; its numbers depend only on the process."""
 
     def __init__(self, start: Rows, noise: Rows) -> None:
         n = len(start)
@@ -44,8 +47,9 @@ class Apart:
         return product(self._gain, white)
 
 
+@final
 class Twins:
-    """`Apart` of any slot. Final; slots in order are quick."""
+    """`Apart` of any slot; asking for slots in order is quick."""
 
     def __init__(self, process: Process) -> None:
         n = process.n
@@ -56,7 +60,7 @@ class Twins:
         self._start, self._late = self._first
 
     def at(self, k: int) -> Apart:
-        """Of slot k."""
+        """The distance in slot k."""
         if k < self._k:
             self._k, (self._start, self._late) = 0, self._first
         while self._k < k:

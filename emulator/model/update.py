@@ -1,4 +1,4 @@
-"""What a slot does to an estimate, to the covariance that is believed, to the actual one, and to the error itself.
+"""The effect of a slot on the estimate, the believed covariance, the actual covariance and the error.
 
 | action | x̂ | believed P | actual P | error e = x − x̂ |
 |---|---|---|---|---|
@@ -7,7 +7,7 @@
 | innovation decoded | A x̂ + w | A P Aᵀ | A P Aᵀ | A e |
 | misled: innovation used as the state | z | 0 | f_k = 2 A Σ_{k−1} Aᵀ | A x_{k−1} − χ_k |
 
-Before slot 0 there is the prior of x_0 itself, so slot 0 is not predicted: what is lost leaves x̂ = 0, P = Σ0, e = x_0.
+Before slot 0 there is the prior of x_0 itself, so slot 0 is not predicted: a lost packet leaves x̂ = 0, P = Σ0, e = x_0.
 
 Source: Theorem IV.1, Lemma V.1; docs/mathematics.md, eavesdroppers.
 """
@@ -27,7 +27,7 @@ _STATE, _INNOVATION = int(Action.STATE), int(Action.INNOVATION)  # numpy compare
 def estimate(
     process: Process, k: int, x_hat: Floats, action: Codes, z: Floats, w: Callable[[], Floats] | None = None
 ) -> Floats:
-    """x̂_k (n, R) from x̂_{k−1}, the actions (R,), the packets z (n, R) and, for who decodes, w_{k−1} = z − χ (n, R)."""
+    """x̂_k (n, R) from x̂_{k−1}, the actions (R,), the packets z (n, R) and, for a decoder, w_{k−1} = z − χ (n, R)."""
 
     def kept() -> Floats:
         predicted = process.predict(x_hat) if k else x_hat
@@ -39,7 +39,7 @@ def estimate(
 
 
 def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> Floats:
-    """P_k (n, n, R) that a receiver believes, from P_{k−1} and the actions (R,)."""
+    """P_k (n, n, R) as a receiver believes it, from P_{k−1} and the actions (R,)."""
 
     def kept() -> Floats:
         if k == 0:
@@ -53,7 +53,7 @@ def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> F
 def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Flags, f: Floats) -> Floats:
     """P_k (n, n, R) of the error, from P_{k−1}, given the events: the mean of e eᵀ over all states and noises.
 
-    action (R,); nu (R,): the packet holds an innovation; f (n, n): f_k of `theory.misled_covariances`. Its mean over
+    action (R,); nu (R,): the packet contains an innovation; f (n, n): f_k of `theory.misled_covariances`. Its mean over
     trials estimates `theory.expected_covariances`.
     """
     return select(
@@ -64,9 +64,9 @@ def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Fl
 
 
 def error(process: Process, e: Floats, action: Codes, nu: Flags, w: Floats, misled: Callable[[], Floats]) -> Floats:
-    """e_k (n, R) from e_{k−1}, the actions (R,), ν (R,), w_{k−1} (n, R), and A x_{k−1} − χ_k (n, R) for who is misled.
+    """e_k (n, R) from e_{k−1}, the actions (R,), ν (R,), w_{k−1} (n, R), and A x_{k−1} − χ_k (n, R) for a misled receiver.
 
-    Nothing cancels, so it holds where x itself has grown beyond all precision. e before slot 0 is 0, and w then is x_0.
+    Nothing cancels, so it is accurate even where x exceeds all precision. Before slot 0, e is 0, and w is then x_0.
     """
 
     def kept() -> Floats:

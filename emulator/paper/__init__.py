@@ -1,1 +1,1 @@
-"""The paper's figures and numbers, ours beside the paper's."""
+"""The paper's figures and numbers, and ours for comparison."""

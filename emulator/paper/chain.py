@@ -1,4 +1,4 @@
-"""The Markov chain of the legitimate estimator: its limiting distribution against simulation.
+"""The Markov chain of the legitimate estimator: its limiting distribution compared with simulation.
 
 Source: the paper's appendix, Proposition (limiting distribution).
 """
@@ -23,7 +23,7 @@ CASES = ((0.9, 0.6), (0.6, 0.3))
 WORDS = ("D", "DI", "DD", "DII", "DID", "DDI", "DDD")
 STEPS = 13
 _BURN_IN = 200
-_LONGEST = 1 << 40  # longer words are not told apart
+_LONGEST = 1 << 40  # longer words are not distinguished
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Occupation:
 
 
 def simulate(mu: float, mu_d: float, trials: int, slots: int, progress: Callable[[str], None]) -> Occupation:
-    """Follow link and schedule, and count where the estimator is. A word is kept as bits: 1, then 1 a drop, 0 not."""
+    """Follow link and schedule, and count the estimator's states. A word is stored as bits: 1, then 1 for a drop, 0 otherwise."""
     batch = Batch(_BURN_IN + slots, trials)
     root = root_of_seed(2023)
     link = link_of({"model": "bernoulli", "quality": mu}, stream_key(root, "link/legitimate"), batch)
@@ -61,7 +61,7 @@ def simulate(mu: float, mu_d: float, trials: int, slots: int, progress: Callable
 
 
 def draw(path: Path, found: list[Occupation]) -> str:
-    """Draw the figure; its caption."""
+    """Draw the figure; returns its caption."""
     with panels(path, 2, 9.6, 4.0) as (left, right):
         for index, ((mu, mu_d), occupation, colour, mark) in enumerate(
             zip(CASES, found, (BLUE, RED), ("o", "s"), strict=True)

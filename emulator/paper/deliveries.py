@@ -1,4 +1,4 @@
-"""What a link delivers, slot by slot, for simulations that need no packets."""
+"""The deliveries of a link, slot by slot, for simulations without packets."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The paper's figures and a table of its numbers, ours beside the paper's.
+"""The paper's figures, and a table of its numbers with ours.
 
-Source: docs/mathematics.md; docs/errata.md for what differs.
+Source: docs/mathematics.md; docs/errata.md for differences.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from evedrop.paper import chain, microgrid, numbers, numerical, strategies
 
 @dataclass(frozen=True)
 class Size:
-    """How much is simulated. The paper's study of the microgrid is 1000 trials of 86 400 slots."""
+    """The amount of simulation. The paper's study of the microgrid has 1000 trials of 86 400 slots."""
 
     microgrid_trials: int = 200
     microgrid_slots: int = microgrid.DAY
@@ -27,13 +27,13 @@ DEFAULT_SIZE = Size()
 
 
 def _silent(_: str) -> None:
-    """Report to nobody."""
+    """Ignore a progress report."""
 
 
 def figures(directory: Path, progress: Callable[[str], None] = _silent, size: Size = DEFAULT_SIZE) -> Path:
-    """Draw every figure into `directory`, made if need be, as PNG and PDF, and write `figures.md` beside them.
+    """Draw every figure into `directory`, created if necessary, as PNG and PDF, and write `figures.md` there.
 
-    progress is told a line at a time what is being done. Under a minute on two cores at the default size.
+    progress receives a line for each step. Takes less than a minute on two cores at the default size.
     """
     directory.mkdir(parents=True, exist_ok=True)
     progress("numerical illustration")

@@ -34,7 +34,7 @@ def process() -> Process:
 
 
 def uncertain_process() -> Process:
-    """The same, known beforehand to ± 50 per cent only: Σ0 = 2500 I."""
+    """The same process with a large initial uncertainty of ± 50 per cent: Σ0 = 2500 I."""
     return Process(np.eye(2), 1e-5 * np.eye(2), 2500.0 * np.eye(2))
 
 
@@ -50,7 +50,7 @@ class Day:
 
 
 def outcomes(receiver: str, mu_d: float) -> Outcomes:
-    """What a receiver of this figure does with a slot."""
+    """A receiver's outcomes in a slot of this figure."""
     if receiver == "legitimate":
         return Outcomes.legitimate(MU, mu_d)
     return Outcomes.eavesdropper(MU, mu_d, 1.0, 1.0 if receiver == "naive" else 0.0)
@@ -67,9 +67,9 @@ def theory(slots: int, mu_ds: Sequence[float] = STATE_PROBABILITIES) -> Floats:
 
 
 def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
-    """A day of covariances for all nine μ_d at once, laid side by side along the axis of trials.
+    """A day of covariances for all nine μ_d at once, concatenated along the axis of trials.
 
-    Links are the same for every μ_d, schedules are drawn for each.
+    Links are the same for every μ_d; schedules are drawn for each.
     """
     batch = Batch(slots, trials)
     root = root_of_seed(2025)
@@ -104,7 +104,7 @@ def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
 
 
 def draw(path: Path, day: Day) -> str:
-    """Draw the figure; its caption."""
+    """Draw the figure; returns its caption."""
     fine = np.linspace(0.1, 0.9, 33)
     curves = theory(day.slots, fine.tolist())
     with panels(path, 2, 9.6, 4.0) as (left, right):

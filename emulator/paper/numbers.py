@@ -1,4 +1,4 @@
-"""Every number the paper prints, ours beside it: agree, erratum, or why it cannot be checked.
+"""Every number that the paper prints, with ours: agreement, erratum, or the reason why it cannot be checked.
 
 Source: docs/errata.md.
 """
@@ -31,7 +31,7 @@ class Number:
 
 
 def table(designs: dict[float, Against], day: Floats) -> str:
-    """The numbers as a Markdown table; `day` is `figures_microgrid.theory`'s for a whole day."""
+    """The numbers as a Markdown table; `day`: `microgrid.theory` for a whole day."""
     lines = ["| where | what | paper | ours | verdict |", "|---|---|---|---|---|"]
     for number in (*numerical_illustration(designs), *microgrid_application(day)):
         lines.append(f"| {number.where} | {number.what} | {number.paper} | {number.ours} | {number.verdict} |")

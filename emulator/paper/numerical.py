@@ -30,7 +30,7 @@ def process() -> Process:
 
 
 def designs() -> dict[float, Against]:
-    """The design against each of the four qualities, by quality."""
+    """The designs by the eavesdropper's link quality."""
     smart = [Adversary(f"{mu_e:g}", mu_e, 1.0, 0.0) for mu_e in QUALITIES]
     found = design(process(), MU, 0.6, smart, slots=80)
     return {mu_e: found.eavesdroppers[f"{mu_e:g}"] for mu_e in QUALITIES}
@@ -43,7 +43,7 @@ def gain(mu_e: float, mu_d: float) -> float:
 
 
 def draw(path: Path, found: dict[float, Against]) -> str:
-    """Draw the figure; its caption."""
+    """Draw the figure; returns its caption."""
     low = stability_bound(process(), MU)
     curves = {}
     for mu_e, against in found.items():

@@ -1,4 +1,4 @@
-"""Finite-k expectations of every receiver against the real model: what their error is, and what they believe it is.
+"""Finite-k expectations of every receiver compared with simulation: the actual error, and the error it believes.
 
 Source: Theorem IV.3 and Theorem V.2, corrected (docs/mathematics.md, expectations).
 """
@@ -40,7 +40,7 @@ def process() -> Process:
 
 
 def outcomes() -> dict[str, Outcomes]:
-    """What each receiver does with a slot, by receiver."""
+    """Receiver → its outcomes in a slot."""
     found = {"legitimate": Outcomes.legitimate(MU, MU_D)}
     for name in ("smart", "suspicious", "naive"):
         outcomes_at = STRATEGIES[name].outcomes(_SUSPICIOUS, MU_D)
@@ -59,7 +59,7 @@ class SimulatedRuns:
 
 
 def simulate(trials: int, progress: Callable[[str], None]) -> SimulatedRuns:
-    """The scheme, its links and its receivers as they run in the emulator, over many trials."""
+    """Simulate the scheme, its links and its receivers as the emulator runs them, over many trials."""
     sums = {name: np.zeros((4, SLOTS)) for name in _LOOKS}
     for first in range(0, trials, _BATCH):
         progress(f"strategies: trial {first} of {trials}")
@@ -72,7 +72,7 @@ def simulate(trials: int, progress: Callable[[str], None]) -> SimulatedRuns:
 
 
 def draw(path: Path, runs: SimulatedRuns) -> str:
-    """Draw the figure; its caption."""
+    """Draw the figure; returns its caption."""
     k = np.arange(SLOTS)
     with panels(path, 2, 9.6, 4.2) as (actual, believed):
         for name, (colour, mark, line) in _LOOKS.items():

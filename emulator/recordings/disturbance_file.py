@@ -4,9 +4,9 @@
     0, 0.0, 0.235
     1, 0.0, 0.235
 
-A name may have its unit beside it. Where the scenario says in which units disturbances are, the file must say so too; powers in
-W and kW are made what the scenario asks for. A column `time`, in seconds, shows where slots are missing. The file may be
-compressed (`.csv.gz`), may have other columns, and may be longer than the run: what comes after the last slot is not read.
+A name may be followed by its unit. If the scenario states the units of disturbances, the file must state them too; powers in
+W and kW are converted to the scenario's unit. A column `time`, in seconds, shows where slots are missing. The file may be
+compressed (`.csv.gz`), may have other columns, and may be longer than the run: rows after the last slot are not read.
 
 Source: docs/scenario.md, plant; docs/microgrid.md, a day of your own.
 """
@@ -30,19 +30,19 @@ _HEADER = re.compile(r"^(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]$")
 _TIME = "time"
 _EXAMPLE = "time [s], P_solar [kW], P_load [kW]"
 _MOST_SAID = 5
-_TIME_ERROR = 1e-6  # of a slot: times may be rounded
+_TIME_ERROR = 1e-6  # in slots: times may be rounded
 MOST_NUMBERS = 10_000_000
-"""Of a table of disturbances: slots times columns, a month of two columns by the second with room to spare."""
-_ROWS_UNASKED = 10_000  # of a scenario that does not say how many slots it has, which is a mistake of its own
+"""The most numbers in a table of disturbances, slots times columns: more than a month of two columns by the second."""
+_ROWS_UNASKED = 10_000  # for a scenario without a number of slots, which is reported as a mistake of its own
 
 
 def found_file(name: str, folder: Path) -> Path:
-    """Where a file that a scenario in this folder names is: in the folder, or else among those that are shipped."""
+    """The path of a file that a scenario in this folder names: in the folder, or otherwise among the shipped files."""
     beside = folder / name
     shipped = Path(str(resources.files("evedrop.scenarios"))) / name
     try:
         return shipped if not beside.exists() and shipped.is_file() else beside
-    except OSError:  # of a name that no file can have: who opens it says so
+    except OSError:  # the name cannot be a file's: opening it reports that
         return beside
 
 
@@ -55,15 +55,15 @@ def read_disturbances(
 ) -> list[list[float]]:
     """A row for each slot with the numbers of these names, in their order and units.
 
-    Raises DisturbanceError with every mistake: no file, missing columns, wrong units, what is no finite number, times that do
-    not advance by `slot_seconds`, fewer rows than `slots`.
+    Raises DisturbanceError with every mistake: no file, missing columns, wrong units, values that are not finite numbers, times
+    that do not advance by `slot_seconds`, fewer rows than `slots`.
     """
     most = MOST_NUMBERS // max(1, len(names))
     if slots is not None and slots > most:
         raise DisturbanceError(
             str(path),
             [
-                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or disturbances fewer"
+                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer disturbances"
             ],
         )
     limit = _ROWS_UNASKED if slots is None else max(0, slots)
@@ -89,14 +89,14 @@ def read_disturbances(
 
 
 def disturbances_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
-    """A file that is read back to the same bits."""
+    """The text of a file that is read back to the same bits."""
     head = names if units is None else [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
     return "".join(f"{','.join(line)}\n" for line in [list(head), *([repr(value) for value in row] for row in rows)])
 
 
 @dataclass(frozen=True)
 class _Row:
-    """A line of the file, by its number."""
+    """A line of the file and its number."""
 
     line: int
     cells: list[str]
@@ -104,7 +104,7 @@ class _Row:
 
 @dataclass(frozen=True)
 class _Column:
-    """A column that is wanted: its place in the file, and what its values are multiplied by."""
+    """A column that is read: its place in the file, and the factor for its values."""
 
     name: str
     place: int
@@ -113,7 +113,7 @@ class _Column:
 
 @dataclass(frozen=True)
 class _Found:
-    """What the lines after the first have in them: a list of numbers for each, its line, and what is wrong."""
+    """The contents of the lines after the first: numbers and line number of each, and the mistakes."""
 
     numbers: list[list[float]]
     lines: list[int]
@@ -121,7 +121,7 @@ class _Found:
 
 
 def _rows(path: Path, slots: int) -> Iterator[_Row]:
-    """Every line that is neither blank nor a comment, of a file of so many slots. Raises DisturbanceError."""
+    """Every line that is neither blank nor a comment, from a file for this number of slots. Raises DisturbanceError."""
     try:
         reader = csv.reader(lines_of(path, Limit.of_rows(slots)), skipinitialspace=True)
         for cells in reader:
@@ -134,7 +134,7 @@ def _rows(path: Path, slots: int) -> Iterator[_Row]:
 
 
 def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> tuple[list[_Column], list[str]]:
-    """The time, if there is one, and the columns of these names; and what is wrong with the first line."""
+    """The column of the time, if there is one, and those of the names; and mistakes in the first line."""
     found: dict[str, tuple[int, str | None]] = {}
     mistakes = []
     for place, cell in enumerate(head.cells):
@@ -169,7 +169,7 @@ def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> t
 
 
 def _factor(unit: str | None, wanted: str | None) -> float | None:
-    """What makes of one unit the other; None if nothing does."""
+    """The factor from one unit to the other; None if they cannot be converted."""
     if unit == wanted:
         return 1.0
     if unit in _KILOWATTS and wanted in _KILOWATTS:
@@ -178,7 +178,7 @@ def _factor(unit: str | None, wanted: str | None) -> float | None:
 
 
 def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _Found:
-    """The columns' values of every line, and what is wrong with lines."""
+    """The columns' values of every line, and the mistakes in lines."""
     places = [(column.place, column.factor) for column in columns]
     numbers: list[list[float]] = []
     lines: list[int] = []
@@ -195,7 +195,7 @@ def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _F
             lines.append(row.line)
             continue
         all_wrong += 1
-        if all_wrong <= _MOST_SAID + 1:  # more are not told, and so need not be kept
+        if all_wrong <= _MOST_SAID + 1:  # more are not reported, and need not be kept
             wrong.append(row)
     mistakes = list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines"))
     return _Found(numbers, lines, mistakes)
@@ -214,9 +214,9 @@ def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column])
 
 
 def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float) -> Iterator[str]:
-    """Where the time does not start at 0, or does not advance by a slot."""
+    """Mistakes where the time does not start at 0 or does not advance by one slot."""
     if times and times[0] != 0.0:
-        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, and every time less that"
+        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, with that subtracted from every time"
     for line, (before, time) in zip(lines[1:], pairwise(times), strict=True):
         if abs(time - before - slot_seconds) <= _TIME_ERROR * slot_seconds:
             continue
@@ -232,10 +232,10 @@ def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: f
 
 
 def _few(mistakes: Iterator[str], where: str) -> Iterator[str]:
-    """The first of them, and that there are more."""
+    """The first of the mistakes, and a note if there are more."""
     for i, mistake in enumerate(mistakes):
         if i == _MOST_SAID:
-            yield f"and more of the kind, in {where}"
+            yield f"and more such mistakes, in {where}"
             return
         yield mistake
 

@@ -1,4 +1,4 @@
-"""Recordings of a link: what became of every packet, and if it was measured, how long it took. CSV or Parquet.
+"""Recordings of a link: the outcome of every packet and, if it was measured, its delay. CSV or Parquet.
 
 Source: docs/links.md, traces.
 """
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +27,16 @@ Outcomes = NDArray[np.uint8]
 _PARQUET = (".parquet", ".pq")
 _EXPECTED = "expected a CSV or Parquet file of 0 (lost) and 1 (delivered)"
 _LIMIT = Limit.of_rows(MOST_OUTCOMES)
-_MOST_BYTES = 2**28  # of a column in a row group of a Parquet file, decompressed, which is in memory at once
-_LONGEST_VALUE = 100  # characters of a text that stands where a number should
-_MOST_NAMES = 20  # columns that a message names
+_MOST_BYTES = 2**28  # decompressed, of a column in a row group of a Parquet file, which is in memory at once
+_LONGEST_VALUE = 100  # characters of a text found where a number should be
+_MOST_NAMES = 20  # columns that a message lists
 
 
+@final
 class LinkRecording:
-    """A recording in a file, read whenever it is asked. Final.
+    """A recording in a file, read on request.
 
-    Raises TraceError for what is no file.
+    Raises TraceError if the path is not a file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,7 +47,7 @@ class LinkRecording:
             self._unreadable(error)
 
     def outcomes(self, column: str | None = None) -> Outcomes:
-        """What became of each packet. Raises TraceError, also for anything but 0 and 1, and for more than ten million."""
+        """The outcome of each packet. Raises TraceError, also for values other than 0 and 1 and for more than ten million."""
         found = bytearray()
         for place, value in self._values(column):
             if value not in {"0", "1"}:
@@ -54,14 +55,14 @@ class LinkRecording:
             found.append(value == "1")
             if len(found) > MOST_OUTCOMES:
                 self._no(
-                    "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most so many, such as a part of it"
+                    "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most that many, such as a part of it"
                 )
         if not found:
             self._no("file", f"is empty; {_EXPECTED}")
         return np.frombuffer(bytes(found), np.uint8)
 
     def delays(self, column: str | None = None) -> NDArray[np.float64]:
-        """How long each packet took, in slots, (packets,); NaN where nothing stands. Raises TraceError as `outcomes`."""
+        """The delay of each packet in slots, (packets,); NaN for empty values. Raises TraceError as `outcomes` does."""
         found = []
         for place, value in self._values(column):
             found.append(self._delay(place, value))
@@ -83,7 +84,7 @@ class LinkRecording:
         return delay
 
     def columns(self) -> list[str]:
-        """Their names; none if the file has no header."""
+        """The columns' names; empty if the file has no header."""
         with self._readable():
             if self._is_parquet:
                 return list(_parquet(self._path).schema_arrow.names)
@@ -95,13 +96,13 @@ class LinkRecording:
         return self._path.suffix.lower() in _PARQUET
 
     def _values(self, column: str | None) -> Iterator[tuple[str, str]]:
-        """Where each value of a column stands, and the value as text."""
+        """The place of each value of a column, and the value as text."""
         with self._readable():
             yield from (self._parquet_values if self._is_parquet else self._csv_values)(column)
 
     @contextmanager
     def _readable(self) -> Iterator[None]:
-        """Make errors of reading the file errors that say so."""
+        """Turn errors of reading the file into TraceError."""
         try:
             yield
         except TraceError:
@@ -141,7 +142,7 @@ class LinkRecording:
         row = 0
         for batch in table.iter_batches(columns=[names[place]]):
             values = batch.column(0)
-            # Texts one by one: the same long one may stand in every row.
+            # Text values are taken one at a time: every row may contain the same long text.
             for value in (one.as_py() for one in values) if _is_dictionary(values) else values.to_pylist():
                 row += 1
                 yield f"row {row}", _as_text(value)
@@ -152,7 +153,7 @@ class LinkRecording:
                 there = (
                     f"there are {_some(names)}" if names and not all(map(_is_number, names)) else "there are no names"
                 )
-                self._no("column", f"{_shown(column)} is no column of {self._path.name}; {there}")
+                self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
             return names.index(column)
         if len(names) != 1:
             if not any(names):
@@ -180,7 +181,7 @@ def _rows(file: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
 
 
 def _parquet(path: Path) -> Any:
-    import pyarrow as pa  # noqa: PLC0415 - half a second that a CSV need not wait for
+    import pyarrow as pa  # noqa: PLC0415 - takes half a second, which a CSV file does not need
     import pyarrow.parquet as pq  # noqa: PLC0415 - the same
 
     texts = [
@@ -188,7 +189,7 @@ def _parquet(path: Path) -> Any:
         for field in pq.read_schema(path)
         if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)
     ]
-    # A text that stands in every row of a million is kept once.
+    # A text that is repeated in a million rows is kept once.
     return pq.ParquetFile(path, read_dictionary=texts)
 
 
@@ -197,13 +198,13 @@ def _is_dictionary(values: Any) -> bool:
 
 
 def _some(names: Sequence[str]) -> str:
-    """Names of columns, in one line of some length."""
+    """The names of columns, in a line of bounded length."""
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return ", ".join(name[:40] for name in names[:_MOST_NAMES]) + more
 
 
 def _as_text(value: Any) -> str:
-    """A Parquet value as a CSV file would have it."""
+    """A Parquet value as a CSV file would contain it."""
     if value is None:
         return ""
     if isinstance(value, (str, bytes)):

@@ -1,4 +1,4 @@
-"""Where two runs part: the first slot, trial and receiver that differ, with both values."""
+"""Where two runs diverge: the first slot, trial and receiver that differ, with both values."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _INPUTS = ("u", "d", "failed")
 
 @dataclass(frozen=True)
 class RunDifference:
-    """The first difference, and whether there is one at all."""
+    """The first difference between two runs, if there is one."""
 
     same: bool
     text: str
 
 
 def difference(a: Results, b: Results) -> RunDifference:
-    """Compare what every receiver received and believed, trial by trial, over the trials and receivers both have."""
+    """Compare all that the receivers received and believed, trial by trial, for the trials and receivers that both runs have."""
     blocks_a, blocks_b = _blocks(a), _blocks(b)
     ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
     common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]
@@ -52,7 +52,7 @@ def difference(a: Results, b: Results) -> RunDifference:
 
 
 def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:
-    """(Receiver, first slot of a block) → the first slot after it: a multiple of 256, the next block's, or the run's end."""
+    """(Receiver, first slot of a block) → the slot after the block: a multiple of 256, the next block, or the run's end."""
     starts: dict[str, set[int]] = {}
     for peer, _, block in blocks:
         starts.setdefault(peer, set()).add(block)
@@ -82,14 +82,14 @@ class _Row:
 
 
 def _first(a: Results, b: Results) -> _Row | None:
-    """The first recorded row that differs, of a receiver, or of the controller."""
+    """The first recorded row of a receiver or the controller that differs."""
     found = _first_row(a.trials, b.trials, ("slot", "trial", "peer"), _COMPARED)
     inputs = (a.inputs, b.inputs)
     if inputs[0] is None or inputs[1] is None:
         return found
     compared = [name for name in _INPUTS if name in inputs[0].schema.names and name in inputs[1].schema.names]
     steered = _first_row(inputs[0], inputs[1], ("slot", "trial"), compared)
-    # What is decided in a slot is decided from what is believed after it.
+    # The decision in a slot follows from the estimate after it.
     return steered if steered is not None and (found is None or steered.slot < found.slot) else found
 
 
@@ -117,7 +117,7 @@ def _first_row(a: pa.Table, b: pa.Table, keys: Sequence[str], compared: Sequence
 
 
 def _plain(table: pa.Table, names: Sequence[str]) -> pa.Table:
-    """Columns that can be joined and compared: strings for dictionaries, the numbers' bytes for lists."""
+    """Columns that can be joined and compared: strings instead of dictionaries, bytes instead of lists of numbers."""
     columns = {}
     for name in names:
         column = table[name]

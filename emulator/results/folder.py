@@ -1,7 +1,7 @@
-"""The folder that results go into, and the files in it: for the user who started the run, and for nobody else.
+"""The results folder and its files, accessible only to the user who started the run.
 
-Results hold the seed, the truth and, while a run goes on, the operator's password. So a folder has the mode 0700 and a
-file 0600 from the moment it is there, whatever the umask is.
+Results contain the seed, the truth and, during a run, the operator's password. A folder therefore has the mode 0700 and a
+file 0600 from its creation on, whatever the umask is.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from evedrop.files import shown
 
 
 def default_folder(scenario: str | Path) -> Path:
-    """`runs/<scenario>-<time>`, in the current folder: what a results folder is called if nobody says."""
+    """The default name of a results folder: `runs/<scenario>-<time>` in the current folder."""
     stem = Path(scenario).stem if Path(scenario).suffix else Path(scenario).name
     return Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def claimed(wanted: Path) -> Path:
-    """Make a new folder of that name, or of that name and a number: nobody else makes the same one. Raises UsageError."""
+    """Make a new folder of that name, with a number appended if the name is taken, without races. Raises UsageError."""
     for number in itertools.count(1):
         folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
         try:
@@ -37,12 +37,12 @@ def claimed(wanted: Path) -> Path:
         except OSError as error:
             raise _unusable(folder, str(error.strerror)) from error
         return folder
-    raise AssertionError  # there is always another number
+    raise AssertionError  # numbers never run out
 
 
 @contextlib.contextmanager
 def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Path]:
-    """The folder for results: `out`, else a new one of the scenario's name, which is removed if it is still empty."""
+    """The folder for results: `out`, or a new one named after the scenario, which is removed if it is still empty."""
     if out is not None:
         yield Path(out)
         return
@@ -51,7 +51,7 @@ def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Pat
         yield folder
     finally:
         with contextlib.suppress(OSError):
-            folder.rmdir()  # only an empty one can be removed
+            folder.rmdir()  # succeeds only if the folder is empty
             folder.parent.rmdir()
 
 
@@ -63,9 +63,9 @@ _FOLDER_MODE, _FILE_MODE = 0o700, 0o600
 
 
 def new_folder(folder: Path) -> Path:
-    """Create a results folder, or take an empty one; nobody else may look into it.
+    """Create a results folder, or use an empty one, and make it private to this user.
 
-    Raises UsageError if it has something in it, belongs to another user, or cannot be written.
+    Raises UsageError if it is not empty, belongs to another user, or cannot be written.
     """
     if shown(folder) != str(folder):
         raise UsageError(f"--out {shown(folder)} is not a name in UTF-8, which results and messages are; give another")
@@ -84,20 +84,20 @@ def new_folder(folder: Path) -> Path:
 
 
 def make_private(folder: Path, exist_ok: bool = True) -> None:
-    """Create a folder, and those above it that are missing, for this user alone. Raises OSError as `Path.mkdir` does."""
+    """Create a folder and its missing parents, for this user only. Raises OSError as `Path.mkdir` does."""
     for missing in reversed([one for one in folder.parents if not one.exists()]):
         missing.mkdir(_FOLDER_MODE, exist_ok=True)
     folder.mkdir(_FOLDER_MODE, exist_ok=exist_ok)
 
 
 def _narrow(folder: Path) -> None:
-    """Take the rights of everybody else from a folder that was there before. Raises UsageError if it is not ours."""
-    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # the folder that is checked is the one that is changed
+    """Remove the rights of all other users from an existing folder. Raises UsageError if it belongs to another user."""
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # so that the folder checked is the folder changed
     try:
         found = os.fstat(opened)
         if found.st_uid != os.geteuid():
             raise UsageError(
-                f"{folder} belongs to the user with the number {found.st_uid}, who could read the seed and the truth in it; "
+                f"{folder} belongs to the user with the id {found.st_uid}, who could read the seed and the truth in it; "
                 "give another --out, or a folder of your own"
             )
         if found.st_mode & 0o077:
@@ -107,7 +107,7 @@ def _narrow(folder: Path) -> None:
 
 
 def private_opener(path: str, flags: int) -> int:
-    """An `opener` of `open`: a file that is made is readable by this user alone, and one that is there becomes so."""
+    """An `opener` for `open`: new and existing files become readable by this user only."""
     opened = os.open(path, flags, _FILE_MODE)
     with suppress(PermissionError):  # a file system without modes
         os.fchmod(opened, _FILE_MODE)
@@ -115,18 +115,18 @@ def private_opener(path: str, flags: int) -> int:
 
 
 def private_file(path: Path) -> Path:
-    """Create an empty file that only this user can read, for a library that opens it by its name; its path."""
+    """Create an empty file that only this user can read, for a library that opens it by name; returns its path."""
     with open(path, "wb", opener=private_opener):
         return path
 
 
 def private_pictures(path: Path) -> Path:
-    """The same of the two files of a picture, `path`.png and `path`.pdf; `path`."""
+    """Create both files of a picture, `path`.png and `path`.pdf, in the same way; returns `path`."""
     for suffix in (".png", ".pdf"):
         private_file(path.with_suffix(suffix))
     return path
 
 
 def write_private(path: Path, text: str) -> None:
-    """Write a text into a file that only this user can read."""
+    """Write a text to a file that only this user can read."""
     private_file(path).write_text(text, encoding="utf-8")

@@ -1,9 +1,9 @@
-"""Tables that grow while a run goes on, in a form that survives whatever ends it, and the Parquet files made of them.
+"""Tables that grow during a run, in a form that survives any ending, and the Parquet files made from them.
 
-While a run goes on, each table is an Arrow IPC stream in the folder `unfinished` of the results folder, to which record
-batches are appended. All tables are written together, in rounds; after each round a line of `unfinished/rounds` says how many
-rows each table has. A reader takes the last whole line and that many rows, so it does not matter in which byte the
-writer was killed or the disk became full. When the run ends, the streams become Parquet files one after the other.
+During a run, each table is an Arrow IPC stream in the folder `unfinished` of the results folder, to which record batches
+are appended. All tables are written together, in rounds; after each round a line of `unfinished/rounds` states how many
+rows each table has. A reader takes the last complete line and that number of rows, so it does not matter at which byte the
+writer was killed or the disk became full. When the run ends, the streams become Parquet files, one after the other.
 
 Source: docs/results.md, while a run goes on.
 """
@@ -29,9 +29,9 @@ from evedrop.results.folder import make_private, private_opener, write_private
 from evedrop.results.tables import NULLABLE
 
 UNFINISHED = "unfinished"
-"""The folder inside a results folder that holds what is not finished."""
+"""The folder inside a results folder that contains unfinished tables."""
 BATCH_BYTES = 16 * 2**20
-"""No record batch and no row group of a Parquet file is larger, unless a single row is."""
+"""The largest record batch and row group of a Parquet file, unless a single row is larger."""
 _GROUP_ROWS = 65_536
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
@@ -43,7 +43,7 @@ class TableStream:
     """An Arrow IPC stream that grows: one table of a run. Rows are held back until the next round."""
 
     def __init__(self, path: Path, schema: pa.Schema, names: Mapping[str, tuple[str, ...]]) -> None:
-        """names: what the codes of each dictionary column stand for. Raises OSError if the file cannot be made."""
+        """names: the meaning of the codes of each dictionary column. Raises OSError if the file cannot be created."""
         self.file = path.name
         self.rows = 0
         """Rows on disk."""
@@ -55,7 +55,7 @@ class TableStream:
         self._sink = _Sink(path)
         options = pa.ipc.IpcWriteOptions(compression="lz4")
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._sink, mode="w"), schema, options=options)
-        # Arrow writes the schema with the first batch, and a reader needs it before there is a row.
+        # Arrow writes the schema with the first batch, and a reader needs the schema before there are rows.
         empty = [
             pa.DictionaryArray.from_arrays(pa.array([], pa.int8()), self._names[one.name])
             if one.name in self._names
@@ -65,11 +65,11 @@ class TableStream:
         self._writer.write_batch(pa.RecordBatch.from_arrays(empty, schema=schema))
 
     def add(self, columns: Sequence[NDArray[Any]]) -> int:
-        """Hold back rows until the next round; how many bytes they have.
+        """Hold back rows until the next round; returns their size in bytes.
 
-        columns: an array for each column, codes where it has names, two-dimensional where it holds lists or bytes.
+        columns: an array for each column: codes for dictionary columns, two-dimensional for lists or bytes.
         """
-        # Copies: a view would keep a whole message in memory.
+        # Copies, because a view would keep a whole message in memory.
         copies = [np.array(column) for column in columns]
         for held, column in zip(self._held, copies, strict=True):
             held.append(column)
@@ -79,7 +79,7 @@ class TableStream:
         return size
 
     def write(self) -> None:
-        """Write what is held back to the file. Raises OSError if it cannot be written whole."""
+        """Write the rows held back to the file. Raises OSError if they cannot be written completely."""
         if self._held_rows:
             whole = [np.concatenate(held) for held in self._held]
             at_once = max(1, self._held_rows * BATCH_BYTES // max(1, self.held_bytes))
@@ -107,13 +107,13 @@ class TableStream:
         return pa.array(values, one.type, from_pandas=one.name in NULLABLE)
 
     def close(self) -> None:
-        """Close the file as it is; what is held back is dropped."""
+        """Close the file; rows held back are dropped."""
         self._sink.close()
 
 
 @final
 class _Sink:
-    """A file for Arrow, which writes every byte or raises: of a short write Arrow would take no notice."""
+    """A file for Arrow that writes every byte or raises: Arrow does not notice a short write."""
 
     def __init__(self, path: Path) -> None:
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
@@ -137,36 +137,36 @@ class _Sink:
 
 @dataclass(frozen=True)
 class TableRound:
-    """What an unfinished results folder has on disk."""
+    """The part of an unfinished results folder that is on disk."""
 
     at: str = ""
-    """How far its run came, in words."""
+    """How far the run came, in words."""
     slots: int = 0
-    """How many slots have rows."""
+    """The number of slots that have rows."""
     tables: Mapping[str, tuple[str, int]] = field(default_factory=dict)
-    """Table → its file and the rows that count."""
+    """Table → its file and its number of valid rows."""
 
 
 class Unfinished:
-    """The writer's side of the folder `unfinished`. Holds a lock on it, by which a reader knows that the run goes on."""
+    """The writer's side of the folder `unfinished`. Holds a lock on it, which tells readers that the run goes on."""
 
     def __init__(self, folder: Path) -> None:
-        """Make it in a results folder. Raises OSError if that cannot be done."""
+        """Create the folder in a results folder. Raises OSError on failure."""
         place = folder / UNFINISHED
         make_private(place, exist_ok=False)
         self._descriptor = os.open(place, os.O_RDONLY)
-        with contextlib.suppress(OSError):  # of a file system without locks, where a run that goes on looks killed
+        with contextlib.suppress(OSError):  # on a file system without locks, a run that goes on looks killed
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
 
     def round(self, at: str, slots: int, streams: Mapping[str, TableStream]) -> None:
-        """Write what every stream holds back, then the line that makes it count. Raises OSError if that fails."""
+        """Write the rows that all streams hold back, then the line that makes them count. Raises OSError on failure."""
         for stream in streams.values():
             stream.write()
         tables = {name: (stream.file, stream.rows) for name, stream in streams.items()}
         line = json.dumps({"at": at, "slots": slots, "tables": tables}).encode() + b"\n"
         if os.write(self._rounds, line) != len(line):
-            raise OSError(28, os.strerror(28), _ROUNDS)  # ENOSPC: only a disk that has become full takes a part
+            raise OSError(28, os.strerror(28), _ROUNDS)  # ENOSPC: only a full disk accepts part of a line
 
     def close(self) -> None:
         """Release the lock; the files stay."""
@@ -175,12 +175,12 @@ class Unfinished:
 
 
 def is_unfinished(folder: Path) -> bool:
-    """Whether a results folder has tables that are not Parquet files yet."""
+    """Whether a results folder has tables that are not yet Parquet files."""
     return (folder / UNFINISHED).is_dir()
 
 
 def goes_on(folder: Path) -> bool:
-    """Whether somebody still writes to an unfinished results folder."""
+    """Whether a process still writes to an unfinished results folder."""
     try:
         descriptor = os.open(folder / UNFINISHED, os.O_RDONLY)
     except OSError:
@@ -197,7 +197,7 @@ def goes_on(folder: Path) -> bool:
 
 
 def last_round(folder: Path) -> TableRound:
-    """What a results folder has in streams: the last round that was written whole; nothing if there was none."""
+    """The last round that was written completely; empty if there was none."""
     try:
         with (folder / UNFINISHED / _ROUNDS).open("rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
@@ -213,14 +213,14 @@ def last_round(folder: Path) -> TableRound:
 
 
 def write_figures(folder: Path, text: str) -> None:
-    """Write the summary of what was measured so far, whole at any moment."""
+    """Write the summary of the run so far; the file is complete at any moment."""
     place = folder / UNFINISHED
     write_private(place / f"{_SUMMARY}.new", text)
     os.replace(place / f"{_SUMMARY}.new", place / _SUMMARY)
 
 
 def figures_path(folder: Path) -> Path:
-    """Where `write_figures` puts them."""
+    """The path to which `write_figures` writes."""
     return folder / UNFINISHED / _SUMMARY
 
 
@@ -253,7 +253,7 @@ def schema_of(folder: Path, name: str) -> pa.Schema | None:
 
 
 def parquet_or_stream(folder: Path, name: str, rows: int = _GROUP_ROWS) -> Iterator[pa.RecordBatch]:
-    """The rows of a table, so many at a time if it is a Parquet file; none if there is no such table or it is damaged."""
+    """The rows of a table, `rows` at a time if it is a Parquet file; none if there is no such table or it is damaged."""
     path = folder / f"{name}.parquet"
     if path.exists():
         with contextlib.suppress(OSError, pa.ArrowException):
@@ -263,9 +263,9 @@ def parquet_or_stream(folder: Path, name: str, rows: int = _GROUP_ROWS) -> Itera
 
 
 def finish(folder: Path) -> None:
-    """Make Parquet files of all streams, each removed when its file is whole. Memory: that of a row group.
+    """Turn all streams into Parquet files; each stream is removed when its file is complete. Memory: one row group.
 
-    Raises OSError if one cannot be written: it and those after it stay streams, which are read as well.
+    Raises OSError if a file cannot be written: its table and all later ones stay streams, which can be read as well.
     """
     for name, (file, _) in last_round(folder).tables.items():
         schema = schema_of(folder, name)
@@ -292,7 +292,7 @@ def _write_parquet(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBat
 
 
 def _groups(batches: Iterator[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]:
-    """Batches put together to row groups."""
+    """Batches grouped into row groups."""
     held: list[pa.RecordBatch] = []
     rows = size = 0
     for batch in batches:
@@ -311,6 +311,6 @@ def _groups(batches: Iterator[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]
 
 
 def forget(folder: Path) -> None:
-    """Remove the folder `unfinished`, if all its tables are Parquet files and the summary is written."""
+    """Remove the folder `unfinished` if all its tables are Parquet files. Call this after the summary is written."""
     if not any((folder / UNFINISHED / file).exists() for file, _ in last_round(folder).tables.values()):
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)

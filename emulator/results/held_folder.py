@@ -1,4 +1,4 @@
-"""A folder that is known by itself and not by its name: it may be renamed while a run writes into it."""
+"""A folder held by its descriptor and not by its name, so that it may be renamed while a run writes to it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import final
 
-_F_GETPATH = 50  # of macOS, which Python has no name for before 3.9 and not on Linux
+_F_GETPATH = 50  # of macOS; Python has no name for it before 3.9, and none on Linux
 
 
 @final
@@ -17,14 +17,14 @@ class HeldFolder:
     """An open folder."""
 
     def __init__(self, path: Path) -> None:
-        """Raises OSError if it cannot be opened."""
+        """Open the folder. Raises OSError if it cannot be opened."""
         self.first = path
         """Its path when it was opened."""
         self._descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
 
     @property
     def now(self) -> Path:
-        """Its path by now. Raises FileNotFoundError if it was removed."""
+        """Its current path. Raises FileNotFoundError if it was removed."""
         if self._is(self.first):
             return self.first
         moved = self._found()
@@ -39,7 +39,7 @@ class HeldFolder:
             return False
 
     def _found(self) -> Path | None:
-        """What the system says of where it is."""
+        """The folder's path according to the system."""
         try:
             if sys.platform == "darwin":
                 return Path(os.fsdecode(fcntl.fcntl(self._descriptor, _F_GETPATH, bytes(1024)).rstrip(b"\0")))
@@ -48,5 +48,5 @@ class HeldFolder:
             return None
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the folder."""
         os.close(self._descriptor)

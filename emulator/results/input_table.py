@@ -1,4 +1,4 @@
-"""The table of what moved a plant: its columns, and its rows.
+"""The table of a plant's inputs and disturbances: its columns and rows.
 
 Source: docs/results.md, tables.
 """
@@ -20,7 +20,7 @@ from evedrop.score.slots import Slots
 
 
 def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
-    """Of so many inputs and disturbances."""
+    """The schema for these numbers of inputs and disturbances."""
     return pa.schema(
         [
             ("slot", pa.int64()),
@@ -34,18 +34,18 @@ def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
 
 
 def inputs_schema_in(path: Path) -> pa.Schema:
-    """What a file's schema should be; where it is no such file, one that says so when the file is read by it."""
+    """The schema that a file should have; for a file that is not such a table, one with which reading it reports that."""
     try:
         with opened(path) as file:
             schema = pq.read_schema(file)
         u, d = (int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d"))
-    except Exception:  # a damaged file makes pyarrow raise errors of many kinds, and the table's reader says what it is
+    except Exception:  # pyarrow raises many kinds of errors for a damaged file, and the table's reader reports them
         u = d = 0
     return inputs_schema(max(1, u), d)
 
 
 def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
-    """A row per slot and recorded trial, the first of which is first_trial; disturbances (slots, q) are of the whole run."""
+    """A row per slot and recorded trial, from first_trial on; disturbances (slots, q) are of the whole run."""
     assert slots.inputs is not None  # noqa: S101 - asked by the caller
     recorded = next(iter(slots.receivers.values())).P.shape[3]
     u, some = slots.inputs.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)

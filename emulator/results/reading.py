@@ -1,4 +1,4 @@
-"""Results folders read: the summary, and the tables as Arrow, of a run that ended, goes on, or was killed.
+"""Reads results folders: the summary, and the tables as Arrow, of a run that ended, goes on, or was killed.
 
 Source: docs/results.md.
 """
@@ -27,14 +27,14 @@ _LAST_SLOT = 100_000_000
 
 @dataclass(frozen=True)
 class Results:
-    """A results folder, read: `summary` as in docs/results.md, the tables as Arrow."""
+    """A results folder that was read: `summary` as in docs/results.md, the tables as Arrow."""
 
     folder: Path
     summary: Mapping[str, Any]
 
     @property
     def remark(self) -> str | None:
-        """What there is to say of a run that did not come to its end; None of one that did."""
+        """A remark on a run that did not complete; None for a complete run."""
         ended = str(self.summary.get("ended", "complete"))
         return None if ended == "complete" else f"{self.folder}: {ended.splitlines()[0]}"
 
@@ -43,17 +43,17 @@ class Results:
         schema = None if path.exists() else schema_of(self.folder, name)
         try:
             if schema is None:
-                with opened(path) as file:  # a pipe would be waited for
+                with opened(path) as file:  # does not wait if it is a pipe
                     table = pq.read_table(file)
             else:
                 table = pa.Table.from_batches(batches_of(self.folder, name), schema)
-        except Exception as error:  # a damaged file makes pyarrow raise errors of many kinds
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
         if not table.schema.equals(wanted):
             other = [field.name for field in wanted if field not in table.schema] or table.schema.names
             raise UsageError(
-                f"{path} is no table of this version (it differs in {', '.join(other)}); run the scenario again"
+                f"{path} is not a table of this version (it differs in {', '.join(other)}); run the scenario again"
             )
         empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
         if empty:
@@ -91,7 +91,7 @@ class Results:
 
 
 def _states_in(schema: pa.Schema) -> int:
-    """The number of states in a table of trials, as far as it is one."""
+    """The number of states in a table of trials; 1 if it is not such a table."""
     x = schema.field("x").type if "x" in schema.names else None
     return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
 
@@ -101,9 +101,9 @@ def _one_line(error: Exception) -> str:
 
 
 def load_results(folder: str | Path) -> Results:
-    """Read a results folder, also one whose run goes on or was killed: `ended` of its summary says so, and where.
+    """Read a results folder, also one of a run that goes on or was killed: `ended` in its summary says so.
 
-    Raises UsageError if it is none, naming the file that is missing or broken.
+    Raises UsageError naming the missing or broken file if it is not a results folder.
     """
     place = Path(folder)
     path = place / "summary.json"
@@ -122,16 +122,16 @@ def _read_summary(path: Path) -> dict[str, Any]:
         summary = json.loads(text_of(path, _MOST_BYTES))
     except Unreadable as error:
         raise UsageError(
-            f"{path.parent} is no results folder ({path.name}: {error}); give the --out of a run"
+            f"{path.parent} is not a results folder ({path.name}: {error}); give the --out of a run"
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
     parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
     if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
-        raise UsageError(f"{path} is no summary of a run; run the scenario again")
+        raise UsageError(f"{path} is not a run summary; run the scenario again")
     events = summary.get("events", [])
     if not isinstance(events, list) or not all(map(_is_event, events)):
-        raise UsageError(f"{path} has events that are none; run the scenario again")
+        raise UsageError(f"{path} has invalid events; run the scenario again")
     return summary
 
 
@@ -145,7 +145,7 @@ def _is_event(found: Any) -> bool:
 
 
 def _cut_short(folder: Path) -> dict[str, Any]:
-    """The summary of a results folder that has none of its own yet: the last figures that were written."""
+    """The last figures that were written, as the summary of a results folder that has no summary yet."""
     found = last_round(folder)
     at = found.at
     if not at:
@@ -164,7 +164,7 @@ def _cut_short(folder: Path) -> dict[str, Any]:
 
 def _no_figures(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
-    # The others need neither theory nor scenario to read results.
+    # Only this case needs theory and the scenario to read results.
     from evedrop.loading import load  # noqa: PLC0415
     from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
     from evedrop.score.totals import Totals  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""The scenario of a run as its results folder has it: complete, with the versions that made it."""
+"""The scenario of a run in its results folder: complete, with the versions that made it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from evedrop.results.folder import write_private
 from evedrop.scenario import Scenario
 
 DISTURBANCES = "disturbances.csv"
-"""Of a results folder whose scenario has some."""
+"""The file in a results folder if its scenario has disturbances."""
 
 
 def write_resolved(folder: Path, scenario: Scenario) -> None:
-    """Write the scenario.toml of a results folder, and the disturbances that it names, each whole at any moment."""
+    """Write the scenario.toml of a results folder, and its disturbances; both files are complete at any moment."""
     texts = {"scenario.toml": resolved(scenario)}
     plant = scenario.plant
     if plant is not None and plant.disturbance_values:
@@ -34,7 +34,7 @@ def write_resolved(folder: Path, scenario: Scenario) -> None:
 
 
 def resolved(scenario: Scenario) -> str:
-    """The scenario as TOML with everything in it and the versions that made it: running it again gives the same digests."""
+    """The complete scenario as TOML, with the versions that made it: running it again gives the same digests."""
     tables = scenario.model_dump(mode="json", exclude_none=True)
     if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
         tables["plant"]["disturbance_file"] = DISTURBANCES

@@ -1,4 +1,4 @@
-"""What the messages of a live run are held to, and the rows that are made of them."""
+"""The rows of all tables, made from slots and digests of a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evedrop.score.slots import Slots
 
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
-    """All rows of some slots."""
+    """Write all rows of some slots."""
     for name, one in scored.items():
         writer.slot_rows(slots.first, name, one.sums, one.expected)
     writer.input_rows(slots, first_trial)
@@ -23,16 +23,16 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
 
 @final
 class DigestRows:
-    """The digests of a run, whose rows are written as the blocks are reported."""
+    """The digests of a run; their rows are written as blocks are reported."""
 
     def __init__(self, digests: Mapping[str, Mapping[int, Digests]], first_trial: int) -> None:
-        """digests: receiver, or controller → block → digests of the trials from first_trial on; blocks are added."""
+        """digests: receiver, or controller → block → digests of the trials from first_trial on; blocks are added later."""
         self._digests = digests
         self._first_trial = first_trial
         self._written = dict.fromkeys(digests, 0)
 
     def write(self, writer: ResultsWriter) -> None:
-        """Write the blocks that were added since the last time."""
+        """Write the blocks that were added since the last call."""
         for name, blocks in self._digests.items():
             if len(blocks) > self._written[name]:
                 new = dict(islice(blocks.items(), self._written[name], None))

@@ -1,6 +1,6 @@
-"""What a shard of a run has kept of its trials, left beside its tables for whoever judges the run as a whole.
+"""The totals of a shard's trials, stored with its tables for the process that scores the whole run.
 
-It never leaves the machine or the user: a pickle, written by one process of a run and read by another, then removed.
+They never leave the machine or the user: a pickle, written by one process of a run, read by another, then removed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _NAME = "score"
 
 
 def dump_score(totals: Totals, folder: Path) -> None:
-    """Write them into a results folder, whole at any moment and for nobody else to read or change."""
+    """Write the totals to a results folder; the file is complete at any moment, and private to this user."""
     unfinished = folder / f"{_NAME}.new"
     with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
         pickle.dump(totals, file)
@@ -24,10 +24,10 @@ def dump_score(totals: Totals, folder: Path) -> None:
 
 
 def load_score(folder: Path, scenario: Scenario) -> Totals:
-    """Those in a results folder; of nothing, where whoever should have left them was killed before."""
+    """Read the totals from a results folder; empty totals if the process that should have written them was killed."""
     try:
         with (folder / _NAME).open("rb") as file:
-            found: Totals = pickle.load(file)  # noqa: S301 - a process of this run has written it, into a folder of ours
+            found: Totals = pickle.load(file)  # noqa: S301 - written by a process of this run, in a folder of this user
     except (OSError, EOFError, pickle.UnpicklingError):
         return Totals.nothing(scenario, scenario.trials)
     return found

@@ -1,4 +1,4 @@
-"""summary.json, which ends a results folder.
+"""summary.json, the last file of a results folder to be written.
 
 Source: docs/results.md, summary.json.
 """
@@ -19,7 +19,7 @@ from evedrop.results.growing_tables import forget
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write summary.json, which ends a results folder; infinite and undefined numbers as strings, which JSON lacks."""
+    """Write summary.json, which completes a results folder; infinite and undefined numbers as strings, which JSON lacks."""
     unfinished = folder / "summary.json.new"
     try:
         write_private(unfinished, summary_text(summary))
@@ -32,12 +32,12 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
-    """A summary as it is in a file."""
+    """The text of a summary's file."""
     return json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n"
 
 
 def plain(value: Any) -> Any:
-    """The same with infinite and undefined numbers as strings, which JSON lacks."""
+    """The same value with infinite and undefined numbers as strings, because JSON lacks them."""
     if isinstance(value, Mapping):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
@@ -48,12 +48,12 @@ def plain(value: Any) -> Any:
 
 
 def unwritten(error: OSError) -> str:
-    """What a summary and a message say of results that could not be written."""
+    """The message, also in summaries, about results that could not be written."""
     if isinstance(error, FileNotFoundError):
         return (
             f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
         )
     return (
-        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; what was "
-        "measured before can be looked at"
+        f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; the results "
+        "so far can be read"
     )

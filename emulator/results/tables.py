@@ -39,9 +39,9 @@ JOURNAL = pa.schema(
     ]
 )
 ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
-"""What a receiver did, as the observer knows it: `misled` is an innovation used as the state."""
+"""A receiver's actions as the observer knows them: `misled` is an innovation used as the state."""
 SENT = ("state", "innovation", "nothing")
-"""What a packet was."""
+"""The kinds of packet."""
 
 
 NULLABLE = {
@@ -50,7 +50,7 @@ NULLABLE = {
     "expected_trace_covariance",
     *(field.name for field in SLOTS if "quantile" in field.name),
 }
-"""Columns in which NaN means that there is nothing."""
+"""Columns in which NaN means that there is no value."""
 
 
 def trials_schema(n: int) -> pa.Schema:

@@ -1,4 +1,4 @@
-"""The results folder: written while the run goes on, whole whenever it ends, and read back as typed tables.
+"""The results folder: written during the run, complete whenever it ends, and read back as typed tables.
 
 Source: docs/results.md.
 """
@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, final
 
 import numpy as np
 import pyarrow as pa
@@ -35,10 +35,10 @@ from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums
 
-_ROUND_SECONDS = 3.0  # at the longest from one round to the next: what a killed writer loses
-_ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # held back at the most, at the start of a run and later
-_ROUND_SHARE = 8  # of what is on disk, so much less may be held back
-_FIGURES_SHARE = 50  # so many times as long as figures took nothing is spent on them
+_ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
+_ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later
+_ROUND_SHARE = 8  # at most this fraction (one in 8) of the bytes on disk is held back
+_FIGURES_SHARE = 50  # after figures took some time, none are computed for 50 times as long
 
 __all__ = [
     "ACTIONS", "DIGESTS", "JOURNAL", "NULLABLE", "SENT", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
@@ -46,11 +46,12 @@ __all__ = [
 ]  # fmt: skip
 
 
+@final
 class ResultsWriter:
-    """Writes the tables of a results folder. Final; a context manager.
+    """Writes the tables of a results folder; a context manager.
 
-    While the block runs, rows go to streams that can be read whatever ends the writer; on leaving it they become Parquet
-    files. `write_summary` then ends the folder.
+    Inside the block, rows go to streams that can be read however the writer ends; on leaving it they become Parquet files.
+    `write_summary` then completes the folder.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class ResultsWriter:
         around: Sequence[float] | None = None,
         loop: tuple[Plant, Floats] | None = None,
     ) -> None:
-        """around: what is added to states and estimates, (n,); loop: of a closed one, plant and disturbances (slots, q).
+        """around: added to states and estimates, (n,); loop: plant and disturbances (slots, q) of a closed loop.
 
         Raises OSError if the folder cannot be written.
         """
@@ -95,7 +96,7 @@ class ResultsWriter:
 
     @classmethod
     def of(cls, folder: Path, scenario: Scenario) -> Self:
-        """Of the results of a scenario."""
+        """A writer for the results of a scenario."""
         loop = (
             None
             if scenario.driven is None or scenario.controller is None
@@ -119,7 +120,7 @@ class ResultsWriter:
             stream.close()
         try:
             finish(self._held.now)
-        except (OSError, pa.ArrowException) as found:  # what was measured stays where it is, and can be read
+        except (OSError, pa.ArrowException) as found:  # the streams stay where they are, and can be read
             failure = failure or (found if isinstance(found, OSError) else OSError(str(found)))
         self._unfinished.close()
         self._held.close()
@@ -129,10 +130,10 @@ class ResultsWriter:
     def checkpoint(
         self, at: str, figures: Callable[[], Mapping[str, Any]], before: Callable[[], None] = lambda: None
     ) -> None:
-        """See to it that what was measured is on disk: within seconds, or when there is much that is not.
+        """Write rows to disk if some seconds have passed since the last round, or if many are held back.
 
-        at: how far the run came, in words; figures: the summary so far, which is asked for more rarely if it takes long;
-        before: called before figures are asked for. Raises OSError if the disk is full or the folder is gone.
+        at: how far the run came, in words; figures: returns the summary so far, called more rarely if it takes long;
+        before: called before figures. Raises OSError if the disk is full or the folder is gone.
         """
         self._at = at
         began = time.monotonic()
@@ -146,31 +147,31 @@ class ResultsWriter:
         if began >= self._figures_due:
             self._figures_due = self._round_due
             self.write_figures(figures())
-            # The first time theory is imported, which says nothing about the next.
+            # The first call imports the theory, so its time says nothing about the next.
             took = time.monotonic() - began if self._figures_before else 0.0
             self._figures_before = True
             self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
 
     def settle(self, at: str, figures: Mapping[str, Any]) -> None:
-        """Have everything on disk, with the last figures: nothing more will come. Raises OSError as above."""
+        """Write everything to disk, with the last figures; no rows may follow. Raises OSError as `checkpoint` does."""
         self._at = at
         self._round()
         self.write_figures(figures)
 
     def write_figures(self, figures: Mapping[str, Any]) -> None:
-        """Write the summary so far, of a run that did not end yet."""
+        """Write the summary so far, of a run that has not ended."""
         write_figures(self._held.now, summary_text({**figures, "ended": self._at}))
 
     def restart_slots(self) -> None:
-        """Forget the rows of all slots, for others will take their place."""
+        """Discard the rows of all slots; other rows will replace them."""
         self._restarts += 1
         self._outdated.append(self._streams["slots"])
         self._streams["slots"] = self._stream("slots", self._restarts)
 
     def _round(self) -> None:
-        if self._broken:  # what would come after a part of a batch could not be read
+        if self._broken:  # rows after an incomplete batch could not be read
             raise OSError(errno.EIO, "an earlier part could not be written")
-        self._broken = True  # unless all goes well
+        self._broken = True  # until the round succeeds
         self._unfinished.round(self._at, self._slots, self._streams)
         self._broken = False
         self._on_disk, self._bytes = self._on_disk + self._bytes, 0
@@ -182,7 +183,7 @@ class ResultsWriter:
     def _add(self, table: str, columns: Sequence[NDArray[Any]]) -> None:
         stream = self._streams[table]
         self._bytes += stream.add(columns)
-        if stream.held_bytes >= BATCH_BYTES:  # these rows count from the next round on
+        if stream.held_bytes >= BATCH_BYTES:  # these rows count only from the next round on
             stream.write()
 
     def slot_rows(
@@ -196,8 +197,8 @@ class ResultsWriter:
     ) -> None:
         """A row per slot: statistics over trials of one receiver.
 
-        expected: the trace that theory gives, (c,); quantiles: of error and of trace, (c, 2 levels), NaN where there are
-        none; covariance_only: the error is the trace of the actual covariance, not a squared error.
+        expected: the trace by theory, (c,); quantiles: of error and of trace, (c, 2 levels), NaN where there are none;
+        covariance_only: the error is the trace of the actual covariance, not a squared error.
         """
         count, trials = len(expected), sums.trials
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -223,7 +224,7 @@ class ResultsWriter:
         )
 
     def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
-        """A row per slot, receiver and recorded trial, the first of which is first_trial: everything."""
+        """A row per slot, receiver and recorded trial, from first_trial on, with all columns."""
         recorded = next(iter(slots.receivers.values())).P.shape[3]
         count = slots.count * recorded
         k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
@@ -249,18 +250,18 @@ class ResultsWriter:
             )
 
     def _levels(self, x: Floats) -> Floats:
-        """States (c, n, r) as rows, (c r, n), with the reference added from which they are deviations."""
+        """States (c, n, r) as rows, (c r, n), with the reference added, from which they are deviations."""
         rows = x.transpose(0, 2, 1).reshape(-1, x.shape[1])
         return rows if self._around is None else rows + self._around
 
     def input_rows(self, slots: Slots, first_trial: int) -> None:
-        """A row per slot and recorded trial, the first of which is first_trial: what moved the plant."""
+        """A row per slot and recorded trial, from first_trial on: the inputs and disturbances of the plant."""
         if slots.inputs is None or self._loop is None:
             return
         self._add("inputs", input_columns(slots, *self._loop, first_trial))
 
     def journal_rows(self, slots: Slots) -> None:
-        """A row per slot and link of a live run: counts by reason, and which trials were delivered as a bit mask."""
+        """A row per slot and link of a live run: counts by reason, and a bit mask of the trials that were delivered."""
         for name, receiver in slots.receivers.items():
             silent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
             offered = np.full(slots.count, slots.trials) - silent
@@ -294,6 +295,6 @@ class ResultsWriter:
 
 
 def seen_actions(action: Codes, nu: Flags) -> Codes:
-    """Indices into `ACTIONS`: what was done, with the truth about the packet's type."""
+    """Indices into `ACTIONS`: the actions, with the truth about each packet's type."""
     misled = (action == Action.STATE) & nu
     return np.where(misled, np.uint8(ACTIONS.index("misled")), action)

@@ -1,4 +1,4 @@
-"""Mistakes in links and events that only show across tables: names, slots, what may follow what.
+"""Mistakes in links and events that only show when tables are compared: names, slots, and the order of events.
 
 Source: docs/scenario.md, links and events.
 """
@@ -25,12 +25,12 @@ _STATES = {"cut": "cut", "kill": "down", "pause": "paused"}
 
 
 def link_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable]) -> Iterator[str]:
-    """What is wrong with correlations, delays in seconds and windows; links: receiver → its link, as far as it is one."""
+    """Mistakes in correlations, delays in seconds and windows; links: receiver → its link, for each link that is valid."""
     receivers = [LEGITIMATE, *_table(tables.get("eavesdroppers"))]
     for name, link in links.items():
         path = f"{LEGITIMATE}.link" if name == LEGITIMATE else f"eavesdroppers.{name}.link"
         if link.in_seconds and not tables.get("slot_seconds"):
-            yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02, what a slot lasts, at the top of the file"
+            yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02, the duration of a slot, at the top of the file"
         if link.correlation is not None:
             yield from _correlation_mistakes(path, name, link, links, receivers)
 
@@ -51,7 +51,7 @@ def _correlation_mistakes(
 
 
 def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], sentences: Sentences) -> Iterator[str]:
-    """What is wrong with events that are right by themselves, each with its number."""
+    """Mistakes across tables in events that are valid by themselves, each with the number of its event."""
     events = _events(tables)
     receivers = [LEGITIMATE, *_table(tables.get("eavesdroppers"))]
     slots = tables.get("slots")
@@ -60,7 +60,7 @@ def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], se
             yield from _when_mistakes(f"event.{i}", event, slots)
         for name in event.names:
             if name not in receivers:
-                hint = ": it is none of the receivers" if name in ("sensor", "router", "observer") else ""
+                hint = ": it is not a receiver" if name in ("sensor", "router", "observer") else ""
                 yield f"event.{i}.{_entry(event)}: names {as_toml(name)}{hint}; expected {listed(receivers)}"
         if event.kind == "jam":
             yield from _jam_mistakes(f"event.{i}", event, tables)
@@ -75,7 +75,7 @@ def event_mistakes(tables: Mapping[str, Any], links: Mapping[str, LinkTable], se
 
 
 def _events(tables: Mapping[str, Any]) -> list[tuple[int, EventTable]]:
-    """The events that are right by themselves, each with its number."""
+    """The events that are valid by themselves, each with its number."""
     events: list[tuple[int, EventTable]] = []
     for i, found in enumerate(tables.get("event", []) if isinstance(tables.get("event"), list) else []):
         try:
@@ -86,7 +86,7 @@ def _events(tables: Mapping[str, Any]) -> list[tuple[int, EventTable]]:
 
 
 def away_in(tables: Mapping[str, Any], name: str, slot: int) -> str | None:
-    """That a receiver is down or paused in a slot, by which event; None if it is there."""
+    """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
     acts = [(i, act) for i, event in _events(tables) for act in acts_of(event) if name in act.names]
     away: tuple[int, Act] | None = None
     for i, act in sorted(acts, key=lambda one: one[1].at):
@@ -118,19 +118,19 @@ def _jam_mistakes(path: str, event: EventTable, tables: Mapping[str, Any]) -> It
     elif isinstance(scheme, str) and scheme in SCHEMES and not SCHEMES[scheme].needs_acknowledgements:
         yield f"{path}.jam: the scheme {scheme} has no acknowledgements that could be jammed; remove the event"
     elif _table(tables.get("acknowledgements")).get("attack", "none") == "none":
-        yield f'{path}.jam: no attack is described; expected acknowledgements.attack = "all", or another, beside it'
+        yield f'{path}.jam: no attack is described; expected acknowledgements.attack = "all", or another, as well'
 
 
 def _jams_in_turn(events: Sequence[tuple[int, EventTable]]) -> Iterator[str]:
-    """Jams that begin while another one lasts."""
+    """Jams that begin before the previous one has ended."""
     jams = sorted(((event.first, event.to, i) for i, event in events if event.kind == "jam"), key=lambda one: one[0])
     for (_, to, _), (first, _, i) in pairwise(jams):
         if to is None or to > first:
-            yield f"event.{i}.jam: begins in slot {first}, while another one lasts; expected that to end before"
+            yield f"event.{i}.jam: begins in slot {first}, while another one lasts; expected that one to end first"
 
 
 def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
-    """Acknowledgements that the scheme needs and has not, or has and does not need; jammers that are nobody; silences."""
+    """Missing or needless acknowledgements, an unknown jammer, and link rates with a scheme that may be silent."""
     scheme = SCHEMES.get(str(_table(tables.get("encoding")).get("scheme")))
     name, found = _table(tables.get("encoding")).get("scheme"), tables.get("acknowledgements")
     if scheme is not None and scheme.needs_acknowledgements and found is None:
@@ -139,7 +139,7 @@ def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
             "[acknowledgements] with link = { quality = 0.9 }"
         )
     if scheme is not None and not scheme.needs_acknowledgements and found is not None:
-        yield f"acknowledgements: is there, but the scheme {name} needs none; remove the table"
+        yield f"acknowledgements: is given, but the scheme {name} needs none; remove the table"
     jammer, eavesdroppers = _table(found).get("jammer"), list(_table(tables.get("eavesdroppers")))
     if isinstance(jammer, str) and jammer not in eavesdroppers:
         yield f"acknowledgements.jammer: is {as_toml(jammer)}; expected an eavesdropper" + (
@@ -151,7 +151,7 @@ def acknowledgement_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
             entries = _table(tables.get(LEGITIMATE) if receiver == LEGITIMATE else tables["eavesdroppers"][receiver])
             if _table(entries.get("link")).get("rate") is not None:
                 yield (
-                    f"{path}.link.rate: is there, but the scheme {name} may stay silent, and a queue counts on a packet "
+                    f"{path}.link.rate: is given, but the scheme {name} may stay silent, and a queue counts on a packet "
                     "in every slot; remove the line"
                 )
 
@@ -162,7 +162,7 @@ def _set_mistakes(
     known = [name for name in LinkTable.model_fields if name != "correlation"]
     for name in event.set or {}:
         if name not in known:
-            yield f"{path}.set.{name}: is nothing that can be changed of a link; expected {listed(known)}"
+            yield f"{path}.set.{name}: is not a link setting that can be changed; expected {listed(known)}"
     try:
         changed = changed_link(link, {name: value for name, value in (event.set or {}).items() if name in known})
     except ValidationError as error:
@@ -171,21 +171,21 @@ def _set_mistakes(
     if changed.in_seconds and not tables.get("slot_seconds"):
         yield f"{path}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
     if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
-        yield f"{path}.set.loss.model: is another than at first, but the link's losses are tied to another link's"
+        yield f"{path}.set.loss.model: differs from the first one, but the link's losses are tied to another link's"
 
 
 def _pooled_mistakes(
     path: str, name: str, event: EventTable, tables: Mapping[str, Any], sentences: Sentences
 ) -> Iterator[str]:
-    """Of an event that changes links which are pooled: they become one, of a quality or a loss model of its own."""
+    """Mistakes in an event that changes pooled links: they become one link, with a quality or a loss model of its own."""
     if not {"quality", "loss"} & set(event.set or {}):
-        yield f"{path}.set: {name} has several links; expected a quality or a loss, of the one link in place of them"
+        yield f"{path}.set: {name} has several links; expected a quality or a loss, for the one link that replaces them"
         return
     yield from _set_mistakes(path, event, LinkTable(quality=1.0), tables, sentences)
 
 
 def _order_mistakes(events: Sequence[tuple[int, EventTable]], receivers: Sequence[str]) -> Iterator[str]:
-    """What ends that has not begun, and what begins while it, or another outage, goes on."""
+    """Events that end something that has not begun, or begin something during it or during another outage."""
     acts: list[tuple[int, Act]] = [(i, act) for i, event in events for act in acts_of(event)]
     acts.sort(key=lambda one: one[1].at)
     for name in receivers:
@@ -197,7 +197,7 @@ def _order_mistakes(events: Sequence[tuple[int, EventTable]], receivers: Sequenc
                 continue
             path = f"event.{i}"
             if act.kind == "cut" and cut is not None:
-                yield f"{path}.cut: {name} is cut already, from slot {cut.at} on; expected it to heal before"
+                yield f"{path}.cut: {name} is cut already, from slot {cut.at} on; expected a heal before"
             if act.kind == "heal" and cut is None:
                 yield f"{path}.heal: {name} is not cut at slot {act.at}; expected a cut before"
             cut = act if act.kind == "cut" else None if act.kind == "heal" else cut

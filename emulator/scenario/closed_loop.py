@@ -1,4 +1,4 @@
-"""Mistakes of plant and controller that only show beside the process, the legitimate estimator and the events.
+"""Mistakes in plant and controller that only show with the process, the legitimate estimator and the events.
 
 Source: docs/scenario.md, plant and controller.
 """
@@ -22,7 +22,7 @@ from evedrop.scenario.words import as_toml, listed
 
 
 def loop_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with plant, controller and who knows of them, as far as a faulty file allows to ask."""
+    """Mistakes in the plant, the controller and `knows_input`, as far as a faulty file can be checked."""
     plant, controller = tables.get("plant"), tables.get("controller")
     if isinstance(controller, Mapping) and not (isinstance(plant, Mapping) and plant.get("inputs")):
         yield (
@@ -96,7 +96,7 @@ def _rows(plant: Mapping[str, Any], slots: Any) -> Iterator[str]:
 
 
 def _beside_plant(tables: Mapping[str, Any], process: ProcessTable) -> Iterator[str]:
-    """Weights of the wrong number, and what the strategy objects to."""
+    """Wrong numbers of weights, and the strategy's objections."""
     try:
         rows = tables["plant"].get("disturbance_values")
         few = {"disturbance_values": rows[:1]} if isinstance(rows, list) else {}
@@ -130,7 +130,7 @@ def _beside_plant(tables: Mapping[str, Any], process: ProcessTable) -> Iterator[
 
 
 def _outages(tables: Mapping[str, Any], controller: Mapping[str, Any]) -> Iterator[str]:
-    """The legitimate estimator must be there while somebody waits for its estimate, or it for the inputs."""
+    """The legitimate estimator must be present while the controller waits for its estimate or it waits for the inputs."""
     try:
         knows = LegitimateTable.model_validate(tables.get(LEGITIMATE)).knows_input
     except ValidationError:

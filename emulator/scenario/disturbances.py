@@ -1,4 +1,4 @@
-"""The disturbances of a scenario's plant: read when it is loaded, so that whoever gets the scenario needs no file.
+"""The disturbances of a scenario's plant: read when the scenario is loaded, so that no other process needs the file.
 
 Source: docs/scenario.md, plant.
 """
@@ -19,20 +19,20 @@ from evedrop.scenario.tables import Scenario
 
 
 def disturbances_beside(tables: Mapping[str, Any], folder: Path) -> None:
-    """Change the name of the file to where it is, for a scenario in this folder."""
+    """Replace the file's name by its path, for a scenario in this folder."""
     plant = tables.get("plant")
     if isinstance(plant, dict) and isinstance(plant.get("disturbance_file"), str):
         plant["disturbance_file"] = str(found_file(plant["disturbance_file"], folder))
 
 
 def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
-    """Put the numbers into the place of the file's name; the mistakes, with their paths."""
+    """Replace the file's name by the numbers in the file. Returns the mistakes, with their paths."""
     plant = tables.get("plant")
     if not isinstance(plant, dict) or not isinstance(plant.get("disturbance_file"), str):
         return []
     if "disturbance_values" in plant:
         del plant["disturbance_file"]
-        return ["plant.disturbance_file: is there beside disturbance_values; expected one of them"]
+        return ["plant.disturbance_file: is given together with disturbance_values; expected one of them"]
     names = plant.get("disturbances")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         names = []
@@ -51,7 +51,7 @@ def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
 
 
 def disturbances_of(scenario: Scenario) -> Floats:
-    """The disturbances of every slot, (slots, q); q is 0 of a scenario that has none."""
+    """The disturbances of every slot, (slots, q); q is 0 for a scenario without disturbances."""
     table = scenario.plant
     if table is None or not table.disturbances:
         return np.zeros((scenario.slots, 0))

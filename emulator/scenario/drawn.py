@@ -1,6 +1,6 @@
-"""The events that a nemesis comes to.
+"""The events that a nemesis draws.
 
-Each receiver draws from a stream of its own, so that adding, changing or removing another one moves none of its faults.
+Each receiver draws from a stream of its own: adding, changing or removing one receiver moves no other receiver's faults.
 
 Source: docs/scenario.md, nemesis.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import count
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,9 @@ from evedrop.scenario.timeline import acts_of
 from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
 MOST_EVENTS = 10_000
-"""Of a scenario, those of the file included."""
+"""The most events of a scenario, including those of the file."""
 _LEAVES = ("kill", "pause")
-_BLOCK = 256  # faults that are drawn at once
+_BLOCK = 256  # faults drawn at once
 
 Span = tuple[int, int]
 """Slots [from, to)."""
@@ -38,9 +38,9 @@ Span = tuple[int, int]
 def with_faults(
     tables: Mapping[str, Any], scenario: Scenario, sentences: Sentences
 ) -> tuple[dict[str, Any], list[str]]:
-    """The tables with the events of their nemesis in place of it, and what is wrong with it.
+    """Replace the nemesis in the tables by its events; also returns its mistakes.
 
-    scenario: what the tables are, right by themselves, with a nemesis.
+    scenario: the tables as a scenario, valid by themselves, with a nemesis.
     """
     table = scenario.nemesis
     assert table is not None  # noqa: S101 - asked by the caller
@@ -58,7 +58,7 @@ def with_faults(
 
 
 def _mistakes(table: NemesisTable, scenario: Scenario, sentences: Sentences) -> Iterator[str]:
-    """What of `set` is wrong for any of the links."""
+    """Mistakes that `set` makes on any of the links."""
     said = set[str]()
     for name in _targets(table, scenario) if table.set is not None else ():
         link = scenario.link(name)
@@ -75,18 +75,19 @@ def _mistakes(table: NemesisTable, scenario: Scenario, sentences: Sentences) -> 
                     f"{NEMESIS}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
                 )
             if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
-                lines.append(f"{NEMESIS}.set.loss.model: is another than that of {name}'s link, whose losses are tied")
+                lines.append(f"{NEMESIS}.set.loss.model: differs from that of {name}'s link, whose losses are tied")
         yield from (line for line in lines if line not in said)
         said.update(lines)
 
 
 def _targets(table: NemesisTable, scenario: Scenario) -> tuple[str, ...]:
-    """The receivers that it may hit, in the order of the scenario."""
+    """The receivers that it may hit, in the scenario's order."""
     return tuple(name for name in scenario.receivers if table.targets is None or name in table.targets)
 
 
+@final
 class _Nemesis:
-    """A nemesis in its scenario. Final."""
+    """A nemesis with its scenario."""
 
     def __init__(self, table: NemesisTable, scenario: Scenario) -> None:
         self._table, self._scenario = table, scenario
@@ -96,7 +97,7 @@ class _Nemesis:
         self._taken = {name: self._taken_by_file(name) for name in self.targets}
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """All of them: those that concern several receivers at once, then each receiver's own."""
+        """All events: first those that concern several receivers at once, then each receiver's own."""
         if "partition" in self._table.faults:
             yield from self._partitions()
         for name in self.targets:
@@ -108,7 +109,7 @@ class _Nemesis:
         return "partition" in self._table.faults or any(map(self.kinds, self.targets))
 
     def kinds(self, name: str) -> list[str]:
-        """What may happen to a receiver by itself, in the order of `FAULTS`."""
+        """The faults that may happen to one receiver alone, in the order of `FAULTS`."""
         scenario = self._scenario
         loop = scenario.controller is not None and (
             scenario.controller.acts_on == "estimate" or scenario.legitimate.knows_input
@@ -121,7 +122,7 @@ class _Nemesis:
         return [kind for kind in FAULTS if kind in self._table.faults and kind not in barred]
 
     def _taken_by_file(self, name: str) -> list[Span]:
-        """When the file's own events cut a receiver off, or have it leave."""
+        """The slots in which the file's own events cut a receiver off or make it leave."""
         opens = {"cut": "heal", "kill": "restart", "pause": "resume"}
         acts = sorted((act for event in self._scenario.event for act in acts_of(event)), key=lambda act: act.at)
         spans: list[Span] = []
@@ -134,7 +135,7 @@ class _Nemesis:
         return spans + [(start, NEVER) for start in begun.values()]
 
     def _partitions(self) -> Iterator[dict[str, Any]]:
-        """Each receiver tosses a coin of its own whether it is among those that are cut off."""
+        """Events of partitions: an independent fair coin decides for each receiver whether it is cut off."""
         coins = {name: self._coins(name) for name in self.targets}
         for start, end, _ in self._spans("partition"):
             heads = [name for name in self.targets if next(coins[name])]
@@ -163,11 +164,11 @@ class _Nemesis:
                 yield {"from": start, "to": end, kind: name}
 
     def _free(self, name: str, start: int, end: int) -> bool:
-        """Whether a slot or more is between a span and all others of a receiver."""
+        """Whether at least one slot separates a span from all others of a receiver."""
         return all(end < other or until < start for other, until in self._taken[name])
 
     def _spans(self, stream: str) -> Iterator[tuple[int, int, float]]:
-        """When one fault after the other begins and ends, and a number in [0, 1) that says which it is."""
+        """The beginning and end of each fault in order, and a number in [0, 1) that chooses which fault it is."""
         before = self._table.start - 1
         for draws in _draws(self._root, stream):
             gaps, lengths = (
@@ -190,7 +191,7 @@ def _draws(root: bytes, name: str) -> Iterator[Floats]:
 
 
 def _geometric(u: Floats, mean: float) -> NDArray[np.int64]:
-    """Numbers of slots, 1 or more, geometrically distributed with this mean, from uniform numbers in [0, 1)."""
+    """Geometrically distributed numbers of slots, at least 1, with this mean, from uniform numbers in [0, 1)."""
     if mean <= 1.0:
         return np.ones(len(u), np.int64)
     return 1 + (log(1.0 - u) / log(np.array([1.0 - 1.0 / mean]))).astype(np.int64)

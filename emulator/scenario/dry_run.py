@@ -1,4 +1,4 @@
-"""A dry run of the classes that are not built in: some slots of the scenario in memory, before any process is started.
+"""A dry run of the classes that are not built in: a few slots of the scenario in memory, before any process is started.
 
 Source: docs/your-own.md.
 """
@@ -40,7 +40,7 @@ def foreign(tables: Any) -> bool:
 
 
 def dry_run(scenario: Scenario) -> list[str]:
-    """What breaks when classes that are not built in are put to work: shapes, types, keys, errors. None of a run's digest."""
+    """Run the classes that are not built in and report what breaks: shapes, types, keys, errors. Changes no digest."""
     if not foreign(scenario.model_dump(exclude_unset=True)):
         return []
     batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
@@ -64,7 +64,7 @@ def dry_run(scenario: Scenario) -> list[str]:
 
 
 def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: str, batch: Batch) -> str | None:
-    """What breaks when an eavesdropper hears the scheme; a class that is not built in is put to work in a process of its own."""
+    """What breaks when an eavesdropper hears the scheme; a class that is not built in runs in a process of its own."""
     spec, name = scenario.encoding.spec, getattr(table, entry)
     if not STRATEGIES.foreign(name):
         kind = SCHEMES[scenario.encoding.scheme]
@@ -85,7 +85,7 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
 
 
 def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
-    """Raise NoAnswer if what a class claims of its outcomes is no answer."""
+    """Raise NoAnswer if a class's answer about its outcomes is invalid."""
     outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, scenario.encoding.mu_d)
     if outcomes_at is not None:
         for quality in (0.0, 0.5, 1.0):
@@ -102,13 +102,13 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
         link = scenario.link(receiver)
         yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
     for i, event in enumerate(scenario.event):
-        # What is wrong with the models of an event shows across tables, and is told there.
+        # Mistakes in the models of an event show across tables and are reported there.
         if event.set is not None and not _model_mistakes(event.set):
             yield from _settings_mistakes(f"event.{i}.set", event.set, problem)
 
 
 def _model_mistakes(settings: Mapping[str, Any]) -> bool:
-    """Whether a loss or delay model cannot be made as it is described."""
+    """Whether a loss or delay model cannot be constructed from its description."""
     for name, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS)):
         found = settings.get(name)
         if found is not None and not isinstance(found, Mapping):

@@ -1,4 +1,4 @@
-"""`[[event]]`: what happens while a run goes on, and in which slot.
+"""`[[event]]`: what happens during a run, and in which slot.
 
 Source: docs/scenario.md, events.
 """
@@ -14,16 +14,16 @@ from evedrop.scenario.table import Found, Table
 from evedrop.scenario.words import listed
 
 LASTING = ("set", "cut", "partition", "kill", "pause", "jam")
-"""What can last `from` a slot `to` another."""
+"""The kinds that can last `from` one slot `to` another."""
 KINDS = (*LASTING, "heal", "restart", "resume", "note")
-"""What can happen; an event is one of them."""
+"""All kinds; an event has exactly one of them."""
 
 Names = str | list[str]
 Slot = Annotated[int, Field(strict=True, ge=0, le=100_000_000, examples=[400])]
 
 
 class EventTable(Table):
-    """`[[event]]`: one thing that happens `at` a slot, or lasts `from` a slot `to` another."""
+    """`[[event]]`: one thing that happens `at` a slot, or lasts `from` one slot `to` another."""
 
     at: Slot | None = None
     start: Annotated[Slot | None, Field(alias="from")] = None
@@ -43,12 +43,12 @@ class EventTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """One thing that happens, and one way to say when."""
+        """Mistakes unless exactly one thing happens, at a time that is stated in one way."""
         return [*_what_mistakes(table), *_when_mistakes(table)]
 
     @property
     def kind(self) -> str:
-        """Which of `KINDS`."""
+        """The event's kind, one of `KINDS`."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
@@ -61,7 +61,7 @@ class EventTable(Table):
 
     @property
     def first(self) -> int:
-        """The slot it begins in."""
+        """The slot in which it begins."""
         slot = self.at if self.at is not None else self.start
         assert slot is not None  # noqa: S101 - checked when it was made
         return slot
@@ -71,14 +71,14 @@ def _what_mistakes(table: Mapping[str, Any]) -> list[Found]:
     kinds = [kind for kind in KINDS if table.get(kind) is not None]
     found: list[Found] = []
     if len(kinds) != 1:
-        said = f"has {listed(kinds)} at once" if kinds else "says not what happens"
+        said = f"has {listed(kinds)} at once" if kinds else "does not say what happens"
         found.append(("event", f'{said}; expected one of {listed(KINDS)}, such as cut = "legitimate"'))
     if kinds == ["set"] and table.get("link") is None:
         found.append(("link", 'is missing; expected the link that is changed, such as link = "legitimate"'))
     if "set" not in kinds and table.get("link") is not None:
-        found.append(("link", "is there without set; expected what changes, such as set = { quality = 0.2 }"))
+        found.append(("link", "is given without set; expected what changes, such as set = { quality = 0.2 }"))
     if table.get("state") is not None and not {"kill", "restart"} & set(kinds):
-        found.append(("state", "is there without a restart; remove the line"))
+        found.append(("state", "is given without a restart; remove the line"))
     if table.get("set") == {}:
         found.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
     return found
@@ -90,11 +90,11 @@ def _when_mistakes(table: Mapping[str, Any]) -> list[Found]:
     if (at is None) == (start is None):
         return [("at", "and from are both there" if at is not None else "is missing; expected at = 400")]
     if start is None and to is not None:
-        return [("to", "is there without from; expected from and to, or at alone")]
+        return [("to", "is given without from; expected from and to, or only at")]
     if start is not None and to is None:
-        return [("to", "is missing beside from; expected the slot in which it ends")]
+        return [("to", "is missing, but from is given; expected the slot in which it ends")]
     if type(start) is int and type(to) is int and to <= start:
         return [("to", f"is {to}, not after from, which is {start}; expected a later slot")]
     if start is not None and len(kinds) == 1 and kinds[0] not in LASTING:
-        return [("from", f"is there, but {kinds[0]} happens in one slot; expected at")]
+        return [("from", f"is given, but {kinds[0]} happens in one slot; expected at")]
     return []

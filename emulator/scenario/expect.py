@@ -1,4 +1,4 @@
-"""`[[expect]]`: what must hold for a run to pass, of a figure, a link, secrecy, or a receiver that must be in step.
+"""`[[expect]]`: a condition that a run must meet, on a figure, a link, secrecy, or a receiver's being in step.
 
 Source: docs/scenario.md, expect.
 """
@@ -27,9 +27,9 @@ FIGURES = (
     "received_fraction",
     "used_fraction",
 )
-"""Of a receiver."""
+"""The figures of a receiver."""
 TRIAL_FIGURES = ("mean_squared_error", "received_fraction", "used_fraction")
-"""Those that a run knows of every trial, and so has quantiles of."""
+"""The figures that a run knows for every trial, and that therefore have quantiles."""
 LINK_FIGURES = ("offered", "delivered", "late", "lost", "unexplained", "rate")
 SECRECY = ("relative", "perfect")
 
@@ -42,7 +42,7 @@ _ENTRIES: Mapping[str, tuple[str, ...]] = {
     "secrecy": ("against",),
     "in_step": ("by", "since"),
 }
-"""What an expectation may be of → the entries that go with it."""
+"""The subjects an expectation may have → the entries that go with each."""
 _EXAMPLES: Mapping[str, str] = {
     "figure": 'figure = "legitimate.mean_squared_error"',
     "link": 'link = "legitimate"',
@@ -71,7 +71,7 @@ Slot = Annotated[int, Field(strict=True, ge=0)]
 
 
 class ExpectTable(Table):
-    """`[[expect]]`: one of `figure`, `link`, `secrecy` and `in_step`, and the entries that go with it."""
+    """`[[expect]]`: one of `figure`, `link`, `secrecy` and `in_step`, with the entries that go with it."""
 
     figure: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
     below: Annotated[Number | None, Field(examples=[0.01])] = None
@@ -90,7 +90,7 @@ class ExpectTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether it is of one thing, and has what that needs and nothing else."""
+        """Mistakes unless it has exactly one subject, with all the entries that this needs and no others."""
         given = [name for name, value in table.items() if value is not None]
         kinds = [kind for kind in _ENTRIES if kind in given]
         if not kinds:
@@ -100,7 +100,7 @@ class ExpectTable(Table):
             return [(kind, f"is missing; expected {_EXAMPLES[kind]}{others}")]
         if len(kinds) > 1:
             one_each = f"expected one of {', '.join(_ENTRIES)} in a table"
-            return [(kind, f"is there beside {kinds[0]}; {one_each}") for kind in kinds[1:]]
+            return [(kind, f"is given together with {kinds[0]}; {one_each}") for kind in kinds[1:]]
         (kind,) = kinds
         found = [
             (name, f"is set, but {kind} has no such entry; remove the line")
@@ -113,12 +113,12 @@ class ExpectTable(Table):
 
     @property
     def kind(self) -> str:
-        """`figure`, `link`, `secrecy` or `in_step`."""
+        """Its subject: `figure`, `link`, `secrecy` or `in_step`."""
         return next(kind for kind in _ENTRIES if getattr(self, kind) is not None)
 
     @property
     def wanted(self) -> str:
-        """What must be found."""
+        """The value or outcome that is expected."""
         match self.kind:
             case "link":
                 return "within its confidence interval"
@@ -134,7 +134,7 @@ class ExpectTable(Table):
 
     @property
     def text(self) -> str:
-        """As a sentence."""
+        """The expectation as a sentence."""
         subject = {
             "figure": self.figure,
             "link": f"link {self.link}",
@@ -148,7 +148,7 @@ class ExpectTable(Table):
         return f"{subject} {self.wanted}"
 
     def holds(self, found: float) -> bool:
-        """Whether a figure is as wanted."""
+        """Whether a figure meets the expectation."""
         if (self.below is not None and not found < self.below) or (self.above is not None and not found > self.above):
             return False
         if self.near is None:
@@ -158,7 +158,7 @@ class ExpectTable(Table):
 
 
 def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
-    """Receiver, and where in the account of its link the figure is; None of a receiver's own figure."""
+    """The receiver, and the place of the figure in the account of its link; None for a receiver's own figure."""
     parts = figure.split(".")
     return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
 
@@ -173,19 +173,19 @@ def _nothing(table: Mapping[str, Any]) -> list[Found]:
 
 
 def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Comparisons that say something, and a range or a quantile only of what has one."""
+    """Mistakes unless it compares with something, and has slots or a quantile only for a figure that allows them."""
     below, above, near = (table.get(name) for name in ("below", "above", "near"))
     distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
     found: list[Found] = []
     if near is None and distances:
-        found.append((distances[0], "is set without near; expected near = 0.01 beside it"))
+        found.append((distances[0], "is set without near; expected near = 0.01 as well"))
     elif near is None and below is None and above is None:
         what = "and above are both missing; expected at least one, such as below = 0.01, or near and within"
         found.append(("below", what))
     elif near is not None and not distances:
-        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, beside near"))
+        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
     elif len(distances) > 1:
-        found.append(("within_relative", "is there beside within; expected one of them"))
+        found.append(("within_relative", "is given together with within; expected one of them"))
     elif near == 0 and distances == ["within_relative"]:
         found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
     if below is not None and above is not None and _number(below) and _number(above) and not above < below:
@@ -218,14 +218,14 @@ def _number(value: Any) -> bool:
 
 
 def _secrecy_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Whether it says against whom."""
+    """A mistake if the eavesdropper is missing."""
     if table.get("against") is None:
         return [("against", "is missing; expected the name of an eavesdropper")]
     return []
 
 
 def _step_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Whether there is time."""
+    """Mistakes in `by` and `since`."""
     by, since = table.get("by"), table.get("since")
     if by is None:
         return [("by", "is missing; expected the last slot by which it must be in step, such as by = 40")]
@@ -236,19 +236,19 @@ def _step_mistakes(table: Mapping[str, Any]) -> list[Found]:
 
 @dataclass(frozen=True)
 class Around:
-    """What an expectation is seen against; None where the file has a mistake there."""
+    """The parts of a scenario that expectations refer to; None where the file has a mistake there."""
 
     receivers: Sequence[str]
-    """The legitimate one first."""
+    """The legitimate estimator first."""
     slots: int | None
     trials: int | None
     no_theory: Callable[[str], str | None]
     """Why there is no theory for a receiver; None if there is."""
     house: bool = False
-    """Whether the plant is one."""
+    """Whether the plant is a house."""
 
     def mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
-        """Whom or what there is not, slots beyond the run, too few trials."""
+        """Unknown receivers and figures, slots beyond the run, and quantiles of too few trials."""
         found: list[Found] = []
         figure = expectation.get("figure")
         if isinstance(figure, str):
@@ -307,7 +307,7 @@ class Around:
     def _quantile_mistakes(self, quantile: Any) -> list[Found]:
         if self.trials is None or not isinstance(quantile, float) or not 0.0 < quantile < 1.0:
             return []
-        # So that a trial is expected beyond it; a little off 1/q, which decimals seldom hit exactly.
+        # At least one trial is expected beyond the quantile; the tolerance is there because decimals seldom hit 1/q exactly.
         least = math.ceil(1.0 / min(quantile, 1.0 - quantile) - 1e-9)
         if self.trials >= least:
             return []

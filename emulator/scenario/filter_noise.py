@@ -1,4 +1,4 @@
-"""A sensor that measures and filters: what it makes of the network's process noise, and what is wrong with it.
+"""A sensor that measures and filters: the process noise that its filter gives the network, and mistakes in its entries.
 
 Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor.
 """
@@ -24,12 +24,12 @@ FILTER = "filter"
 
 
 def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
-    """Put the covariance of the filter's innovations into the place of `Q = "filter"`; the mistakes, with their paths."""
+    """Replace `Q = "filter"` by the covariance of the filter's innovations. Returns the mistakes, with their paths."""
     process = tables.get("process")
     if not isinstance(process, dict) or process.get("Q") != FILTER:
         return []
     n = len(process["A"]) if isinstance(process.get("A"), list) else 1
-    process["Q"] = np.eye(max(1, n) if n <= MOST_STATES else 1).tolist()  # until it is known, or in its place
+    process["Q"] = np.eye(max(1, n) if n <= MOST_STATES else 1).tolist()  # a placeholder until Q is known
     plant = tables.get("plant")
     if not isinstance(plant, Mapping) or plant.get("output_matrix") is None:
         return [
@@ -40,7 +40,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
         step = settled_of(process, plant)
     except ValidationError:
         return []
-    except ValueError:  # the plant's own mistake
+    except ValueError:  # a mistake in the plant, reported elsewhere
         return []
     process["Q"] = step.innovation.tolist()
     process["singular_noise"] = is_singular(step.innovation)
@@ -48,7 +48,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
 
 
 def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterStep:
-    """The filter of tables in the end. Raises ValidationError or ValueError where they have none."""
+    """The steady state of the tables' filter. Raises ValidationError or ValueError if it does not exist."""
     made = ProcessTable.model_validate({**process, "Q": np.eye(len(process["A"])).tolist(), "singular_noise": False})
     table = PlantTable.model_validate(without_disturbances(plant))
     A, n = np.array(made.A), len(made.A)
@@ -59,7 +59,7 @@ def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterSt
 
 
 def without_disturbances(plant: Mapping[str, Any]) -> dict[str, Any]:
-    """A plant without its disturbances, which may be a day of numbers."""
+    """A plant without its disturbances, which may be numbers for a whole day."""
     return {name: value for name, value in plant.items() if not name.startswith("disturbance")}
 
 
@@ -69,7 +69,7 @@ def is_singular(Q: Floats) -> bool:
 
 
 def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
-    """What is wrong with what the sensor measures of n states."""
+    """Mistakes in the sensor's measurement of n states."""
     C, V = plant.get("output_matrix"), plant.get("measurement_noise")
     found = []
     if C is None or not numbers(C):
@@ -77,7 +77,7 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
     if max(n, len(C)) > MOST_STATES:
         large = f"is of {len(C)} measurements of {n} states"
         return [
-            f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, for the filter is plain arithmetic"
+            f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, because the filter uses plain arithmetic"
         ]
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
@@ -101,7 +101,7 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
 
 
 def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with the sensor's filter beside process, scheme and eavesdroppers."""
+    """Mistakes in the sensor's filter together with process, scheme and eavesdroppers."""
     process, plant = tables.get("process"), tables.get("plant")
     if not isinstance(process, Mapping):
         return
@@ -115,21 +115,21 @@ def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         except ValueError:
             if not wrong:
                 yield (
-                    "plant.output_matrix: leaves the sensor's filter without an end: what it measures must show every state, "
-                    "and plant.noise must move every state, or it trusts no measurement any more"
+                    "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state, "
+                    "and plant.noise must move every state, or the filter ends up ignoring all measurements"
                 )
         encoding = tables.get("encoding")
         name = str(encoding.get("scheme")) if isinstance(encoding, Mapping) else ""
         scheme = SCHEMES.get(name)
         if scheme is not None and scheme.decides_initial_state:
-            yield f"plant.output_matrix: is there, but the scheme {name} decides x_0 itself; expected another scheme"
+            yield f"plant.output_matrix: is given, but the scheme {name} decides x_0 itself; expected another scheme"
     if process.get("singular_noise") is True:
         eavesdroppers = tables.get("eavesdroppers")
         for name, table in (eavesdroppers if isinstance(eavesdroppers, Mapping) else {}).items():
             for entry in ("strategy", "reads_as"):
                 if isinstance(table, Mapping) and _inverts_noise(table.get(entry)):
                     yield (
-                        f"eavesdroppers.{name}.{entry}: is {table[entry]}, which reckons with the inverse of Q, and Q may be "
+                        f"eavesdroppers.{name}.{entry}: is {table[entry]}, which uses the inverse of Q, and Q may be "
                         "singular; expected another strategy, or a Q that is not"
                     )
 

@@ -1,4 +1,4 @@
-"""`[household]`: which of a plant's quantities are a house's grid, load, sun and battery, and what makes it active.
+"""`[household]`: which of a plant's quantities are a house's grid, load, sun and battery, and when the house is active.
 
 Source: docs/scenario.md, household.
 """
@@ -14,9 +14,9 @@ from evedrop.scenario.table import Table
 from evedrop.scenario.words import as_toml, listed
 
 FIGURES = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
-"""Of the house."""
+"""The figures of the house."""
 RECEIVER_FIGURES = ("activity_area", "detection_rate")
-"""Of what a receiver can tell of it."""
+"""The figures of what a receiver can infer about the house."""
 HOUSEHOLD = "household"
 
 Name = Annotated[str, Field(strict=True, min_length=1)]
@@ -34,7 +34,7 @@ class HouseholdTable(Table):
     false_alarms: Annotated[float, Field(strict=True, gt=0.0, lt=1.0, examples=[0.05])] = 0.05
 
     def window(self, period_seconds: float) -> int:
-        """Decisions of a window, at least 1, of so many seconds each."""
+        """The number of decisions in a window, at least 1; a decision lasts period_seconds."""
         return max(1, round(self.window_seconds / period_seconds))
 
 
@@ -45,7 +45,7 @@ def household_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         return
     plant, process = tables.get("plant"), tables.get("process")
     if not isinstance(plant, Mapping) or not isinstance(tables.get("controller"), Mapping):
-        yield f"{HOUSEHOLD}: is there without a [plant] and a [controller], which it is about; expected both, or no such table"
+        yield f"{HOUSEHOLD}: is given without a [plant] and a [controller], which it describes; expected both, or no such table"
         return
     known = {
         "grid": ("plant.inputs", plant.get("inputs")),
@@ -60,6 +60,6 @@ def household_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         there = [one for one in names if isinstance(one, str)] if isinstance(names, list) else []
         if name not in there:
             choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(name)}, …]"
-            yield f"{HOUSEHOLD}.{entry}: is {as_toml(name)}, which is none of {where}; {choice}"
+            yield f"{HOUSEHOLD}.{entry}: is {as_toml(name)}, which is not among {where}; {choice}"
     if HOUSEHOLD in (tables.get("eavesdroppers") or {}):
-        yield f"eavesdroppers.{HOUSEHOLD}: is a name that figures of the house have; expected another"
+        yield f"eavesdroppers.{HOUSEHOLD}: is a name that the house's figures use; expected another"

@@ -1,4 +1,4 @@
-"""`link = {…}` of a scenario file: what may stand in it, checked, and what it means.
+"""`link = {…}` of a scenario file: its entries, their checks and their meaning.
 
 Source: docs/scenario.md, links.
 """
@@ -16,18 +16,18 @@ from evedrop.model.links.link import LossModel
 from evedrop.scenario.table import Found, Probability, Table, model_mistakes
 from evedrop.scenario.words import as_toml
 
-_QUEUE = 100  # packets that wait before a link of limited rate, if the scenario does not say
+_QUEUE = 100  # default for the packets that wait before a link of limited rate
 
 
 class CorrelationTable(Table):
-    """`correlation = {…}`: whose losses a link's are tied to, and how strongly."""
+    """`correlation = {…}`: the link whose losses this link's are tied to, and how strongly."""
 
     to: Annotated[str, Field(strict=True, alias="with", examples=["legitimate"])]
     strength: Annotated[Probability, Field(examples=[0.5])]
 
 
 class LinkTable(Table):
-    """`link = {…}`: how packets get from the router to one receiver."""
+    """`link = {…}`: how packets travel from the router to one receiver."""
 
     quality: Annotated[Probability | None, Field(examples=[0.9])] = None
     loss: Annotated[dict[str, Any] | None, Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}])] = None
@@ -41,12 +41,12 @@ class LinkTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """One of quality and loss, and models with all they need and nothing else."""
+        """Mistakes unless there is one of quality and loss, and each model has exactly the parameters it needs."""
         found: list[Found] = []
         if table.get("quality") is None and table.get("loss") is None:
             found.append(("quality", "is missing; expected quality = 0.9, or a loss model"))
         elif table.get("quality") is not None and table.get("loss") is not None:
-            found.append(("quality", "is there beside loss, of which it is the short form; expected one of them"))
+            found.append(("quality", "is given together with loss, whose short form it is; expected one of them"))
         found += model_mistakes("loss", table.get("loss"), LOSS_MODELS)
         delay = table.get("delay")
         if isinstance(delay, Mapping):
@@ -55,34 +55,34 @@ class LinkTable(Table):
                 found.append(("delay.unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
         elif table.get("reorder"):
             found.append(
-                ("reorder", "is there without a delay, so that nothing can overtake; expected a delay beside it")
+                ("reorder", "is given without a delay, so that nothing can overtake; expected a delay as well")
             )
         if table.get("queue") is not None and table.get("rate") is None:
-            found.append(("queue", "is there without a rate, so that nothing queues; expected a rate beside it"))
+            found.append(("queue", "is given without a rate, so that nothing queues; expected a rate as well"))
         return found
 
     @classmethod
     def pooled(cls, links: list[LinkTable]) -> LinkTable:
-        """Several links that end at one receiver, as one: it hears what any of them delivers."""
+        """Several links that end at one receiver, as one link: the receiver hears what any of them delivers."""
         return cls.model_construct(loss={"model": "pooled", "links": [link.loss_spec for link in links]})
 
     @property
     def loss_spec(self) -> dict[str, Any]:
-        """Its loss model and parameters."""
+        """The loss model and its parameters."""
         return {"model": "bernoulli", "quality": self.quality} if self.loss is None else self.loss
 
     @property
     def model(self) -> LossModel:
-        """The loss model, fresh."""
+        """A new instance of the loss model."""
         return loss_of(self.loss_spec)
 
     @property
     def in_seconds(self) -> bool:
-        """Whether its delays are in seconds."""
+        """Whether the link's delays are in seconds."""
         return self.delay is not None and self.delay.get("unit") == "seconds"
 
     def settings(self, slot_seconds: float | None) -> dict[str, Any]:
-        """As `Course.settings`, delays in slots."""
+        """The settings for `LinkSchedule.settings`, with delays in slots."""
         made: dict[str, Any] = {"loss": self.loss_spec}
         made |= {name: value for name in ("reorder", "duplicate", "corrupt") if (value := getattr(self, name))}
         if self.rate is not None:
@@ -104,7 +104,7 @@ WindowField = Annotated[int, Field(strict=True, ge=0, le=10_000, examples=[8])]
 
 
 def changed_link(link: LinkTable, changes: Mapping[str, Any]) -> LinkTable:
-    """A link with some entries changed. Raises ValidationError for what is no link then."""
+    """A link with some entries changed. Raises ValidationError if the result is not a valid link."""
     entries = link.model_dump(exclude_unset=True)
     if "quality" in changes:
         entries.pop("loss", None)

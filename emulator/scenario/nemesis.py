@@ -1,4 +1,4 @@
-"""`[nemesis]`: faults at random, seeded, which become ordinary events before the run.
+"""`[nemesis]`: random faults with a seed; they become ordinary events before the run.
 
 Source: docs/scenario.md, nemesis.
 """
@@ -16,14 +16,14 @@ from evedrop.scenario.words import as_toml, listed
 
 NEMESIS = "nemesis"
 FAULTS = ("kill", "pause", "cut", "set", "partition")
-"""What it can draw, each as in `[[event]]`."""
+"""The faults it can draw, each as in `[[event]]`."""
 
 Mean = Annotated[float, Field(strict=True, ge=1.0, le=1e8)]
 Fault = Annotated[str, Field(strict=True), AfterValidator(one_of(FAULTS))]
 
 
 class NemesisTable(Table):
-    """`[nemesis]`: which faults, on whom, how often and how long."""
+    """`[nemesis]`: which faults hit which receivers, how often and for how long."""
 
     faults: Annotated[list[Fault], Field(min_length=1, examples=[["kill", "pause", "cut"]])]
     targets: Annotated[
@@ -39,15 +39,17 @@ class NemesisTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Entries that belong to some faults alone; a time that ends before it begins; names that are there twice."""
+        """Entries that need a fault that is not drawn, a time that ends before it begins, and names that appear twice."""
         found: list[Found] = []
         faults = table.get("faults")
         if isinstance(faults, list):
             if "set" in faults and table.get("set") is None:
-                found.append(("set", "is missing beside the fault set; expected what changes: set = { quality = 0.2 }"))
+                found.append(
+                    ("set", "is missing, but the fault set is drawn; expected what changes: set = { quality = 0.2 }")
+                )
             for entry, fault in (("set", "set"), ("state", "kill")):
                 if fault not in faults and table.get(entry) is not None:
-                    found.append((entry, f'is there, but "{fault}" is not among faults; add it, or remove the line'))
+                    found.append((entry, f'is given, but "{fault}" is not among faults; add it, or remove the line'))
         for entry in ("faults", "targets"):
             names = table.get(entry)
             if isinstance(names, list) and len(set(map(str, names))) < len(names):
@@ -59,7 +61,7 @@ class NemesisTable(Table):
 
 
 def nemesis_mistakes(tables: Mapping[str, Any], receivers: Sequence[str]) -> Iterator[str]:
-    """Slots that are not in the run, and targets that are not receivers."""
+    """Slots outside the run, and targets that are not receivers."""
     try:
         table = NemesisTable.model_validate(tables.get(NEMESIS))
     except ValidationError:

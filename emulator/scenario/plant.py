@@ -1,4 +1,4 @@
-"""`[plant]` and `[controller]`: what moves the true states, and who steers them.
+"""`[plant]` and `[controller]`: what moves the true states, and what decides the inputs.
 
 Source: docs/scenario.md, plant and controller.
 """
@@ -44,7 +44,7 @@ class PlantTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether entries fit each other; those that must fit the process are held against it later."""
+        """Entries that do not fit each other; entries that must fit the process are checked later."""
         found: list[Found] = []
         for kind in ("input", "disturbance"):
             names, matrix, units = table.get(f"{kind}s") or [], table.get(f"{kind}_matrix"), table.get(f"{kind}_units")
@@ -77,14 +77,14 @@ class PlantTable(Table):
         for one, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
             if table.get(one) is not None and table.get(other) is None:
                 example = as_toml((cls.model_fields[other].examples or [0])[0])
-                found.append((other, f"is missing beside {one}; expected {other} = {example}, or neither"))
+                found.append((other, f"is missing, but {one} is given; expected {other} = {example}, or neither"))
         rows, disturbances = table.get("disturbance_values"), table.get("disturbances") or []
         if isinstance(disturbances, list):
             if disturbances and rows is None:
                 found.append(
                     ("disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values')
                 )
-            # A day has 86 400 of them: their numbers are checked elsewhere, and faster.
+            # A day has 86 400 rows: their numbers are checked elsewhere, and faster.
             whole = isinstance(rows, list) and {type(row) for row in rows} == {list}
             if whole and rows is not None and {*map(len, rows)} != {len(disturbances)}:
                 i = next(i for i, row in enumerate(rows) if len(row) != len(disturbances))
@@ -96,7 +96,7 @@ class PlantTable(Table):
 def limit_mistakes(
     table: Mapping[str, Any], kind: str, count: int, why: str, within: Mapping[str, Sequence[float]]
 ) -> list[Found]:
-    """What is wrong with lower and upper limits of so many numbers, and with what must lie between them."""
+    """Mistakes in `count` lower and upper limits, and in the values that must lie between them."""
     found: list[Found] = []
     limits: dict[str, list[float]] = {}
     for name in (f"{kind}_lower", f"{kind}_upper"):
@@ -122,7 +122,7 @@ def limit_mistakes(
 
 
 class ControllerTable(Table):
-    """`[controller]`: who decides the inputs, how often and by what; beside it the strategy's own parameters."""
+    """`[controller]`: the strategy that decides the inputs, how often and from what, with the strategy's own parameters."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -136,7 +136,7 @@ class ControllerTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Weights and limits below 0; parameters that the strategy lacks, or does not have."""
+        """Weights and limits below 0, and missing or unknown parameters of the strategy."""
         found: list[Found] = []
         for name in ("state_weights", "input_weights", "rate_weights", "rate_limits"):
             values = table.get(name)
@@ -163,7 +163,7 @@ class ControllerTable(Table):
 
 
 def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:
-    """The plant of a table that fits its process, in deviations from the reference."""
+    """The plant that a table describes, in deviations from the reference; the table fits its process."""
     around, n, m = np.array(reference), len(reference), len(table.inputs)
 
     def limits(values: Sequence[float] | None, without: float, count: int) -> Floats:
@@ -184,7 +184,7 @@ def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:
 
 
 def assignment_of(table: ControllerTable, process: Process, plant: Plant, slot_seconds: float) -> Assignment:
-    """What the controller of a table that fits its plant is told."""
+    """The assignment of the controller that a table describes; the table fits its plant."""
     m = plant.inputs
     per_slot = np.full(m, np.inf) if table.rate_limits is None else np.array(table.rate_limits)
     return Assignment(

@@ -1,4 +1,4 @@
-"""`[process]`: what everybody knows of what moves.
+"""`[process]`: the process model, which every process of a run knows.
 
 Source: docs/scenario.md, process.
 """
@@ -34,7 +34,7 @@ class ProcessTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether the three are a process; what is missing or no matrix at all is left out of the question."""
+        """Mistakes in the three matrices together; one that is missing or malformed is not compared."""
         found: list[Found] = []
         matrices: dict[str, NDArray[np.float64]] = {}
         for name in _MATRICES:
@@ -65,7 +65,7 @@ class ProcessTable(Table):
 
     @property
     def around(self) -> list[float]:
-        """The public reference, from which states are transmitted as deviations; 0 unless it is given."""
+        """The public reference; states are transmitted as deviations from it. 0 unless it is given."""
         return [0.0] * len(self.A) if self.reference is None else self.reference
 
     @property

@@ -1,4 +1,4 @@
-"""The recordings that a scenario names: read when it is loaded, so that whoever gets the scenario needs no file.
+"""The recordings that a scenario names: read when the scenario is loaded, so that no other process needs the files.
 
 Source: docs/links.md, traces.
 """
@@ -16,18 +16,18 @@ from evedrop.model.delays.trace import MOST_DELAYS
 from evedrop.recordings.link_recording import LinkRecording
 from evedrop.scenario.words import as_toml
 
-_STAND_IN = "1"  # for a recording that cannot be read: it is complained of once
+_STAND_IN = "1"  # for a recording that cannot be read, so that it is reported only once
 
 
 def beside(tables: Mapping[str, Any], folder: Path) -> None:
-    """Change the name of every recording to where it is, for a scenario in this folder."""
+    """Replace the name of every recording by its path, for a scenario in this folder."""
     for _, trace in _traces(tables):
         if isinstance(trace.get("file"), str):
             trace["file"] = str(folder / trace["file"])
 
 
 def read_recordings(tables: Mapping[str, Any]) -> list[str]:
-    """Put what is recorded in the place of every recording's `file` and `column`; the mistakes, with their paths."""
+    """Replace `file` and `column` of every recording by its contents. Returns the mistakes, with their paths."""
     mistakes = []
     delays = 0
     slots = tables.get("slots")
@@ -65,11 +65,11 @@ def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]
 
 
 def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
-    """One recording's, by `entry`: outcomes or values; what is wrong, as (entry, what)."""
+    """Replace one recording by its outcomes or values, according to `entry`; the mistakes as (entry, description)."""
     file, column = trace.pop("file", None), trace.pop("column", None)
     if entry in trace:
         extra = "file" if file is not None else "column" if column is not None else None
-        return [(extra, f"is there beside {entry}; expected one of them")] if extra else []
+        return [(extra, f"is given together with {entry}; expected one of them")] if extra else []
     trace[entry] = _STAND_IN if entry == "outcomes" else [0.0]
     if file is None:
         return [("file", 'is missing; expected file = "walk.csv"')]

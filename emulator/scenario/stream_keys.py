@@ -1,4 +1,4 @@
-"""The keys of a scenario's random streams, those of the shared secret among them."""
+"""The keys of a scenario's random streams, including those of the shared secret."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evedrop.streams import root_of_seed, stream_key
 
 @dataclass(frozen=True)
 class StreamKeys:
-    """The keys of all streams of a scenario: those of the seed, and the two of the secret."""
+    """The keys of all streams of a scenario: those from the seed, and the two of the secret."""
 
     seed_root: bytes
     secret_root: bytes
@@ -43,34 +43,34 @@ class StreamKeys:
         return cls(root, stream_key(secret, "secret"))
 
     def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
-        """Keys of the shared secret's streams."""
+        """The keys of the shared secret's streams."""
         return {name: stream_key(self.secret_root, name) for name in names}
 
     @property
     def process(self) -> bytes:
-        """Of the sensor's process noise."""
+        """The key of the sensor's process noise."""
         return stream_key(self.seed_root, "process")
 
     def link(self, receiver: str, course: LinkSchedule) -> dict[str, bytes]:
-        """Of all that a receiver's link draws from."""
+        """The keys of all streams that a receiver's link draws from."""
         return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
 
     def links(self, courses: Mapping[str, LinkSchedule]) -> dict[str, bytes]:
-        """Of all links."""
+        """The keys of all links."""
         return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
 
     @property
     def measurement(self) -> bytes:
-        """Of the noise of what the sensor measures."""
+        """The key of the sensor's measurement noise."""
         return stream_key(self.seed_root, "measurement")
 
     @property
     def way_back(self) -> bytes:
-        """Of the losses of acknowledgements."""
+        """The key of the losses of acknowledgements."""
         return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
 
     def eavesdropper(self, name: str, strategy: str, parameters: Mapping[str, Any]) -> dict[str, bytes]:
-        """What an eavesdropper's strategy must be given: the schedule's key, its own coin's, or nothing."""
+        """The keys that an eavesdropper's strategy must be given: the schedule's, that of its own coin, or none."""
         keys = {}
         for stream in STRATEGIES[strategy].streams(parameters):
             own = stream_key(self.seed_root, f"coin/{name}")

@@ -1,4 +1,4 @@
-"""What all tables of a scenario file share: entries checked by themselves and together, all mistakes at once."""
+"""The base class of all tables of a scenario file: it checks each entry and all together, and reports every mistake at once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
 def expected(what: str, hint: str = "") -> PydanticCustomError:
-    """The error of one value: the line will say what was found, that this was expected, and what may have been meant."""
+    """The error of one value. The message says what was found, what was expected, and what may have been meant."""
     return PydanticCustomError("expected", "one value", {"expected": what, "hint": hint})
 
 
@@ -48,7 +48,7 @@ def one_of(names: Iterable[str]) -> Callable[[str], str]:
 
 
 def registered(classes: Registry[Any]) -> Callable[[str], str]:
-    """A check that a value is the name of a class."""
+    """A check that a value is the name of a registered class."""
 
     def check(value: str) -> str:
         why = _no_class(value, classes)
@@ -62,7 +62,7 @@ def registered(classes: Registry[Any]) -> Callable[[str], str]:
 
 
 def _no_class(name: Any, classes: Registry[Any]) -> str | None:
-    """Why a name stands for no class, in words that follow `is NAME`, or "" if it is just unknown; None if it stands for one."""
+    """Why no class has this name, in words that follow `is NAME`, or "" if it is just unknown; None if a class has it."""
     try:
         classes[str(name)]
     except NotRegistered as error:
@@ -83,7 +83,7 @@ Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
 Matrix = list[list[Annotated[float, Field(strict=True)]]]
 Found = tuple[str, str]
-"""A mistake in a table: the entry, and what is wrong with it."""
+"""A mistake in a table: the entry and a description."""
 
 
 class Table(BaseModel):
@@ -93,14 +93,14 @@ class Table(BaseModel):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """What only shows when entries are seen together; entries that are wrong by themselves may be in the table."""
+        """Mistakes that need several entries to be seen. The table may contain entries with mistakes of their own."""
         del table
         return []
 
     @model_validator(mode="wrap")
     @classmethod
     def _all_at_once(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
-        """Entries by themselves and together, so that one mistake does not hide another."""
+        """Check each entry and all entries together, so that one mistake does not hide another."""
         together = cls.mistakes(found) if isinstance(found, Mapping) else []
         mistakes = PydanticCustomError("mistakes", "several", {"mistakes": together})
         try:
@@ -117,7 +117,7 @@ class Table(BaseModel):
 
 
 def _again(detail: ErrorDetails) -> InitErrorDetails:
-    """An error that was reported, to be reported once more with others."""
+    """An error that was reported already, made ready to be reported with others."""
     kind, context = detail["type"], detail.get("ctx", {})
     own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
     return InitErrorDetails(type=own, loc=detail["loc"], input=detail["input"], ctx=context)
@@ -133,9 +133,9 @@ def _number(value: Any) -> bool:
 
 
 def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]:
-    """What is wrong with `{model = "…", …}`: an unknown model, parameters that are missing, unknown or wrong.
+    """Mistakes in `{model = "…", …}`: an unknown model; missing, unknown or wrong parameters.
 
-    models: of classes with `parameters`, `optional` and `mistakes`.
+    models: a registry of classes with `parameters`, `optional` and `mistakes`.
     """
     if not isinstance(found, Mapping):
         return []
@@ -153,7 +153,7 @@ def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]
         if name not in given and name not in model.optional
     ]
     mistakes += [
-        (f"{entry}.{name}", f"is no parameter of {found['model']}; expected {listed(sorted(model.parameters))}")
+        (f"{entry}.{name}", f"is not a parameter of {found['model']}; expected {listed(sorted(model.parameters))}")
         for name in given
         if name not in model.parameters
     ]

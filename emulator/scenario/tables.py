@@ -1,4 +1,4 @@
-"""The tables of a scenario file: what may stand in them, checked, and what it means.
+"""The tables of a scenario file: their entries, checks and meaning.
 
 Source: docs/scenario.md.
 """
@@ -38,7 +38,7 @@ MOST_SECRET_BYTES = 2**20
 
 
 class EncodingTable(Table):
-    """`[encoding]`: the scheme, and beside it the parameters that this scheme has."""
+    """`[encoding]`: the scheme and its parameters."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -46,14 +46,16 @@ class EncodingTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether the scheme has all its parameters, no others, and each as it must be."""
+        """Missing, unknown and wrong parameters of the scheme."""
         scheme = SCHEMES.get(str(table.get("scheme")))
         given = {name: value for name, value in table.items() if name != "scheme"}
         if scheme is None and is_own(table.get("scheme")):
             return []
         if scheme is None:
             anywhere = {name for one in SCHEMES.values() for name in one.parameters}
-            return [(name, "is no parameter of any scheme; remove the line") for name in given if name not in anywhere]
+            return [
+                (name, "is not a parameter of any scheme; remove the line") for name in given if name not in anywhere
+            ]
         found = [
             (name, f"is missing; the scheme {table['scheme']} needs it, such as {name} = {as_toml(example)}")
             for name, example in scheme.parameters.items()
@@ -71,12 +73,12 @@ class EncodingTable(Table):
 
     @property
     def spec(self) -> dict[str, Any]:
-        """What sensor and legitimate estimator are told."""
+        """The scheme's description for sensor and legitimate estimator."""
         return {"scheme": self.scheme, **self.parameters}
 
     @property
     def mu_d(self) -> float:
-        """μ_d; 1 for a scheme that sends nothing but the state."""
+        """μ_d; 1 for a scheme that sends only states."""
         return float(self.parameters.get("state_probability", 1.0))
 
 
@@ -89,7 +91,7 @@ class LegitimateTable(Table):
 
 
 class EavesdropperTable(Table):
-    """`[eavesdroppers.NAME]`: a strategy with its parameters, and a link, or several."""
+    """`[eavesdroppers.NAME]`: a strategy with its parameters, and one link or several."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -108,14 +110,14 @@ class EavesdropperTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether the strategy has all its entries and no others."""
+        """Missing and unknown entries of the strategy."""
         strategy = STRATEGIES.get(str(table.get("strategy")))
         example = as_toml((cls.model_fields["link"].examples or [0])[0])
         strange = [name for name in table if name not in cls.model_fields]
         if strategy is None:
             lost = table.get("link") is None and table.get("links") is None
             found = [("link", f"is missing; expected link = {example}")] if lost else []
-            # What a class needs that cannot be had is not known.
+            # The entries of a class that cannot be loaded are unknown.
             known = strange if is_own(table.get("strategy")) else []
             return found + [(name, no_entry(name, [*cls.model_fields])) for name in strange if name not in known]
         reader = READERS.get(str(table.get("reads_as"))) if "reads_as" in strategy.parameters else None
@@ -145,14 +147,12 @@ class EavesdropperTable(Table):
             entries = {name for name, value in link.items() if value} if isinstance(link, Mapping) else set()
             more = sorted(entries - {"quality", "loss"})
             if more:
-                found.append(
-                    (f"links.{i}", f"has {listed(more)}; links that are pooled have a quality or a loss alone")
-                )
+                found.append((f"links.{i}", f"has {listed(more)}; links that are pooled have only a quality or a loss"))
         return found
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The strategy's parameters, and those of the one it reads as."""
+        """The strategy's parameters, and those of the strategy it reads as."""
         names = [*STRATEGIES[self.strategy].parameters]
         if self.reads_as is not None:
             names += READERS[self.reads_as].parameters
@@ -165,7 +165,7 @@ class EavesdropperTable(Table):
 
 
 class WayBackTable(Table):
-    """`link = {…}` of the acknowledgements: they are lost, each by itself, or arrive at once."""
+    """`link = {…}` of the acknowledgements: each is lost independently or arrives at once."""
 
     quality: Annotated[Probability, Field(examples=[0.9])]
 
@@ -180,11 +180,11 @@ class AcknowledgementsTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Who blocks critical acknowledgements has a link of its own; no other attack asks for one."""
+        """Mistakes in the jammer: the attack `critical` needs a jammer with a link of its own, and no other attack uses one."""
         attack, jammer = table.get("attack", "none"), table.get("jammer")
         if attack == "critical" and jammer is None:
             return [
-                ("jammer", "is missing; the attack critical needs the eavesdropper that blocks what it missed itself")
+                ("jammer", "is missing; the attack critical needs the eavesdropper that blocks the packets it missed")
             ]
         if attack != "critical" and jammer is not None:
             return [
@@ -197,13 +197,13 @@ class AcknowledgementsTable(Table):
 
 
 class NetworkTable(Table):
-    """`[network]`: how the processes of a live run are connected; the trials are the same."""
+    """`[network]`: how the processes of a live run are connected; it does not change the trials."""
 
     routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
 
 
 class Scenario(Table):
-    """One scenario, checked."""
+    """One scenario, with all checks passed."""
 
     title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
     slots: Annotated[int, Field(ge=1, le=100_000_000, strict=True, examples=[2000])]
@@ -244,15 +244,15 @@ class Scenario(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Whether there is a folder of modules; they are looked for in it from now on, so that entries can name classes.
+        """A mistake if the folder of modules does not exist. Modules are found in it from now on, so entries can name classes.
 
-        Without a scheme or a link of somebody's own nothing in it is imported here: see `evedrop.model.answers`.
+        A custom scheme or link is the only reason to import one of the modules here: see `evedrop.model.answers`.
         """
         folder = table.get("modules")
         if not isinstance(folder, str):
             return []
         if not Path(folder).is_dir():
-            return [("modules", f'is "{folder}", which is no folder; expected the one that the modules are in')]
+            return [("modules", f'is "{folder}", which is not a folder; expected the folder that contains the modules')]
         absolute = str(Path(folder).absolute())
         wrong = [("modules", what) for what in elsewhere(absolute, table)]
         ANSWERS.folder = absolute
@@ -262,29 +262,29 @@ class Scenario(Table):
 
     @property
     def relayed(self) -> bool:
-        """Whether there are two routers, of which the second is a relay."""
+        """Whether there are two routers; the second is a relay."""
         return self.network is not None and self.network.routers > 1
 
     @property
     def receivers(self) -> tuple[str, ...]:
-        """All receivers, the legitimate one first."""
+        """All receivers, the legitimate estimator first."""
         return (LEGITIMATE, *self.eavesdroppers)
 
     @property
     def driven(self) -> Plant | None:
-        """What drives the true states, if it is not the process alone."""
+        """The plant that drives the true states, if there is more than the process."""
         return None if self.plant is None else plant_of(self.plant, self.process.around)
 
     @property
     def assignment(self) -> Assignment | None:
-        """What the controller is told, if there is one."""
+        """What the controller needs to know, if there is a controller."""
         if self.driven is None or self.controller is None:
             return None
         return assignment_of(self.controller, self.process.process, self.driven, self.slot_seconds or 1.0)
 
     @property
     def digested(self) -> tuple[str, ...]:
-        """Whoever has a digest: all receivers, and the controller if there is one."""
+        """The processes that have a digest: all receivers, and the controller if there is one."""
         return self.receivers if self.controller is None else (*self.receivers, CONTROLLER)
 
     @property
@@ -294,7 +294,7 @@ class Scenario(Table):
 
     @property
     def leaks(self) -> dict[str, int]:
-        """Eavesdropper → the slot whose true state is betrayed to it, of those who are told one."""
+        """Eavesdropper → the slot whose true state is betrayed to it; only eavesdroppers to which one is betrayed."""
         slots = {name: STRATEGIES[one.strategy].betrayed(one.parameters) for name, one in self.eavesdroppers.items()}
         return {name: slot for name, slot in slots.items() if slot is not None}
 
@@ -303,20 +303,20 @@ class Scenario(Table):
         return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].pool
 
     def window(self, receiver: str) -> int:
-        """By how many slots a packet may be late for a receiver."""
+        """The number of slots by which a packet may be late for a receiver."""
         return (self.legitimate if receiver == LEGITIMATE else self.eavesdroppers[receiver]).window
 
     @cached_property
     def timeline(self) -> Timeline:
-        """When what happens, from the events."""
+        """The order of events and their effects."""
         return Timeline.of(self.event, self.receivers, self._changed_settings)
 
     def _changed_settings(self, receiver: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """A link's settings with some entries changed; those of an earlier event are among them already."""
+        """A link's settings with some entries changed; `changes` includes those of earlier events."""
         return changed_link(self.link(receiver), changes).settings(self.slot_seconds)
 
     def course(self, receiver: str) -> LinkSchedule:
-        """All that is known of a receiver's link in advance."""
+        """Everything that is known of a receiver's link in advance."""
         link = self.link(receiver)
         return LinkSchedule(
             link.settings(self.slot_seconds),
@@ -327,7 +327,7 @@ class Scenario(Table):
         )
 
     def cuts(self, receiver: str) -> list[int]:
-        """Slots in which a receiver goes away or is back, with which a block of its digest begins."""
+        """The slots in which a receiver goes away or comes back; a new block of its digest begins in each."""
         if receiver == CONTROLLER:
             return []
         return sorted({slot for one in self.timeline.outages[receiver] for slot in (one.start, one.stop)})

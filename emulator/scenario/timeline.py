@@ -1,4 +1,4 @@
-"""The events of a scenario in order: when the run is held and what is done then, and what it means for every link.
+"""The events of a scenario in order: the slots before which the run is held, what is done then, and the effect on each link.
 
 Source: docs/scenario.md, events.
 """
@@ -16,10 +16,10 @@ from evedrop.scenario.words import as_toml
 
 _REASONS = {"kill": Fate.DOWN, "pause": Fate.PAUSED}
 _ENDS = {"cut": "heal", "partition": "heal", "jam": "jammed", "kill": "restart", "pause": "resume"}
-_JAMMING = {"jam": "acknowledgements are attacked", "jammed": "acknowledgements are attacked no more"}
+_JAMMING = {"jam": "acknowledgements are attacked", "jammed": "acknowledgements are no longer attacked"}
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
-"""From a receiver and the entries of its link that are changed to its settings then."""
+"""Maps a receiver and the changed entries of its link to the link's new settings."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class Act:
     names: tuple[str, ...]
     """The receivers it is done to."""
     changes: Mapping[str, Any] | None = None
-    """Of a `set`: the link's entries; None sets those of the scenario again."""
+    """For a `set`: the link's entries; None restores those of the scenario."""
     text: str = ""
-    """Of a note."""
+    """For a note."""
 
     @property
     def said(self) -> str:
-        """As a line of a journal."""
+        """The act as a line of a journal."""
         if self.kind == "note":
             return self.text
         if self.kind in _JAMMING:
@@ -53,22 +53,22 @@ class Act:
 
 @dataclass(frozen=True)
 class Away(ReceiverOutage):
-    """An outage of a receiver, and what it knows when it is back."""
+    """An outage of a receiver, and what the receiver knows when it comes back."""
 
     keeps_state: bool = True
-    """False: it starts from the prior of the slot it went away in."""
+    """False: it restarts from the prior of the slot in which it went away."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """What a scenario's events come to."""
+    """The effects of a scenario's events."""
 
     acts: tuple[Act, ...]
-    """In order."""
+    """In order of slots."""
     changes: Mapping[str, tuple[Change, ...]]
     """Receiver → changes of its link."""
     outages: Mapping[str, tuple[Away, ...]]
-    """Receiver → when it is not there."""
+    """Receiver → its outages."""
 
     @property
     def holds(self) -> dict[int, list[Act]]:
@@ -80,7 +80,7 @@ class Timeline:
 
     @property
     def jams(self) -> list[list[int]] | None:
-        """Slots [from, to) in which acknowledgements are attacked; None if no event says: then they always are."""
+        """Slots [from, to) in which acknowledgements are attacked; None if no event says so: they are then always attacked."""
         spans: list[list[int]] = []
         for act in self.acts:
             if act.kind == "jam":
@@ -101,7 +101,7 @@ class Timeline:
 
 
 def acts_of(event: EventTable) -> Iterator[Act]:
-    """An event's beginning, and its end if it lasts."""
+    """The beginning of an event, and its end if it lasts."""
     kind = "cut" if event.kind == "partition" else event.kind
     yield Act(event.first, kind, event.names, event.set, event.note or "")
     if event.to is not None:
@@ -121,7 +121,7 @@ def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Chang
 
 
 def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries with others laid over them; of quality and loss the later one holds."""
+    """Entries overlaid by others; the later one of quality and loss replaces the earlier one."""
     dropped = {"quality": "loss", "loss": "quality"}
     gone = {dropped[name] for name in changes if name in dropped}
     return {**{name: value for name, value in entries.items() if name not in gone}, **changes}

@@ -1,4 +1,4 @@
-"""Values that no entry of a scenario can use, whichever it is: found before anything looks closer.
+"""Values that no entry of a scenario can have, found before any other check.
 
 Source: docs/scenario.md, what a scenario cannot have.
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 from evedrop.scenario.words import as_toml
 
-_DEEPEST = 16  # tables and lists in one another; what is in use has half of that
+_DEEPEST = 16  # nesting of tables and lists; scenarios use about half of that
 _LARGEST_BITS = 4096  # of a whole number; a seed has 256
 _LONGEST_NAME = 200
 _PLAIN = {"\n", "\t"}
@@ -20,10 +20,10 @@ MOST_EAVESDROPPERS = 64
 
 
 def unusable(tables: Any) -> Iterator[str]:
-    """A sentence for each of the first of them, with its path."""
+    """A sentence with a path for each of the first unusable values."""
     for number, sentence in enumerate(_unusable(tables)):
         if number == _MOST_TOLD:
-            yield f"and more of the kind: {_MOST_TOLD} are listed"
+            yield f"and more such mistakes: {_MOST_TOLD} are listed"
             return
         yield sentence
 
@@ -31,10 +31,10 @@ def unusable(tables: Any) -> Iterator[str]:
 def _unusable(tables: Any) -> Iterator[str]:
     eavesdroppers = tables.get("eavesdroppers")
     if isinstance(eavesdroppers, dict) and len(eavesdroppers) > MOST_EAVESDROPPERS:
-        # Each would be looked at, and each told what it lacks.
+        # Otherwise each of them would be checked and reported.
         yield f"eavesdroppers: has {len(eavesdroppers)} entries; expected at most {MOST_EAVESDROPPERS}"
         return
-    # A stack of our own: dotted keys can nest tables deeper than Python's calls can follow.
+    # An explicit stack: dotted keys can nest tables deeper than Python's recursion limit.
     waiting: list[tuple[tuple[str, ...], Any]] = [((), tables)]
     while waiting:
         path, value = waiting.pop()
@@ -71,11 +71,11 @@ def _name_mistakes(path: tuple[str, ...], entries: list[tuple[Any, Any]]) -> Ite
 
 
 def _is_strange(character: str) -> bool:
-    """Whether it moves the cursor, ends a string, or is half of a character."""
+    """Whether a character moves the cursor, ends a string, or is half of a surrogate pair."""
     return unicodedata.category(character) in ("Cc", "Cs") and character not in _PLAIN
 
 
 def _dotted(path: tuple[str, ...]) -> str:
-    """A path in a line of some length, its names in plain characters."""
+    """A dotted path of bounded length, with plain characters only."""
     names = [name if len(name) <= _LONGEST_NAME else f"{name[:20]}…" for name in path[: _DEEPEST + 1]]
     return "".join("?" if _is_strange(one) or one in _PLAIN else one for one in ".".join(names)) or "the scenario"

@@ -1,4 +1,4 @@
-"""How a message writes a value and a choice."""
+"""How messages write values and choices."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ __all__ = ["as_toml", "listed", "near"]
 
 
 def no_entry(name: str, known: Sequence[str]) -> str:
-    """What is said of an entry that a table does not have."""
+    """The message about an entry that a table does not have."""
     close = difflib.get_close_matches(name, known, 1)
     hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
-    return f"is no entry of this table; {hint}"
+    return f"is not an entry of this table; {hint}"
 
 
 def near(found: Any, names: Iterable[str]) -> str:
-    """A hint, `; did you mean NAME?`, where something found is almost one of the names; else nothing."""
+    """A hint, `; did you mean NAME?`, if the value found is close to one of the names; otherwise an empty string."""
     close = difflib.get_close_matches(str(found), list(names), 1)
     return f"; did you mean {close[0]}?" if close else ""
 

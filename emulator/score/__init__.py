@@ -1,1 +1,1 @@
-"""How well every receiver did: sums, verdicts, and the summary made of them."""
+"""How well every receiver did: sums, verdicts, and the summary that is made from them."""

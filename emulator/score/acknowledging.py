@@ -1,4 +1,4 @@
-"""Acknowledgements of a scenario: their way back, who attacks it when, and the chart by which the sensor notices.
+"""Acknowledgements of a scenario: their way back, the attack on it, and the chart with which the sensor detects the attack.
 
 Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack.
 """
@@ -6,7 +6,7 @@ Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +18,21 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.streams import Batch
 
-_ATTACK_LOOKED_FOR = "all"  # of a sensor whose scenario attacks nothing
+_ATTACK_LOOKED_FOR = "all"  # by the sensor of a scenario without an attack
 
 
 class WayBackSpec(NamedTuple):
-    """What the router is told of the way back."""
+    """The way back as the router needs to know it."""
 
     quality: float
     attack: str
     jammer: str | None
     spans: list[list[int]] | None
-    """Slots [from, to) in which the attack is on; None is always."""
+    """Slots [from, to) in which the attack is on; None: in all slots."""
 
 
 def way_back_of(scenario: Scenario) -> WayBackSpec | None:
-    """Of a scenario; None if its scheme needs no acknowledgements."""
+    """The way back of a scenario; None if its scheme needs no acknowledgements."""
     table = scenario.acknowledgements
     if table is None:
         return None
@@ -40,9 +40,9 @@ def way_back_of(scenario: Scenario) -> WayBackSpec | None:
 
 
 def chart_of(scenario: Scenario) -> Chart | None:
-    """The sensor's, for the attack that the scenario describes, or where it has none for one that blocks all.
+    """The sensor's chart for the scenario's attack, or for an attack that blocks everything if there is none.
 
-    None where no chart tells the two rates apart as seldom wrongly as the scenario wants.
+    None where no chart separates the two rates with as few false alarms as the scenario asks.
     """
     table = scenario.acknowledgements
     if table is None:
@@ -59,19 +59,20 @@ def chart_of(scenario: Scenario) -> Chart | None:
         return None
 
 
+@final
 class Acknowledging:
-    """The way back in memory: what the legitimate estimator, the router and the sensor's watch do of a live run. Final."""
+    """The way back in memory: does the work of legitimate estimator, router and attack detector in a live run."""
 
     def __init__(self, spec: WayBackSpec, chart: Chart | None, key: bytes, batch: Batch) -> None:
         self._way = AckChannel(spec.attack, spec.quality, key, batch, spec.spans)
         self._jammer = spec.jammer
         self._watch = None if chart is None else CusumBatch(chart, batch.trials)
         self.alarms: Flags = np.zeros(batch.trials, np.bool_)
-        """Where the last slot has raised an alarm, (R,)."""
+        """Whether the last slot raised an alarm, (R,)."""
 
     @classmethod
     def of(cls, scenario: Scenario, key: bytes, batch: Batch) -> Acknowledging | None:
-        """Of a scenario; None if there are no acknowledgements."""
+        """The way back of a scenario; None if there are no acknowledgements."""
         spec = way_back_of(scenario)
         return None if spec is None else cls(spec, chart_of(scenario), key, batch)
 
@@ -90,27 +91,28 @@ class Acknowledging:
         return arrived
 
 
+@final
 class Detection:
-    """When the sensor of every trial became sure of an attack. Final."""
+    """The slot in which the sensor of each trial detected an attack."""
 
     def __init__(self, trials: int) -> None:
         self.first: NDArray[np.int64] = np.full(trials, -1, np.int64)
-        """The slot, (R,); −1 where it has not."""
+        """The slot, (R,); −1 where no attack was detected."""
 
     @classmethod
     def merged(cls, parts: Sequence[Detection]) -> Detection:
-        """Of several sets of trials, in order."""
+        """The detection of several sets of trials, in order."""
         whole = cls(0)
         whole.first = np.concatenate([part.first for part in parts])
         return whole
 
     def add(self, first: int, alarms: Flags) -> None:
-        """Take slots from `first` on, alarms (c, R)."""
+        """Add slots from `first` on, alarms (c, R)."""
         raised = alarms.any(axis=0)
         self.first = np.where(raised & (self.first < 0), first + np.argmax(alarms, axis=0), self.first)
 
     def summary(self, scenario: Scenario) -> dict[str, Any] | None:
-        """What became of the sensor's watch, for the summary; None if it does not watch."""
+        """The sensor's detection for the summary; None if the sensor does not watch for attacks."""
         chart, spec = chart_of(scenario), way_back_of(scenario)
         if chart is None or spec is None:
             return None

@@ -1,4 +1,4 @@
-"""The channel checks itself: what a link did in a run, against what its models say it does.
+"""A check of the channel: compares the losses and delays of a link in a run with those of its models.
 
 Source: docs/results.md, links; docs/mathematics.md, links.
 """
@@ -23,12 +23,12 @@ QUANTILES = (0.5, 0.9, 0.99)
 
 
 def channel_of(scenario: Scenario, receiver: str, tally: Tally) -> dict[str, Any]:
-    """What the summary says of a link beside its account.
+    """The link's figures in the summary, besides its account.
 
-    `rate`: of the packets that met the loss model, the fraction it let through; `expected_rate`: by the model;
-    `interval`: of the model's rate given what was found, at 99.9 % confidence; `within_interval`: whether the model's rate
-    lies in it; `lost_by`; `bursts`, `mean_burst` and `expected_mean_burst` of consecutive losses; `delays` and what the
-    model says of them. None where nothing was measured, or nothing is known.
+    `rate`: the fraction of packets that the loss model let through; `expected_rate`: the same by the model;
+    `interval`: for the model's rate given the packets observed, at 99.9 % confidence; `within_interval`: whether the model's
+    rate lies in it; `lost_by`; `bursts`, `mean_burst` and `expected_mean_burst` of consecutive losses; `delays`, observed and
+    by the model. None where nothing was measured, or nothing is known.
     """
     course = scenario.course(receiver)
     pieces = _pieces(course, tally.done)
@@ -45,9 +45,9 @@ def channel_of(scenario: Scenario, receiver: str, tally: Tally) -> dict[str, Any
         **_delays(course, tally),
     }
     if tally.offered != tally.done * tally.trials:
-        return found  # trials that were cut short at different slots, in which other models may have ruled
+        return found  # trials were cut short at different slots, in which different models may have applied
     if tally.unsent:
-        # What a scheme sends may depend on what came before: of a loss model with a memory these packets are no fair sample.
+        # A scheme's packets may depend on the past: for a loss model with a memory they are not a fair sample.
         if len(pieces) != 1 or len(pieces[0][0]) < tally.done or not _independent(pieces[0][1]):
             return found
         met -= tally.unsent
@@ -74,8 +74,8 @@ _ROUNDING = 1e-12
 def interval(rate: float, expected: float, variance: float) -> tuple[float, float]:
     """Clopper and Pearson's interval for a probability at 99.9 % confidence.
 
-    Of as many independent packets as would scatter like these: `variance` is that of the rate if it is `expected`. A rate
-    that cannot scatter is its own interval.
+    Assumes as many independent packets as would scatter equally: `variance` is that of the rate if it is `expected`. A
+    rate that cannot scatter is its own interval.
     """
     from scipy.special import betaincinv  # noqa: PLC0415 - 0.2 s that only a summary needs
 
@@ -89,7 +89,7 @@ def interval(rate: float, expected: float, variance: float) -> tuple[float, floa
 
 
 def _pieces(course: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
-    """The slots below `done` in which packets met a loss model, and the model."""
+    """The slots below `done` in which packets met a loss model, with that model."""
     marks = stretches(course)
     ends = [*(start for start, _, _ in marks[1:]), done]
     return [
@@ -100,7 +100,7 @@ def _pieces(course: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
 
 
 def _mean_burst(tally: Tally) -> float | None:
-    """Mean number of consecutive losses; None where there are none, or where some are too long to be told apart."""
+    """Mean number of consecutive losses; None if there are none, or if some were too long to be counted."""
     count = int(tally.bursts.sum())
     if not count or tally.bursts[-1]:
         return None
@@ -108,7 +108,7 @@ def _mean_burst(tally: Tally) -> float | None:
 
 
 def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
-    """Mean number of consecutive losses by the model: P(lost) over P(lost after a packet that was not)."""
+    """Mean number of consecutive losses by the model: P(lost) over P(lost after a packet that was not lost)."""
     models = {id(loss): loss for _, loss in pieces}
     chain: Chain | None = next(iter(models.values())).chain if len(pieces) == 1 else None
     if chain is None:
@@ -119,7 +119,7 @@ def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
 
 
 def _delays(course: LinkSchedule, tally: Tally) -> dict[str, Any]:
-    """Fractions of the packets that came through by the slots they took, the last for more than the window; quantiles."""
+    """Fractions of the delivered packets by delay in slots, the last for delays beyond the window; and quantiles."""
     total = int(tally.delays.sum())
     if course.settings.get("delay") is None or not total:
         return {"delays": None, "expected_delays": None, "delay_quantiles": None}
@@ -132,7 +132,7 @@ def _delays(course: LinkSchedule, tally: Tally) -> dict[str, Any]:
 
 
 def _expected_delays(course: LinkSchedule) -> list[float] | None:
-    """The same by the model, of a link whose delays stay the same and which has no queue."""
+    """The same by the model, for a link whose delays never change and that has no queue."""
     if any(change.settings is not None for change in course.changes) or course.settings.get("rate", 1.0) < 1.0:
         return None
     model, reorder = delay_of(course.settings["delay"]), course.settings.get("reorder", 0.0)

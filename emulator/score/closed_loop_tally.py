@@ -1,4 +1,4 @@
-"""What became of a closed loop: failed decisions, clipped inputs, and the error of the two estimators that there could be.
+"""Totals of a closed loop: failed decisions, clipped inputs, and the errors of the two possible estimators.
 
 Source: docs/results.md, controller.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -34,65 +34,67 @@ class Acted:
     estimates: Mapping[str, Floats]
     """Receiver → x̂, (c, n, R)."""
     action: Codes
-    """The legitimate estimator's, (c, R)."""
+    """The legitimate estimator's actions, (c, R)."""
     true: Floats
-    """The true states, (c, n, R): x, but of a sensor that filters."""
+    """The true states, (c, n, R); equal to x unless the sensor filters."""
 
     def part(self, trials: slice) -> Acted:
-        """Of some trials."""
+        """The same for some of the trials."""
         inputs = InputSlots(self.inputs.u[..., trials], self.inputs.failed[:, trials])
         estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
         return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials], self.true[..., trials])
 
 
+@final
 @dataclass
 class SolveTimes:
-    """What decisions take, of all trials that are simulated side by side. Final."""
+    """The time that decisions take, over all trials that are simulated together."""
 
     decisions: int = 0
     seconds: float = 0.0
     longest: float = 0.0
 
     def add(self, seconds: Iterable[float]) -> None:
-        """Take some decisions."""
+        """Add some decisions."""
         for one in seconds:
             self.decisions += 1
             self.seconds += one
             self.longest = max(self.longest, one)
 
     def merge(self, other: SolveTimes) -> None:
-        """Take another's."""
+        """Add another process's decisions."""
         self.decisions += other.decisions
         self.seconds += other.seconds
         self.longest = max(self.longest, other.longest)
 
     @property
     def mean(self) -> float | None:
-        """Mean seconds a decision; None without one."""
+        """Mean seconds per decision; None if there were none."""
         return self.seconds / self.decisions if self.decisions else None
 
 
+@final
 class LoopTally:
-    """A closed loop's totals over a set of trials, whose slots come in order. Final."""
+    """A closed loop's totals over a set of trials, whose slots come in order."""
 
     def __init__(self, process: Process, plant: Plant, trials: int, knows_input: bool, comparable: bool) -> None:
-        """comparable: whether the error of the other estimator, which is not in the loop, is to be had."""
+        """comparable: whether the error of the other estimator, which is not in the loop, can be computed."""
         self._plant = plant
         self._sign = -1.0 if knows_input else 1.0
         self._offset = Offset(process, plant, trials) if comparable else None
         self.slots = 0
         """Trial-slots."""
         self.failed = 0
-        """Trial-slots whose inputs are held because a decision failed."""
+        """Trial-slots whose inputs were held because a decision failed."""
         self.clipped = 0
-        """Trial-slots in which the plant clips an input."""
+        """Trial-slots in which the plant clipped an input."""
         self.other_error = 0.0
         self.household: HouseholdTally | None = None
-        """Of a plant that is a house."""
+        """For a plant that is a house."""
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> LoopTally | None:
-        """Of so many trials of a scenario; None without a controller."""
+        """The totals of some trials of a scenario; None without a controller."""
         if scenario.driven is None or scenario.controller is None:
             return None
         comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
@@ -102,7 +104,7 @@ class LoopTally:
         return tally
 
     def add(self, acted: Acted) -> None:
-        """Take the next slots."""
+        """Add the next slots."""
         inputs = acted.inputs
         if self.household is not None:
             self.household.add(acted.true, inputs.u, acted.estimates)
@@ -119,7 +121,7 @@ class LoopTally:
 
     @classmethod
     def merged(cls, parts: Sequence[LoopTally | None]) -> LoopTally | None:
-        """Of several sets of trials, in order."""
+        """The totals of several sets of trials, in order."""
         known = [part for part in parts if part is not None]
         if not known:
             return None
@@ -135,7 +137,7 @@ class LoopTally:
     def summary(
         self, scenario: Scenario, peer: dict[str, Any], times: SolveTimes, digest: str | None
     ) -> dict[str, Any]:
-        """What the summary says of the controller; peer: what it says of the legitimate estimator."""
+        """The summary's entry on the controller; peer: its entry on the legitimate estimator."""
         assert scenario.controller is not None  # noqa: S101 - else there is no tally
         knows = scenario.legitimate.knows_input
         errors = [peer["mean_squared_error"], self.other_error / self.slots if self._offset and self.slots else None]

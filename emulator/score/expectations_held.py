@@ -1,4 +1,4 @@
-"""Did what was expected of a run hold? What was found, what was wanted, and how to see a failure again.
+"""Whether a run met its expectations: the value found, the value expected, and how to reproduce a failure.
 
 Source: docs/scenario.md, expect; docs/results.md, expectations.
 """
@@ -22,13 +22,13 @@ from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched import watch_of
 
 Found = float | str | None
-"""None: the run does not tell, or, of a receiver that must be in step, it never was."""
+"""None: the run does not tell, or a receiver that must be in step never was."""
 
 _MODES = {"exact": "", "covariance-only": " --covariance-only", "error-coordinates": " --error-coordinates"}
 
 
 def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
-    """The command that runs what is in a results folder once more, to the same bits."""
+    """The command that runs the contents of a results folder again, to the same bits."""
     where = shlex.quote(str(folder.absolute()))
     if mode == "live":
         return f"evedrop run {where}"
@@ -36,7 +36,7 @@ def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
 
 
 def format_expectation(expectation: Mapping[str, Any]) -> str:
-    """An expectation of a summary as a sentence."""
+    """An expectation from a summary as a sentence."""
     found, held = expectation["found"], expectation["held"]
     word = {True: "held", False: "FAILED", None: "this run does not tell"}[held]
     if found is None:
@@ -49,7 +49,7 @@ def format_expectation(expectation: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a run has to show, by receiver."""
+    """The results of a run by receiver."""
 
     scenario: Scenario
     peers: Mapping[str, Mapping[str, Any]]
@@ -63,7 +63,7 @@ class Evidence:
     """As in the summary."""
 
     def judged(self, replay: str | None) -> list[dict[str, Any]]:
-        """Every expectation of the scenario as in the summary; `replay` is the command that shows a failure again."""
+        """Every expectation of the scenario as in the summary; `replay` is the command that reproduces a failure."""
         return [self._judged(expect, replay) for expect in self.scenario.expect]
 
     def _judged(self, expect: ExpectTable, replay: str | None) -> dict[str, Any]:
@@ -88,7 +88,7 @@ class Evidence:
         return inner if isinstance(inner, (int, float)) else None
 
     def _of_household(self, figure: str, of_receiver: str | None = None) -> float | None:
-        """A figure of the house, or what a receiver, the first of two, can tell of it; None where there is no such run."""
+        """A figure of the house, or of what a receiver can infer about it (the first of two parts); None if there is none."""
         if self.household is None:
             return None
         found: float | None = (
@@ -97,7 +97,7 @@ class Evidence:
         return found
 
     def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:
-        """A figure of the whole run, of some slots, or a quantile over trials of either."""
+        """A figure of the whole run or of some slots, or a quantile of it over trials."""
         whole: float | None = self.peers[receiver][figure]
         first, end = expect.slots or (0, self.scenario.slots)
         if whole is None or (expect.slots is None and expect.quantile is None):
@@ -115,7 +115,7 @@ class Evidence:
         return account.get("rate"), account.get("within_interval")
 
     def _secrecy(self, expect: ExpectTable) -> tuple[Found, bool | None]:
-        """Held if theory promises it and the run shows it; whatever else there is to say is no promise kept."""
+        """Held if theory promises secrecy and the run shows it; in all other cases it is not held."""
         verdict = self.secrecy[str(expect.against)]
         relative = expect.secrecy == "relative"
         shown = verdict.relative if relative else verdict.perfect
@@ -127,7 +127,7 @@ class Evidence:
         return found, promised is True and shown is Verdict.HELD if complete else None
 
     def _in_step(self, expect: ExpectTable) -> tuple[Found, bool | None]:
-        """By the largest slot over trials; a run that was cut short before that slot does not tell."""
+        """The largest slot over trials; undecided if the run was cut short before that slot."""
         wanted = watch_of(self.scenario, expect)
         assert wanted is not None  # noqa: S101 - every such expectation has one
         tally = self.tallies[wanted[0]]

@@ -1,4 +1,4 @@
-"""A sensor that measures and filters, in a run: errors against what it transmits are not errors against the truth.
+"""A sensor that measures and filters: errors against its transmitted estimate differ from errors against the truth.
 
 Source: docs/results.md, filter.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from evedrop.streams import Batch
 
 
 def local_filter_of(scenario: Scenario, key: bytes, batch: Batch) -> LocalFilter | None:
-    """The sensor's; None of one that knows the state."""
+    """The sensor's filter; None if the sensor knows the state."""
     driven = scenario.driven
     if driven is None or driven.output_matrix is None:
         return None
@@ -32,8 +32,9 @@ def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[s
     return {SENSOR: squared_errors(true, x), **{name: squared_errors(true, x_hat) for name, x_hat in x_hats.items()}}
 
 
+@final
 class FilterTally:
-    """Sums of errors against the true state, over the slots and trials so far. Final."""
+    """Sums of errors against the true state, over the slots and trials so far."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -42,12 +43,12 @@ class FilterTally:
 
     @classmethod
     def of(cls, scenario: Scenario) -> FilterTally | None:
-        """Of a scenario; None if its sensor knows the state."""
+        """A tally for a scenario; None if its sensor knows the state."""
         driven = scenario.driven
         return None if driven is None or driven.output_matrix is None else cls()
 
     def add(self, errors: Mapping[str, Floats]) -> None:
-        """Take the next slots, (c, R) each."""
+        """Add the next slots, (c, R) each."""
         self.slots += len(errors[SENSOR])
         self.count += errors[SENSOR].size
         for name, error in errors.items():
@@ -55,7 +56,7 @@ class FilterTally:
 
     @classmethod
     def merged(cls, parts: Sequence[FilterTally | None]) -> FilterTally | None:
-        """Of several sets of trials, in order."""
+        """The sums of several sets of trials, in order."""
         known = [part for part in parts if part is not None]
         if not known:
             return None
@@ -69,7 +70,7 @@ class FilterTally:
         return whole
 
     def summary(self, scenario: Scenario) -> dict[str, Any]:
-        """What the summary says of the filter."""
+        """The summary's entry on the filter."""
         driven = scenario.driven
         assert driven is not None  # noqa: S101 - else there is no tally
         steps = Steps(scenario.process.process, driven)

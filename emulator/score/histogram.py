@@ -1,13 +1,13 @@
-"""Quantiles over trials, slot by slot, from histograms that add up: the same whatever ran where, in bounded memory.
+"""Quantiles over trials, slot by slot, from histograms that add up: the same for any number of workers, in bounded memory.
 
 A bin is a quarter of an octave wide (the exponent and two bits of the mantissa), so a quantile is within 25 % of the
-exact one, and usually, being interpolated, within a few. 512 bins span 128 octaves; what is below counts as 0, and
-what is above as infinite.
+exact one; interpolation usually brings it within a few per cent. 512 bins span 128 octaves; smaller values count as 0,
+and larger ones as infinite.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,14 @@ from evedrop.model.process import Floats
 LEVELS = (0.05, 0.5, 0.95)
 """The quantiles that are reported."""
 _BINS = 512
-_OCTAVES_BELOW = 24  # of the scale
+_OCTAVES_BELOW = 24  # octaves below the scale
 _MOST_ROWS = 4096
-_SHIFT = 50  # leaves sign, exponent and two bits of the mantissa
+_SHIFT = 50  # keeps sign, exponent and two bits of the mantissa
 
 
+@final
 class SlotHistograms:
-    """Histograms of one quantity in at most 4096 evenly spaced slots of a run. Final."""
+    """Histograms of one quantity in at most 4096 evenly spaced slots of a run."""
 
     def __init__(self, slots: int, scale: float) -> None:
         self._slots = slots
@@ -32,7 +33,7 @@ class SlotHistograms:
         self._counts = np.zeros((-(-slots // self._stride), _BINS), np.uint32)
 
     def add(self, first: int, values: Floats) -> None:
-        """Take the values (c, R), none negative, of slots first … first+c−1."""
+        """Add the values (c, R), none negative, of slots first … first+c−1."""
         skip = -first % self._stride
         chosen = values[skip :: self._stride]
         rows = len(chosen)
@@ -50,7 +51,7 @@ class SlotHistograms:
         self._counts += other._counts
 
     def __getstate__(self) -> dict[str, Any]:
-        """As a worker sends it: of half a million bins and more, a few in a hundred hold anything."""
+        """The state as a worker sends it: only the filled bins, which are a few per cent of half a million and more."""
         filled = np.flatnonzero(self._counts).astype(np.uint32)
         return {**self.__dict__, "_counts": (self._counts.shape, filled, self._counts.reshape(-1)[filled])}
 
@@ -74,7 +75,7 @@ class SlotHistograms:
             before = cumulative[rows, bins] - count
             part = np.clip((wanted - before) / np.maximum(count, 1), 0.0, 1.0)
             values = edges[bins] + part * (edges[bins + 1] - edges[bins])
-            # Beyond the bins' reach nothing is known but the side.
+            # Outside the bins' range, all that is known of a value is whether it is too small or too large.
             found[rows * self._stride, column] = np.select([bins == 0, bins == _BINS - 1], [0.0, np.inf], values)
         return found
 

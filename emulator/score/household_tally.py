@@ -1,4 +1,4 @@
-"""What became of a house over a run: energy bought and sold, what perfect knowledge would change, and who can tell what.
+"""Totals of a house over a run: energy bought and sold, the change by perfect knowledge, and what receivers can infer.
 
 Source: docs/microgrid.md, energy and privacy; docs/results.md, household.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from evedrop.scenario.household import HouseholdTable
 
 
 def guesses_of(scenario: Scenario, table: HouseholdTable, trials: int) -> dict[str, LoadGuess]:
-    """Receiver → who guesses the load from its estimates."""
+    """Receiver → the guess of the load from its estimates."""
     plant, controller, assignment = scenario.plant, scenario.controller, scenario.assignment
     assert plant is not None and controller is not None and assignment is not None  # noqa: S101, PT018 - a house has them
     names, strategy = plant.disturbances, CONTROLLERS[controller.strategy]
@@ -33,8 +33,9 @@ def guesses_of(scenario: Scenario, table: HouseholdTable, trials: int) -> dict[s
     return {name: LoadGuess(assignment, strategy(assignment, trials), house, shone) for name in scenario.receivers}
 
 
+@final
 class HouseholdTally:
-    """A house's totals over a set of trials, whose slots come in order. Final."""
+    """A house's totals over a set of trials, whose slots come in order."""
 
     def __init__(self, scenario: Scenario, table: HouseholdTable, trials: int) -> None:
         plant, controller, assignment = scenario.driven, scenario.controller, scenario.assignment
@@ -56,11 +57,11 @@ class HouseholdTally:
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> HouseholdTally | None:
-        """Of so many trials of a scenario; None without a house."""
+        """The totals of some trials of a scenario; None without a house."""
         return None if scenario.household is None else cls(scenario, scenario.household, trials)
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
-        """Take the next slots: states (c, n, R), inputs as decided (c, m, R), and what each receiver believes, (c, n, R)."""
+        """Add the next slots: states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
         grid, other = np.empty(u[:, 0].shape), np.empty(u[:, 0].shape)
         for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
             other[row] = self._perfect.follow(state, inputs)[self._grid]
@@ -74,12 +75,12 @@ class HouseholdTally:
         self.done += len(x)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the controllers, which may hold what only their own process can: it takes no further slots elsewhere."""
+        """The state without the controllers, which may hold objects bound to their process: a copy takes no further slots."""
         return {name: value for name, value in self.__dict__.items() if name not in ("_perfect", "_guesses")}
 
     @classmethod
     def merged(cls, parts: Sequence[HouseholdTally | None]) -> HouseholdTally | None:
-        """Of several sets of trials, in order. Where some came to fewer slots, guesses are those of the slots of all."""
+        """The totals of several sets of trials, in order. If some have fewer slots, guesses cover the slots that all have."""
         known = [part for part in parts if part is not None]
         if not known:
             return None
@@ -94,7 +95,7 @@ class HouseholdTally:
         return whole
 
     def summary(self) -> dict[str, Any]:
-        """What the summary says of the house: means over trials; None for what there is none of."""
+        """The summary's entry on the house: means over trials; None for figures that do not exist."""
         meter, seconds = self.meter, self._slot_seconds
         apart = meter.difference
         return {
@@ -111,7 +112,7 @@ class HouseholdTally:
         }
 
     def _activity(self) -> dict[str, Any]:
-        """How well each receiver's guesses tell active windows, of those that are over."""
+        """How well each receiver's guesses detect active windows, over the windows that have ended."""
         table = self._table
         load = privacy.means(self._disturbances[:, self._load], self._period)
         periods = min(len(loads) for loads in self._guessed.values())
@@ -132,6 +133,6 @@ class HouseholdTally:
 
 
 def _mean(values: Floats) -> float | None:
-    """Over trials; None where a trial has none."""
+    """The mean over trials; None if a trial has no value."""
     mean = float(np.mean(values))
     return mean if np.isfinite(mean) else None

@@ -1,4 +1,4 @@
-"""What a scheme keeps secret from an adversary."""
+"""How much a scheme keeps secret from an adversary."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class SecrecyKept(StrEnum):
-    """What a scheme keeps secret from an adversary, in a word."""
+    """How much a scheme keeps secret from an adversary, in a word."""
 
     PERFECT = "perfect"
     RELATIVE = "relative"
@@ -19,4 +19,4 @@ class SecrecyKept(StrEnum):
 
 
 MARKS = {SecrecyKept.PERFECT: "●", SecrecyKept.RELATIVE: "◐", SecrecyKept.UNDECIDED: "?", SecrecyKept.BROKEN: "✕"}
-"""Verdicts as marks that can be told apart without colours."""
+"""Verdicts as marks that can be distinguished without colours."""

@@ -1,11 +1,14 @@
-"""Keeps the score of a run, live or in memory: theory beside every slot, a tally per receiver, and the summary."""
+"""Scores a run, live or in memory: compares every slot with theory, keeps a tally per receiver, and makes the summary.
+
+The summary is described in docs/results.md.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -38,8 +41,9 @@ class Scored(NamedTuple):
     """Theory: trace of the expected actual error covariance, (c,)."""
 
 
+@final
 class Scorekeeper:
-    """Scores the slots of a batch of trials, in order. Final."""
+    """Scores the slots of a batch of trials, in order."""
 
     def __init__(self, scenario: Scenario, trials: int) -> None:
         self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
@@ -68,7 +72,7 @@ class Scorekeeper:
         return scored
 
     def _add_plant(self, slots: Slots) -> None:
-        """Take what slots say of alarms, of a controller, and of a sensor that filters."""
+        """Add the slots' alarms, the controller's decisions, and the true errors of a sensor that filters."""
         totals, estimates = self.totals, {name: one.x_hat for name, one in slots.receivers.items()}
         if slots.alarms is not None and totals.detection is not None:
             totals.detection.add(slots.first, slots.alarms)
@@ -81,24 +85,24 @@ class Scorekeeper:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run went, to its end."""
+    """How a run ended."""
 
     wall_seconds: float
-    """Start command to last row on disk."""
+    """From the start command to the last row on disk."""
     how: str = "complete"
     """`complete`, `interrupted`, or why it failed."""
     replay: str | None = None
-    """The command that runs it once more, for whoever sees an expectation fail."""
+    """The command that runs it again, shown when an expectation fails."""
     mode: str = "live"
-    """Or that of a run in memory."""
+    """`live`, or the mode of a run in memory."""
     events: Sequence[Mapping[str, Any]] = ()
-    """As the summary has them."""
+    """As in the summary."""
     outages: Sequence[Mapping[str, Any]] = ()
-    """The same."""
+    """As in the summary."""
     accused: tuple[str, ...] = ()
-    """The processes that the run has ended with because of what they did."""
+    """The processes whose behaviour made the run end."""
     misdelivered: Mapping[str, int] = field(default_factory=dict)
-    """Process → messages of other keys that it dropped."""
+    """Process → messages with other processes' keys, which it dropped."""
 
 
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
@@ -109,7 +113,7 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
 
 
 def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> dict[str, Any]:
-    """The summary of docs/results.md; a digest is None where there is none, or the run was cut short."""
+    """The summary of docs/results.md; a digest is None if there is none, or if the run was cut short."""
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     expected = expectations_of(scenario)
     peers: dict[str, dict[str, Any]] = {
@@ -158,19 +162,19 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
 
 
 def _figures(tally: Tally) -> dict[str, float | None]:
-    """A receiver's figures; None for what there is no theory for."""
+    """A receiver's figures; None where there is no theory."""
     return {name: None if math.isnan(value) else value for name, value in tally.figures.items()}
 
 
 def _quantiles(tally: Tally) -> dict[str, float] | None:
-    """Quantiles over trials of a trial's mean error; None of a run cut short."""
+    """Quantiles over trials of a trial's mean error; None if the run was cut short."""
     if tally.done != tally.slots:
         return None
     return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
 
 
 def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, Any] | None:
-    """The trial whose mean error lies furthest from the median, in logarithms and median deviations, of any receiver."""
+    """The trial whose mean error, for any receiver, lies furthest from the median, in logarithms and median deviations."""
     found: dict[str, Any] | None = None
     furthest = 0.0
     for name, tally in tallies.items():
@@ -203,7 +207,7 @@ def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) 
 
 
 def events_of(scenario: Scenario, done: int) -> list[dict[str, Any]]:
-    """What the scenario has happen before slot `done`, as the summary lists it."""
+    """The scenario's events before slot `done`, as the summary lists them."""
     return [{"slot": act.at, "event": act.said, "by": "scenario"} for act in scenario.timeline.acts if act.at < done]
 
 

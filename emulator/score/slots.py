@@ -1,4 +1,4 @@
-"""Truth, estimates and fates of the same slots, joined: what is scored, recorded and shown, live and in memory alike."""
+"""Truth, estimates and fates of the same slots, joined to be scored, recorded and shown, both live and in memory."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ class ReceiverSlots:
     trace: Floats
     """Sum over all trials of tr P and of its square, (c, 2)."""
     delivered: Flags
-    """What the router says it passed on, (c, R)."""
+    """Whether the router reports the packet as delivered, (c, R)."""
     lost: Mapping[str, NDArray[np.uint32]]
-    """Reason → packets the router says were lost for it, (c,)."""
+    """Reason → packets that the router reports as lost for it, (c,)."""
     late: NDArray[np.uint16] | None = None
-    """Packets of earlier slots that it took in each slot, (c, R); None of who can take none."""
+    """Packets of earlier slots that it received in each slot, (c, R); None if the receiver accepts no late packets."""
     late_used: NDArray[np.uint16] | None = None
-    """Those of them that it used, (c, R)."""
+    """The late packets that it used, (c, R)."""
     late_delivered: NDArray[np.uint16] | None = None
-    """The same as the router says, (c, R)."""
+    """The late packets delivered according to the router, (c, R)."""
     unsent: NDArray[np.uint32] | None = None
-    """Trials in which there was no packet, as the router says, (c,); None: none that it knows of."""
+    """Trials without a packet according to the router, (c,); None: none."""
 
 
 @dataclass(frozen=True)
 class InputSlots:
-    """What the controller decided, over c slots."""
+    """The controller's decisions over c slots."""
 
     u: Floats
     """As decided, (c, m, R); the plant may clip it."""
     failed: Flags
-    """Whether the decision that holds failed, so that the inputs before are held, (c, R)."""
+    """Whether the decision failed, so that the previous inputs are held, (c, R)."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ class Slots:
     """(c, R)."""
     receivers: Mapping[str, ReceiverSlots]
     sent: Flags | None = None
-    """Whether there was a packet, as the sensor says, (c, R); None: always."""
+    """Whether the sensor sent a packet, (c, R); None: always."""
     alarms: Flags | None = None
     """As in `Truth`."""
     inputs: InputSlots | None = None
     """None without a controller."""
     true: Floats | None = None
-    """The true states, (c, n, R), of a sensor that filters; None where they are x."""
+    """The true states, (c, n, R), for a sensor that filters; None where they equal x."""
 
     @property
     def count(self) -> int:
@@ -79,7 +79,7 @@ class Slots:
         return int(self.x.shape[2])
 
     def copied(self) -> Slots:
-        """The same in arrays of its own."""
+        """A copy with arrays of its own."""
         receivers = {
             name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
             for name, one in self.receivers.items()
@@ -90,7 +90,7 @@ class Slots:
 
 
 def concatenated(parts: Sequence[Slots]) -> Slots:
-    """Consecutive slots as one; the fates' reasons, which nobody asks for any more, are left out."""
+    """Consecutive slots as one, without the reasons for losses, which are not needed any more."""
 
     def column(name: str, one: str) -> NDArray[Any]:
         return np.concatenate([getattr(part.receivers[name], one) for part in parts])
@@ -108,7 +108,7 @@ def concatenated(parts: Sequence[Slots]) -> Slots:
 
 
 def all_set(flags: Flags | None, like: Flags) -> Flags:
-    """Flags that are all set where none are given."""
+    """The flags; if there are none, flags that are all set."""
     return np.ones_like(like) if flags is None else flags
 
 

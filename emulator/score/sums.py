@@ -1,9 +1,10 @@
-"""How well everybody did: sums over trials in every slot, over slots in every trial, and the summary made of them."""
+"""Sums over trials in every slot and over slots in every trial, from which the summary is made."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +15,17 @@ from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.score.watched import Watched
 
 WINDOWS = 8
-"""The slots k ≥ 1 are judged in so many windows, of equal length up to one slot."""
+"""The number of windows into which slots k ≥ 1 are divided for verdicts, of equal length up to one slot."""
 
 
+@final
 @dataclass
 class SlotSums:
-    """Sums over trials, slot by slot, (c,) each. Final."""
+    """Sums over trials, slot by slot, (c,) each."""
 
     trials: Floats
     error: Floats
-    """Squared error, or tr of the actual covariance in a study that simulates covariances alone."""
+    """Squared error, or tr of the actual covariance in a study that simulates only covariances."""
     error_squared: Floats
     trace: Floats
     """Believed tr P."""
@@ -43,7 +45,7 @@ class SlotSums:
             getattr(self, one.name)[rows] += getattr(other, one.name)
 
     def measured(self) -> SlotSums:
-        """The slots that any trial came to: all but the last ones of a run cut short."""
+        """The slots that any trial reached: in a run cut short, not the last ones."""
         rows = slice(0, int(np.count_nonzero(self.trials)))
         return SlotSums(*(getattr(self, one.name)[rows] for one in fields(self)))
 
@@ -59,7 +61,7 @@ def squared_errors(x: Floats, x_hat: Floats) -> Floats:
 def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> SlotSums:
     """The sums of some slots, from error (c, R), action (c, R), and the sums of tr P and of its square, (c, 2).
 
-    Without the latter the error is tr P itself.
+    Without sums of tr P, the error is tr P itself.
     """
     count, trials = error.shape
     errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
@@ -77,23 +79,24 @@ def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> Slot
 
 
 def window_of(k: NDArray[np.intp], slots: int) -> NDArray[np.intp]:
-    """The window each slot k ≥ 1 belongs to, of a run of `slots` slots; −1 for k = 0."""
+    """The window that contains each slot k ≥ 1 of a run of `slots` slots; −1 for k = 0."""
     return np.where(k == 0, -1, (k - 1) * WINDOWS // max(slots - 1, 1))
 
 
+@final
 @dataclass
 class Tally:
-    """One receiver's totals over a run. Final."""
+    """One receiver's totals over a run."""
 
     slots: int
-    """Of the whole run."""
+    """The number of slots of the whole run."""
     trials: int
     watched: Watched = field(default_factory=lambda: Watched((), 0))
-    """What expectations ask of the receiver."""
+    """The sums that expectations need of the receiver."""
     done: int = 0
-    """Slots that all trials have."""
+    """Slots that all trials have reached."""
     offered: int = 0
-    """Slots times trials: as many packets, but for those that were not sent."""
+    """Slots times trials, which is the number of packets, except those that were not sent."""
     unsent: int = 0
     error: float = 0.0
     trace: float = 0.0
@@ -101,19 +104,19 @@ class Tally:
     received: int = 0
     used: int = 0
     unexplained: int = 0
-    """Packets whose fate in the journal is not the receiver's."""
+    """Packets for which journal and receiver disagree."""
     late: int = 0
-    """Packets that arrived after their own slot, within the window; and those of them that were used."""
+    """Packets that arrived after their own slot, within the window; `late_used`: those of them that were used."""
     late_used: int = 0
     late_sent: int = 0
-    """Packets that the router has let through but for another slot."""
+    """Packets that the router let through, but for a later slot."""
     lost: dict[str, int] = field(default_factory=dict)
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
     bursts: NDArray[np.int64] = field(init=False)
     """As in `Account`."""
     delays: NDArray[np.int64] = field(init=False)
-    """As in `Account`; of no length before anything is counted."""
+    """As in `Account`; empty until something is counted."""
 
     def __post_init__(self) -> None:
         self.window_errors = np.zeros((WINDOWS + 1, self.trials))
@@ -121,7 +124,7 @@ class Tally:
         self.delays = np.zeros(0, np.int64)
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
-        """Take c slots: their errors (c, R), sums, and expected trace (c,)."""
+        """Add c slots: their errors (c, R), sums, and expected trace (c,)."""
         count = len(error)
         self.done += count
         self.offered += count * self.trials
@@ -143,7 +146,7 @@ class Tally:
         lost: Mapping[str, NDArray[np.uint32]],
         unsent: NDArray[np.uint32] | None = None,
     ) -> None:
-        """Hold the journal, delivered (c, R) in time, reason → lost (c,), unsent (c,), against what the receiver did, (c, R)."""
+        """Compare the journal with the receiver's action (c, R): delivered in time (c, R), reason → lost (c,), unsent (c,)."""
         self.unexplained += int(np.count_nonzero(delivered != (action != Action.LOST)))
         count = delivered.size - int(np.count_nonzero(delivered))
         for reason, counts in lost.items():
@@ -154,19 +157,19 @@ class Tally:
         self.late_sent += count - silent
 
     def account_sent(self, sent: Flags, delivered: Flags, unsent: NDArray[np.uint32] | None) -> None:
-        """Hold what the sensor says it sent, (c, R), against the journal's delivered (c, R) and unsent (c,)."""
+        """Compare the packets that the sensor reports as sent, (c, R), with the journal's delivered (c, R) and unsent (c,)."""
         silent = np.count_nonzero(~sent, axis=1)
         self.unexplained += int(np.count_nonzero(delivered & ~sent))
         self.unexplained += int(np.abs(silent - (0 if unsent is None else unsent.astype(np.int64))).sum())
 
     def account_late(self, delivered: NDArray[np.uint16], taken: NDArray[np.uint16], used: NDArray[np.uint16]) -> None:
-        """Hold the late packets that the router delivered in each slot, (c, R), against those that the receiver took."""
+        """Compare the late packets that the router delivered in each slot, (c, R), with those that the receiver took."""
         self.late += int(taken.sum())
         self.late_used += int(used.sum())
         self.unexplained += int(np.count_nonzero(delivered != taken))
 
     def count(self, account: Account) -> None:
-        """Take a link's bursts and delays."""
+        """Add a link's bursts and delays."""
         self.bursts += account.bursts
         if self.delays.size < account.delays.size:
             self.delays = np.zeros(account.delays.size, np.int64)
@@ -187,7 +190,7 @@ class Tally:
     @property
     def link(self) -> dict[str, int]:
         """The link's account: every packet offered is delivered or lost for a reason."""
-        # Of a run cut short some packets are still under way; of a whole one the router has said which.
+        # In a run cut short some packets are still under way; for a whole run the router has reported which.
         lost = sum(self.lost.values()) + max(0, self.late_sent - self.late)
         delivered = self.received + self.late
         offered = self.offered - self.unsent

@@ -1,4 +1,4 @@
-"""All that is kept of a set of trials while their slots come, live or in memory, and of which the summary is made."""
+"""Everything that is kept of a set of trials as their slots come, live or in memory, to make the summary from."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from evedrop.score.watched import Watched, watches_of
 
 @dataclass(frozen=True)
 class Totals:
-    """Of some trials; what is not of receivers is None where there is no such thing, or its mode does not follow it."""
+    """The totals of some trials. Totals that do not concern receivers are None where the run or its mode has none."""
 
     tallies: Mapping[str, Tally]
-    """By receiver."""
+    """Receiver → its tally."""
     detection: Detection | None = None
     loop: LoopTally | None = None
     filter: FilterTally | None = None
@@ -26,13 +26,13 @@ class Totals:
 
     @classmethod
     def nothing(cls, scenario: Scenario, trials: int) -> Totals:
-        """Of so many trials that come to no slot."""
+        """The totals of trials that reach no slot."""
         watches = watches_of(scenario)
         return cls({name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()})
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> Totals:
-        """Of so many trials that are about to begin, whose states are known."""
+        """Empty totals for trials that are about to begin, whose states are known."""
         return cls(
             cls.nothing(scenario, trials).tallies,
             Detection(trials),
@@ -42,7 +42,7 @@ class Totals:
 
     @classmethod
     def merged(cls, parts: Sequence[Totals]) -> Totals:
-        """Of disjoint sets of trials, in their order."""
+        """The totals of disjoint sets of trials, in their order."""
         times = SolveTimes()
         for part in parts:
             times.merge(part.solve_times)

@@ -1,4 +1,4 @@
-"""Did secrecy hold in this run, and does theory say it must? Too few trials to tell is a verdict of its own.
+"""Whether secrecy held in a run, and whether theory says that it must. Too few trials to decide is a verdict of its own.
 
 Source: docs/mathematics.md, secrecy and design; docs/results.md, verdict.
 """
@@ -17,13 +17,11 @@ from evedrop.model.process import Floats
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 
 CONFIDENCE = 0.99
-_ROUNDING = (
-    1e-12  # of errors as large as the eavesdropper's: a perfect link leaves the legitimate one with nothing else
-)
+_ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
 
 
 class Verdict(StrEnum):
-    """What a run says of a claim."""
+    """What a run shows about a claim."""
 
     HELD = "held"
     FAILED = "failed"
@@ -32,29 +30,29 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Secrecy:
-    """Secrecy against one eavesdropper: what the run shows and what theory says."""
+    """Secrecy against one eavesdropper: the result of the run and the claim of theory."""
 
     eavesdropper: str
     relative: Verdict
     perfect: Verdict
     relative_by_theory: bool | None
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where theory does not know."""
+    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where theory makes no statement."""
     relative_from: int | None
-    """First slot k ≥ 1 from which on tr E P_k < tr E Pᵉ_k to the end of the run; None if it does not hold there."""
+    """The first slot k ≥ 1 from which on tr E P_k < tr E Pᵉ_k until the end of the run; None if there is none."""
     windows: str
-    """The slots of the windows in which relative secrecy failed or stayed undecided, such as "1 to 124"; empty if in all."""
+    """The slots of the windows in which relative secrecy failed or was undecided, such as "1 to 124"; empty if all."""
     perfect_by_theory: bool | None
-    """J bounded and J_e not; None where theory does not know."""
+    """J bounded and J_e not; None where theory makes no statement."""
     ratio: float
     """Mean error, eavesdropper's over legitimate; NaN before the first slot."""
     trials: int
     judged_by: str
-    """`mean` over trials, or `median` where an error has infinite variance and a mean is no measure."""
+    """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
     unknown: str = "there is no theory for these links"
-    """What is said where theory makes no claim."""
+    """The sentence's ending where theory makes no claim."""
 
     def as_dict(self) -> dict[str, str | bool | int | None]:
-        """As in the summary."""
+        """The entries of the summary."""
         return {
             "relative": self.relative.value,
             "perfect": self.perfect.value,
@@ -108,12 +106,12 @@ def mean_bounds(samples: Floats) -> tuple[float, float]:
 
 
 def median_bounds(samples: Floats) -> tuple[float, float]:
-    """One-sided 99 % bounds below and above the median of samples (R,), by order statistics, whatever their tails."""
+    """One-sided 99 % bounds below and above the median of samples (R,), by order statistics, for any tails."""
     from scipy.special import bdtr, bdtrik  # noqa: PLC0415 - as above
 
     count = len(samples)
     ordered = np.sort(samples)
-    # The largest rank that, by the binomial law of how many samples lie below the median, is too high only once in 100.
+    # The largest rank that is too high with a probability of 1 %, by the binomial law of the number of samples below the median.
     rank = int(bdtrik(1.0 - CONFIDENCE, count, 0.5)) if bdtr(0, count, 0.5) <= 1.0 - CONFIDENCE else -1
     if rank < 0:
         return -math.inf, math.inf
@@ -121,7 +119,7 @@ def median_bounds(samples: Floats) -> tuple[float, float]:
 
 
 def _relative(difference: Floats, bounds_of: Bounds, slots: int) -> tuple[Verdict, str]:
-    """From the mean error differences of each window and trial, (WINDOWS, R): the verdict, and the slots it is due to."""
+    """The verdict from the mean error differences of each window and trial, (WINDOWS, R), and the slots that decide it."""
     bounds = {w: bounds_of(row) for w, row in enumerate(difference) if not np.isnan(row).any()}
     failed = [window for window, (_, high) in bounds.items() if high < 0.0]
     doubtful = [window for window, (low, _) in bounds.items() if not low > 0.0]
@@ -140,7 +138,7 @@ def _slots_of(windows: list[int], slots: int) -> str:
 
 
 def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: Bounds) -> Verdict:
-    """Grows from the first to the last quarter, while the legitimate error stays within its bound."""
+    """Held if the error grows from the first to the last quarter while the legitimate error stays within its bound."""
     quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
         return Verdict.UNDECIDED
@@ -154,13 +152,13 @@ def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: 
 def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
     """The verdict on one eavesdropper, from both tallies and what theory expects of both receivers."""
     (user, user_theory), (name, other, other_theory) = legitimate, eavesdropper
-    # A bound from below can make a promise, and can deny none.
+    # A lower bound can support a promise, but cannot deny one.
     bounded = other_theory.bound is not None
     theirs = other_theory.bound or other_theory
     known = user_theory.known and theirs.known
     user_bound = user_theory.limit if user_theory.known else math.inf
     perfect_by_theory = (math.isfinite(user_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
-    # A limit too large to be worked out promises nothing, and denies nothing.
+    # A limit too large to be computed neither promises nor denies anything.
     perfect_by_theory = perfect_by_theory if known and not math.isnan(user_bound + theirs.limit) else None
     complete = user.done == user.slots
     slots = user.slots if complete else max(user.done, 2)
@@ -193,7 +191,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
 
 
 def _holds_from(gap: Floats) -> int | None:
-    """First slot k ≥ 1 from which on the gap (slots,) is positive to its end."""
+    """The first slot k ≥ 1 from which on the gap (slots,) is positive until its end."""
     wrong = np.flatnonzero(~(gap[1:] > 0.0)) + 1
     first = int(wrong[-1]) + 1 if wrong.size else 1
     return first if first < len(gap) else None

@@ -1,4 +1,4 @@
-"""Which figures of a live run were verified, and which rest on a receiver's own word.
+"""Which figures of a live run were verified, and which rest on a receiver's own report.
 
 Source: docs/results.md, what is verified.
 """
@@ -13,9 +13,9 @@ from evedrop.scenario import Scenario
 
 
 def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Any]:
-    """The entry `verification` of a live run's summary: receiver → what was verified, and what rests on its own word.
+    """The entry `verification` of a live run's summary: receiver → the verified figures, and those that it only reported.
 
-    accused: processes that the run has ended with because of what they said.
+    accused: processes whose reports made the run end.
     """
     recorded = _recorded_of(scenario)
     checked, of_recorded = ["mean_squared_error", "received_fraction"], ["mean_trace_covariance", "digest"]
@@ -32,6 +32,6 @@ def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[s
 
 
 def _recorded_of(scenario: Scenario) -> int:
-    """How many trials are recorded; each shard records its first at least."""
+    """The number of recorded trials; each shard records at least its first."""
     bounds = [scenario.trials * i // scenario.shards for i in range(scenario.shards + 1)]
     return sum(max(1, min(scenario.record_trials, stop) - start) for start, stop in pairwise(bounds))

@@ -1,13 +1,13 @@
-"""What expectations ask of a receiver beyond its totals: sums over some slots, and when it was in step, trial by trial.
+"""What expectations need of a receiver besides its totals: sums over some slots, and when it was in step, trial by trial.
 
-Memory: a number for each trial and expectation. A trial's numbers are added up slot by slot, so they are the same bits
-however its slots and the other trials were cut into parts, live and in memory.
+Memory: a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
+however its slots and the other trials were divided, live and in memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ Late = Sequence[NDArray[np.uint16]] | NDArray[np.uint16]
 
 
 class WatchedSlots(NamedTuple):
-    """What to keep of which slots, from first to before end."""
+    """A quantity to keep, and its slots from first to before end."""
 
     what: str
     """A figure, or `in_step`."""
@@ -34,7 +34,7 @@ class WatchedSlots(NamedTuple):
 
 
 def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
-    """Receiver, and what an expectation needs kept of it; None where the summary's figures, or theory, will do."""
+    """Receiver and the quantity an expectation needs; None where the summary's figures or theory are enough."""
     if expect.in_step is not None:
         return expect.in_step, WatchedSlots(IN_STEP, _since(scenario, expect), scenario.slots)
     if expect.figure is None or (expect.slots is None and expect.quantile is None):
@@ -45,7 +45,7 @@ def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots
 
 
 def _since(scenario: Scenario, expect: ExpectTable) -> int:
-    """From where on a receiver must come into step: as said, or since the last event before that is over for it."""
+    """The slot from which a receiver must come into step: as given, or that of the last event on it up to slot `by`."""
     if expect.since is not None:
         return expect.since
     by = scenario.slots if expect.by is None else expect.by
@@ -54,26 +54,27 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
 
 
 def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
-    """Receiver → all that the scenario's expectations need kept of it."""
+    """Receiver → everything that the scenario's expectations need of it."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
     return {name: tuple(dict.fromkeys(watch for one, watch in wanted if one == name)) for name in scenario.receivers}
 
 
+@final
 class Watched:
-    """What was kept of R trials. Final."""
+    """The sums kept of R trials."""
 
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
         self._trials = trials
-        # Of the believed trace no trial's own is known in a live run: its entry is the sum over all trials.
+        # A live run does not know the believed trace of each trial: its entry is the sum over all trials.
         self._kept = {
             watch: np.zeros(1) if watch.what == _TRACE else np.full(trials, _NEVER if watch.what == IN_STEP else 0.0)
             for watch in watches
         }
 
     def add(self, first: int, error: Floats, action: Codes, traces: Floats, late: Late | None = None) -> None:
-        """Take c slots from `first` on: error and action (c, R), and the sum over trials of tr P, (c,).
+        """Add c slots from `first` on: error and action (c, R), and the sum over trials of tr P, (c,).
 
-        late: packets of earlier slots that arrived, and that were used, (c, R) each, of who can make use of them.
+        late: packets of earlier slots that arrived, and that were used, (c, R) each, for receivers that accept them.
         """
         for watch, kept in self._kept.items():
             rows = slice(max(watch.first - first, 0), min(watch.end - first, len(error)))
@@ -89,11 +90,11 @@ class Watched:
                     np.add(kept, late[_LATE[watch.what]][rows].sum(axis=0), out=kept)
 
     def means(self, watch: WatchedSlots) -> Floats:
-        """A figure's mean over the slots, of each trial, (R,)."""
+        """The mean of a figure over the slots, for each trial, (R,)."""
         return self._kept[watch] / (watch.end - watch.first)
 
     def mean(self, watch: WatchedSlots) -> float:
-        """A figure's mean over the slots and trials."""
+        """The mean of a figure over the slots and trials."""
         return float(self.means(watch).sum()) / self._trials
 
     def quantile(self, watch: WatchedSlots, level: float) -> float:
@@ -101,13 +102,13 @@ class Watched:
         return float(np.quantile(self.means(watch), level))
 
     def in_step(self, watch: WatchedSlots) -> int | None:
-        """The largest over trials of the first slot in which a packet was used as the state; None if a trial has none."""
+        """The largest over trials of the first slot in which a packet was used as the state; None if a trial has no such slot."""
         kept = self._kept[watch]
         return None if (kept == _NEVER).any() else int(kept.max())
 
     @classmethod
     def of(cls, parts: Sequence[Watched]) -> Watched:
-        """One of disjoint sets of trials, in their order."""
+        """The sums of disjoint sets of trials, in their order."""
         total = cls((), sum(part._trials for part in parts))
         for watch in parts[0]._kept:
             kept = [part._kept[watch] for part in parts]
@@ -116,7 +117,7 @@ class Watched:
 
 
 def _add(kept: Floats, figure: str, error: Floats, action: Codes, traces: Floats) -> None:
-    """Add some slots of a figure to what was kept of it."""
+    """Add some slots of a figure to its sums."""
     match figure:
         case "mean_squared_error":
             for row in error:

@@ -1,1 +1,1 @@
-"""Everything that is looked at: the recording, its layout, and figures. Only here are rerun and matplotlib used."""
+"""Recordings, their layout, and figures. Only this package uses rerun and matplotlib."""

@@ -11,7 +11,7 @@ from evedrop.view.scene import Scene
 
 _WINDOW = 105  # slots; with a slot below four pixels, Rerun merges it with its neighbours to grey
 _LANES_OF_A_SCREEN = 23.0  # lanes that would fill the usual window from top to bottom
-_ROOM = 25  # slots right of the present, kept free for the legend
+_ROOM = 25  # slots to the right of the present, kept free for the legend
 _TRAIL = 30
 _TRUTH_TRAIL = 130
 
@@ -36,7 +36,7 @@ def layout(scene: Scene) -> rrb.Blueprint:
 
 
 def _driven(scene: Scene) -> rrb.Container:
-    """Of a closed loop: plant and levels on the left, over the whole run; network and events on the right."""
+    """The panels of a closed loop: plant and levels on the left, over the whole run; network and events on the right."""
     whole = rrb.TimeAxis(
         view_range=rrb.TimeRange(
             start=rrb.TimeRangeBoundary.absolute(seq=0), end=rrb.TimeRangeBoundary.absolute(seq=scene.slots)
@@ -68,7 +68,7 @@ def _blueprint(root: rrb.Container) -> rrb.Blueprint:
 
 
 def _left_shares(scene: Scene) -> list[float]:
-    """Heights on the left: as much as the lanes need, at most half; the rest to the curves, in equal parts."""
+    """Heights on the left: the lanes get what they need, at most half; the curves share the rest equally."""
     lanes_share = min(0.5, (2.0 + len(scene.receivers) + 1) / _LANES_OF_A_SCREEN)
     return [0.5 - lanes_share / 2, 0.5 - lanes_share / 2, lanes_share]
 
@@ -113,7 +113,7 @@ def _plane(scene: Scene) -> rrb.View:
 
 
 def _past(scene: Scene, slots: int) -> rrb.VisibleTimeRanges:
-    # A trail's piece is logged at its end, so the oldest that is shown begins a frame earlier.
+    # A trail's piece is logged at its end, so the oldest piece shown begins a frame earlier.
     reach = max(slots, 4 * plane.stride(scene))
     return rrb.VisibleTimeRanges(
         [

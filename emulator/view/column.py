@@ -1,4 +1,4 @@
-"""Values of one entity over some slots, as Rerun takes them."""
+"""Values of one entity over some slots, in Rerun's form."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Column:
     values: rr.ComponentColumnList
 
     def send(self, to: rr.RecordingStream) -> None:
-        """Put it into a recording."""
+        """Add it to a recording."""
         to.send_columns(self.path, indexes=[rr.TimeColumn(paths.TIMELINE, sequence=self.slots)], columns=self.values)
 
 

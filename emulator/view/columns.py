@@ -1,8 +1,9 @@
-"""SceneSlots as columns of the recording: what each panel is made of, and in which style."""
+"""Slots as columns of the recording: the data of each panel, and its style."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import final
 
 import numpy as np
 import rerun as rr
@@ -18,10 +19,11 @@ from evedrop.view.palette import GROUND, TRUTH, TRUTH_CURVE, colour, dim
 from evedrop.view.scene import PeerSlots, Scene, SceneSlots
 
 
+@final
 class Columns:
     """Turns the slots of a run, in order, into columns.
 
-    Final. Scalars and lanes are kept in full, the plane at its frames.
+    Scalars and lanes are complete; the plane has only its frames.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -67,7 +69,7 @@ class Columns:
                 yield scalars(paths.curve(kind, name), k[known], self._log10(values[known]))
 
     def _log10(self, values: Floats) -> Floats:
-        """log10 with everything below the floor on it: a state that was received is known exactly."""
+        """log10, with everything below the floor raised to it: a state that was received is known exactly."""
         with np.errstate(invalid="ignore"):
             logarithms: Floats = np.log10(np.maximum(values, self._floor))
         return logarithms
@@ -130,7 +132,7 @@ _LARGEST = rr.components.AggregationPolicy.Max
 
 
 def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
-    """Names and colours of everything, once."""
+    """Log names and colours of everything, once."""
     driven.log_styles(to, scene)
     _log_lane_style(to, paths.lane(scene, -1), lanes.SENT)
     for i, shown in enumerate(scene.receivers):
@@ -167,7 +169,7 @@ def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
         )
     else:
         _log_moving_style(to, paths.TRUTH, TRUTH, radius=3.5, order=40.0)
-        # Not to be seen: it is there for the panel to fit to.
+        # Invisible: it is there for the panel to fit to.
         to.log(paths.FRAME, rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1)), static=True)
 
 
@@ -199,6 +201,6 @@ def _log_lane_style(to: rr.RecordingStream, path: str, lane: Lane) -> None:
 
 
 def _floor(scene: Scene) -> float:
-    """Smallest value a curve shows: a decade below one step's noise, two below it for a mean of trials with and without."""
+    """Smallest value of a curve: a decade below one step's noise, or two for a mean over trials with and without errors."""
     decades = 1 if scene.trials == 1 else 2
     return float(10.0 ** (np.floor(np.log10(scene.noise)) - decades))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from evedrop.studies.compare import Cell, Comparison, SchemeResult
 
-# Blue for what is kept and orange for what is not, the deeper the surer: apart for every kind of colour-blindness, and in grey.
+# Blue for secrecy kept and orange for secrecy broken, darker where more certain: distinct with any colour-blindness, and in grey.
 _GROUND = {
     SecrecyKept.PERFECT: "#1f6fb2",
     SecrecyKept.RELATIVE: "#a9cdea",
@@ -34,7 +34,7 @@ _SAID = {
     SecrecyKept.UNDECIDED: "too few trials to tell",
     SecrecyKept.BROKEN: "broken",
 }
-_NOTABLE = 1.1  # times: the share by which an attack must raise the user's error to be noted
+_NOTABLE = 1.1  # the factor by which an attack must raise the user's error to be noted
 _FACTS = ("legitimate\nerror", "ACKs", "bits a\npacket", "secret bits\na slot (+ once)")
 _FACT_WIDTH = 1.25
 _LEAST_WIDTH = 9.0
@@ -74,7 +74,7 @@ def _facts(one: SchemeResult) -> Iterator[str]:
 
 
 def _cell(axes: Axes, column: int, row: int, one: SchemeResult, cell: Cell) -> None:
-    from matplotlib.patches import Rectangle  # noqa: PLC0415 - slow to import, and needed by this picture alone
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - slow to import, and needed only for this picture
 
     box: Any = {"xy": (column + 0.03, row - 0.47), "width": 0.94, "height": 0.94, "linewidth": 0}
     word = cell.verdict

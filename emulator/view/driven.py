@@ -1,4 +1,4 @@
-"""A plant with a controller in the view: what moves it, its levels and what everybody takes them for, a house's energies.
+"""A plant with a controller in the view: inputs and disturbances, true and estimated levels, and a house's energies.
 
 Source: docs/view.md.
 """
@@ -20,7 +20,7 @@ from evedrop.view.column import Column, scalars
 from evedrop.view.palette import TRUTH_CURVE, Colour, colour
 from evedrop.view.scene import Moved, Scene, SceneSlots
 
-_MOST_POINTS = 20_000  # of a curve over a run: a day of seconds is drawn every five seconds
+_MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
 _MOVING: tuple[Colour, ...] = (
     (226, 178, 40),  # the first disturbance, of a house the sun
     (222, 92, 82),
@@ -55,7 +55,7 @@ def columns(scene: Scene, k: NDArray[np.int64], slots: SceneSlots, moved: Moved)
 
 
 def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
-    """Names and colours, once."""
+    """Log names and colours, once."""
     if not scene.moving:
         return
     for i, label in enumerate(scene.moving):
@@ -69,13 +69,13 @@ def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
         _line(to, f"{paths.ENERGY}/sold", "sold", SOLD, 1.8)
         _line(to, f"{paths.GUESSES}/{paths.TRUTH}", "truth", TRUTH_CURVE, 1.4, steps=True)
         for j, shown in enumerate(scene.receivers):
-            # Points: a guess that jumps about is a cloud, and hides no other.
+            # Points: a guess that jumps appears as a cloud, and hides no other.
             style = rr.SeriesPoints(names=shown.name, colors=colour(j), markers="circle", marker_sizes=1.6)
             to.log(f"{paths.GUESSES}/{shown.name}", style, static=True)
 
 
 def panels(scene: Scene, axis: rrb.TimeAxis) -> list[rrb.View]:
-    """What moves the plant, a panel for each of the first two levels, and of a house what is bought and sold."""
+    """The inputs and disturbances, a panel for each of the first two levels, and for a house the energy bought and sold."""
     found: list[rrb.View] = [_panel("What moves the plant: " + ", ".join(scene.moving), paths.MOVING, axis)]
     for i in range(min(scene.n, 2)):
         label = scene.states[i] if scene.states else f"state {i}"
@@ -87,7 +87,7 @@ def panels(scene: Scene, axis: rrb.TimeAxis) -> list[rrb.View]:
 
 
 def guessed(scene: Scene, axis: rrb.TimeAxis) -> list[rrb.View]:
-    """Of a house, the load and what everybody takes it for."""
+    """For a house, the load and every receiver's guess of it."""
     if scene.house is None:
         return []
     title = f"{scene.house.load}, and what each would guess from its estimate"

@@ -1,12 +1,12 @@
-"""Which moments of a run deserve a line. No Rerun in here.
+"""Chooses the moments of a run that deserve a line. Does not use Rerun.
 
-What happens all the time is in the lanes; a line is for a stretch without usable packets that is long for this receiver.
-How long is long adapts, so that a run of any length gets at most some hundreds of lines.
+Frequent events are visible in the lanes; a line reports a stretch without usable packets that is long for this receiver.
+The threshold adapts, so that a run of any length gets at most some hundreds of lines.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.view.lanes import MISLED, SILENT
 from evedrop.view.scene import Scene, Shown
 
-_SHORTEST = 3  # packets in a row; fewer missed ones are everyday life
-_LINES = 200  # about how many stretches a receiver may have reported in a whole run
-_SLOTS_PER_LINE = 100  # at the least, so that the lines of a run in real time can be read
+_SHORTEST = 3  # packets in a row; missing fewer is normal
+_LINES = 200  # the approximate number of stretches that a receiver may report in a whole run
+_SLOTS_PER_LINE = 100  # at least, so that the lines of a run in real time can be read
 
 
 class Event(NamedTuple):
@@ -29,7 +29,7 @@ class Event(NamedTuple):
 
 
 def introduction(scene: Scene) -> list[Event]:
-    """What the run is about, and who takes part."""
+    """The subject of the run, and its receivers."""
     trials = "" if scene.trials == 1 else f"; curves: mean of {scene.trials} trials"
     about = [Event(0, "INFO", f"{scene.title}{trials}")]
     for shown in scene.receivers:
@@ -38,12 +38,12 @@ def introduction(scene: Scene) -> list[Event]:
     return about
 
 
+@final
 class Watcher:
     """Finds the events of one receiver, chunk by chunk, in its lane's codes.
 
-    Final. A good slot gives the receiver the state's worth: for the legitimate estimator any packet, for an
-    eavesdropper the state used as such. What is reported are stretches without a good slot: when one has become long,
-    and when it ends.
+    A good slot tells the receiver as much as the state: for the legitimate estimator any packet, for an eavesdropper a state
+    that it used as such. A stretch without a good slot is reported when it has become long, and when it ends.
     """
 
     def __init__(self, shown: Shown, scene: Scene) -> None:
@@ -53,8 +53,8 @@ class Watcher:
         self._long = _SHORTEST
         self._reported = 0
         self._bad = 0  # length so far of the stretch that the next chunk may continue
-        self._misled = 0  # of these, how many slots misled
-        self._silent = 0  # and in how many nothing was sent
+        self._misled = 0  # how many of these slots misled the receiver
+        self._silent = 0  # how many of them had no packet
         self._told = False  # whether this stretch was reported
         self._ever_misled = False
 
@@ -77,10 +77,10 @@ class Watcher:
         return sorted(events, key=lambda event: event.k)
 
     def _extend(self, first: int, some: slice, misled: Flags, silent: Flags, events: list[Event]) -> None:
-        """Lengthen the current stretch by some slots of the chunk."""
+        """Extend the current stretch by some slots of the chunk."""
         length = self._bad + some.stop - some.start
         if not self._told and length >= self._long:
-            turn = some.start + self._long - self._bad  # one past the slot that made it long
+            turn = some.start + self._long - self._bad  # the slot after the one that made it long
             fooled = self._misled + int(np.count_nonzero(misled[some.start : turn]))
             unsent = self._silent + int(np.count_nonzero(silent[some.start : turn]))
             events.append(Event(first + turn - 1, "WARN", self._lost(fooled, unsent)))

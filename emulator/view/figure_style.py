@@ -1,4 +1,4 @@
-"""How every figure looks, and how it is saved: one raster for reading, one vector for printing."""
+"""The style of all figures, and how they are saved: as a raster image and as a vector image."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ _STYLE: Any = {
 def panels(path: Path, columns: int, width: float, height: float) -> Iterator[list[Axes]]:
     """Axes to draw on, side by side; width and height in inches. Saved as `path`.png and `path`.pdf at the end.
 
-    No windowing toolkit is touched and no global state is left changed.
+    Uses no windowing toolkit, and leaves no global state changed.
     """
-    import matplotlib as mpl  # noqa: PLC0415 - slow to import, and needed by this command alone
+    import matplotlib as mpl  # noqa: PLC0415 - slow to import, and needed only for figures
     from matplotlib.figure import Figure  # noqa: PLC0415 - as above
 
     with mpl.rc_context(_STYLE):

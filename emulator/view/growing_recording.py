@@ -1,7 +1,7 @@
-"""A recording that is still being written, handed on to a viewer as it grows: through a pipe, or by HTTP to a browser.
+"""A recording that is still being written, passed on to a viewer as it grows: through a pipe, or by HTTP to a browser.
 
-Only who has the address of a recording gets it: there is a secret in it. Nothing here can hold up a run: the run writes a
-file, and what reads it are threads of their own, each of which may wait for its viewer for ever.
+Only a reader that knows the address of a recording gets it: the address contains a secret. Nothing here can delay a run: the
+run writes a file, and threads of their own read it, each of which may wait for its viewer indefinitely.
 """
 
 from __future__ import annotations
@@ -15,21 +15,22 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, final
 
 from evedrop.errors import UsageError
 
-_LOOK_SECONDS = 0.05  # how soon it is noticed that there is more
-_REQUEST_SECONDS = 10.0  # for a browser to say what it wants
-_MOST_READERS = 32  # at a time; another user who opens more is turned away, and so is everybody else meanwhile
+_LOOK_SECONDS = 0.05  # between checks whether the file has grown
+_REQUEST_SECONDS = 10.0  # for a browser to send its request
+_MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
 _PIECE = 2**18
 
 
+@final
 class Followed:
-    """A file that grows, from its beginning on; there may be none yet, and it may be moved. Final."""
+    """A file that grows, read from its beginning; it may not exist yet, and it may be moved."""
 
     def __init__(self, path: Path, complete: bool = False) -> None:
-        """complete: whether nothing is added any more."""
+        """complete: whether the file will not grow."""
         self._path = path
         self._file: int | None = None
         self._lock = threading.Lock()
@@ -38,16 +39,16 @@ class Followed:
             self._over.set()
 
     def complete(self) -> None:
-        """All that will be in the file is in it: pieces end with its end."""
+        """Declare the file complete: `pieces` ends with its end."""
         with contextlib.suppress(OSError):
             self._opened()
         self._over.set()
 
     def pieces(self) -> Iterator[bytes]:
-        """What is in the file and will be, as it comes."""
+        """The contents of the file, as they come."""
         at = 0
         while True:
-            over = self._over.is_set()  # asked first: what comes between the read and the question would be lost
+            over = self._over.is_set()  # asked before reading, so that no piece written in between is lost
             piece = self._read(at)
             if piece:
                 at += len(piece)
@@ -71,7 +72,7 @@ class Followed:
 
 
 def feed(followed: Followed, pipe: IO[bytes]) -> None:
-    """Write a recording into a pipe, on a thread of its own, until its end or that of who reads the pipe."""
+    """Write a recording into a pipe, on a thread of its own, until the recording ends or the pipe's reader does."""
 
     def write() -> None:
         with contextlib.suppress(OSError), pipe:
@@ -81,10 +82,11 @@ def feed(followed: Followed, pipe: IO[bytes]) -> None:
     threading.Thread(target=write, name="view", daemon=True).start()
 
 
+@final
 class Served:
-    """A recording at an address that cannot be guessed. Final.
+    """A recording at an address that cannot be guessed.
 
-    Raises UsageError if the port cannot be had.
+    Raises UsageError if the port is not available.
     """
 
     def __init__(self, followed: Followed, host: str, port: int) -> None:
@@ -97,7 +99,7 @@ class Served:
         threading.Thread(target=self._server.serve_forever, args=(_LOOK_SECONDS,), name="view", daemon=True).start()
 
     def stop(self) -> None:
-        """Take no more readers. Those under way are left to themselves."""
+        """Accept no more readers. Those in progress continue by themselves."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -113,21 +115,21 @@ class _Server(ThreadingHTTPServer):
         super().__init__((host, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """On a thread, if there is a place left."""
+        """Serve on a thread, if there is a free place."""
         if self._places.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """One reader."""
+        """Serve one reader."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader that left, or never said what it wants, is no event."""
+        """Ignore readers that leave or never send a request."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -136,14 +138,14 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Server
 
     def do_GET(self) -> None:
-        """The recording, for who knows its address."""
+        """Send the recording to a reader that knows its address."""
         self.close_connection = True
         if not hmac.compare_digest(self.path.encode(), self.server.path):
             self.send_response(404)
             self.send_header("Content-Length", "0")
             self.end_headers()
             return
-        self.connection.settimeout(None)  # a browser whose user has paused it may wait as long as it likes
+        self.connection.settimeout(None)  # a browser whose user has paused it may wait indefinitely
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self.send_response(200)
         self.send_header("Content-Type", "application/octet-stream")
@@ -156,8 +158,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(b"0\r\n\r\n")
 
     def log_message(self, *_: Any) -> None:
-        """Nothing: the address is a secret."""
+        """Log nothing, because the address is a secret."""
 
     def version_string(self) -> str:
-        """What it is, and not of which version."""
+        """The program's name without its version."""
         return "evedrop"

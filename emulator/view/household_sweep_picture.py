@@ -1,4 +1,4 @@
-"""The plot of a sweep over a house: what is bought and sold, what perfect knowledge would change, and who can tell what."""
+"""The plot of a sweep over a house: energy bought and sold, the effect of perfect knowledge, and what receivers can infer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _COLOURS = (BLUE, RED, ORANGE, GREEN, GREY)
 _MARKS = "osD^v"
-_LIMIT = 1.58  # per cent, which the paper says its grid power keeps below
+_LIMIT = 1.58  # per cent, the paper's bound on the difference of its grid power
 
 
 def draw(path: Path, table: pa.Table, key: str) -> None:
-    """Draw `path`.png and `path`.pdf against the values of one entry; of the other entries, only the first values are shown."""
+    """Draw `path`.png and `path`.pdf against the values of one entry; for other entries, only the first values are shown."""
     rows = _of_one_line(table.to_pylist(), key)
     peers = list(dict.fromkeys(row["peer"] for row in rows))
     mine = {peer: [row for row in rows if row["peer"] == peer] for peer in peers}
@@ -52,7 +52,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
 
 
 def _of_one_line(rows: list[dict[str, Any]], key: str) -> list[dict[str, Any]]:
-    """The rows of one peer after the other that differ in the entry, and the first of those that differ in others alone."""
+    """The rows of each peer that differ in the entry, without repetitions that differ only in others."""
     first: dict[tuple[Any, Any], dict[str, Any]] = {}
     for row in rows:
         first.setdefault((row[key], row["peer"]), row)

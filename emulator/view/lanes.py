@@ -1,4 +1,4 @@
-"""What became of each packet, as the coloured lanes show it. No Rerun in here."""
+"""The outcome of each packet, as the coloured lanes show it. Does not use Rerun."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Lane:
-    """What can happen in a lane; the index of a word is its code."""
+    """The words of a lane; a word's index is its code."""
 
     words: tuple[str, ...]
     colours: tuple[Colour, ...]
@@ -36,11 +36,11 @@ EAVESDROPPER = Lane((*LEGITIMATE.words, "misled"), (*LEGITIMATE.colours, AMBER))
 SILENT = 4
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
 MISLED = 5
-"""Code of the one thing an eavesdropper does not know itself."""
+"""Code of the only outcome that an eavesdropper does not know itself."""
 
 
 def sent(nu: Flags, any_packet: Flags | None) -> Codes:
-    """Codes of the lane of what was sent, (c,), from ν (c,) and whether there was a packet, (c,); None: always."""
+    """Codes of the sensor's lane, (c,), from ν (c,) and whether there was a packet, (c,); None: always."""
     types = nu.astype(np.uint8)
     return types if any_packet is None else np.where(any_packet, types, np.uint8(SENT.words.index("silent")))
 
@@ -48,7 +48,7 @@ def sent(nu: Flags, any_packet: Flags | None) -> Codes:
 def received(action: Codes, nu: Flags, any_packet: Flags | None) -> Codes:
     """Codes of a receiver's lane, (c,), from its actions (c,), ν (c,) and whether there was a packet, (c,); None: always.
 
-    They are the actions, but for silence, and for an innovation taken for the state: that one misled.
+    They are the actions, except for silence, and for an innovation taken for the state, which misled.
     """
     misled = nu & (action == Action.STATE)
     codes: Codes = np.where(misled, np.uint8(MISLED), action)

@@ -1,15 +1,15 @@
-"""Colours of the view, told apart by the colour-blind, on dark and on light grounds alike: no white or black series."""
+"""Colours of the view, distinct for the colour-blind and on dark and light grounds alike: no white or black series."""
 
 from __future__ import annotations
 
 Colour = tuple[int, int, int]
 
 GROUND: Colour = (16, 18, 22)
-"""Behind the state plane, which is dark in either theme."""
+"""The ground of the state plane, which is dark in both themes."""
 TRUTH: Colour = (226, 228, 234)
-"""Only ever drawn on `GROUND`."""
+"""Used only on `GROUND`."""
 TRUTH_CURVE: Colour = (138, 144, 156)
-"""Where the ground is the theme's."""
+"""Used where the ground is the theme's."""
 
 _RECEIVERS: tuple[Colour, ...] = (
     (45, 190, 165),  # teal
@@ -23,7 +23,7 @@ _RECEIVERS: tuple[Colour, ...] = (
 
 
 def colour(i: int) -> Colour:
-    """Colour of the i-th receiver; the legitimate one is 0. Repeats after seven."""
+    """Colour of the i-th receiver; the legitimate estimator is 0. Repeats after seven."""
     return _RECEIVERS[i % len(_RECEIVERS)]
 
 

@@ -1,4 +1,4 @@
-"""Where each thing is in the recording. Entity names are what the panels show, so they are short."""
+"""The place of each entity in the recording. The panels show entity names, so these are short."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GUESSES = "guesses"
 
 
 def lane(scene: Scene, i: int) -> str:
-    """Lane of the i-th receiver; of what was sent for i = −1. Lanes are sorted by path, hence the number."""
+    """Lane of the i-th receiver, or of the sensor for i = −1. Lanes are sorted by path, hence the number."""
     digits = len(str(len(scene.receivers)))
     name = "sent" if i < 0 else scene.receivers[i].name
     return f"{PACKETS}/{i + 1:0{digits}d}_{name}"
@@ -34,17 +34,17 @@ def curve(kind: str, name: str) -> str:
 
 
 def trail(name: str) -> str:
-    """Where it was."""
+    """The path of a receiver's past estimates."""
     return f"{PLANE}/{name}/trail"
 
 
 def ellipse(name: str) -> str:
-    """How far from there it believes the state may be."""
+    """The path of the ellipse of a receiver's belief."""
     return f"{PLANE}/{name}/cov"
 
 
 def point(name: str) -> str:
-    """Where it is."""
+    """The path of a receiver's current estimate."""
     return f"{PLANE}/{name}/at"
 
 

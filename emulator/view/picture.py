@@ -1,6 +1,6 @@
-"""A picture of a finished recording, taken without a screen.
+"""Takes a picture of a finished recording without a screen.
 
-Needs a Vulkan driver; software will do, such as Debian's mesa-vulkan-drivers.
+Needs a Vulkan driver; a software driver is enough, such as Debian's mesa-vulkan-drivers.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SETTLE_SECONDS = 30.0
 
 
 def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int | None = None) -> list[str]:
-    """Draw a moment of a recording, by default its last, into a PNG file; what the panels complain about, if anything.
+    """Draw a moment of a recording, by default its last, to a PNG file; returns the panels' complaints.
 
     Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written.
     """
@@ -41,9 +41,9 @@ def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int
 
 
 def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
-    """The same by a process of its own, in a network of its own where the system allows that.
+    """The same in a process of its own, with a network of its own if the system allows that.
 
-    A viewer without a screen draws for whoever finds its port.
+    Anybody who finds the port of a viewer without a screen can let it draw.
     """
     command = [
         sys.executable,
@@ -63,11 +63,11 @@ def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
 
 
 def main(words: Sequence[str]) -> int:
-    """Draw what `picture_apart` asks for; the exit status."""
+    """Draw what `picture_apart` asks for; returns the exit status."""
     rrd, png, *slot = words
     try:
         for complaint in picture(Path(rrd), Path(png), slot=int(slot[0]) if slot else None):
-            print(complaint)  # noqa: T201 - whoever has started us reads it
+            print(complaint)  # noqa: T201 - read by the process that started this one
     except UsageError as error:
         print(error, file=sys.stderr)  # noqa: T201 - the same
         return error.exit_status
@@ -75,20 +75,20 @@ def main(words: Sequence[str]) -> int:
 
 
 def reports(viewer: ViewerClient) -> list[str]:
-    """What the panels complain about: "panel: complaint"."""
+    """The panels' complaints: "panel: complaint"."""
     return [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
 
 
 def check(rrd: Path) -> None:
-    """Read a recording to its end. Raises UsageError if it is none, or broken.
+    """Read a recording to its end. Raises UsageError if it is not a recording, or broken.
 
-    The viewer itself would say nothing, and show nothing.
+    The viewer itself would report nothing, and show nothing.
     """
     if not rrd.is_file():
         raise UsageError(f"{rrd} does not exist; give the recording.rrd of a results folder")
     try:
         with warnings.catch_warnings():
-            # A recording that was cut short between two messages is shown as far as it goes.
+            # A recording that was cut short between two messages is shown up to that point.
             warnings.simplefilter("ignore")
             for _ in RrdReader(rrd).stream():
                 pass
@@ -110,7 +110,7 @@ def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterato
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder)
         try:
-            # The viewer would announce in the picture that it draws without a graphics card.
+            # The viewer would write into the picture that it draws without a graphics card.
             process = spawn(port, arguments, logs, environment={"RUST_LOG": "error"})
         except UsageError as error:
             raise UsageError(_without_driver(str(error)) or str(error)) from error
@@ -142,7 +142,7 @@ def _show(viewer: ViewerClient, slot: int | None) -> None:
 
 
 def _last_slot(viewer: ViewerClient) -> int | None:
-    """The recording's last slot, once it and its layout are there."""
+    """The recording's last slot, once recording and layout are loaded."""
     state = viewer.get_state()
     if state.loading or not state.views:
         return None

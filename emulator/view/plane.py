@@ -1,13 +1,13 @@
-"""The state plane as arrays: points, trails and ellipses at the frames of the view. No Rerun in here.
+"""The state plane as arrays: points, trails and ellipses at the frames of the view. Does not use Rerun.
 
-A run of any length gets a bounded number of frames. Trails lose nothing by it: between two frames every slot is drawn.
+A run of any length gets a bounded number of frames. Trails are complete all the same: between two frames every slot is drawn.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ Points = NDArray[np.float32]
 
 _FRAMES_PER_SECOND = 30.0
 _MOST_FRAMES = 4_000
-_MOST_FRAMES_IN_REAL_TIME = 30_000  # still five a second over more than an hour
+_MOST_FRAMES_IN_REAL_TIME = 30_000  # five a second for more than an hour
 _LARGEST = 1e30  # Rerun's points are float32
 _FRAMED_SLOTS = 256
 _SIGMAS = 2.0
@@ -34,7 +34,7 @@ def stride(scene: Scene) -> int:
 
 
 def frames(scene: Scene, first: int, count: int) -> NDArray[np.intp]:
-    """Which of `count` slots from `first` on are frames, as offsets; the run's last slot always is."""
+    """The slots among `count` from `first` on that are frames, as offsets; the run's last slot always is."""
     every = stride(scene)
     offsets = np.arange(-first % every, count, every)
     if first + count == scene.slots and (first + count - 1) % every:
@@ -50,7 +50,7 @@ def on_plane(states: Floats) -> Points:
 def ellipses(centres: Floats, P: Floats) -> Points:
     """2σ ellipses of P (c, n, n) around states (c, n) as closed lines, (c, 41, 2).
 
-    A circle mapped by the Cholesky factor, written out so that a covariance of 0 is a point and not an error.
+    A circle mapped by the Cholesky factor, written out so that a covariance of 0 gives a point and not an error.
     """
     angle = np.linspace(0.0, 2.0 * math.pi, _CORNERS + 1)
     with np.errstate(all="ignore"):
@@ -68,11 +68,12 @@ def _shown(values: NDArray[Any]) -> Points:
     return points
 
 
+@final
 @dataclass
 class Frame:
-    """What the plane must show: a box around everything of the last while, with some room.
+    """The part of the plane to show: a box around all recent points, with some room.
 
-    Final. Its sides lie on a grid that is coarse against its size, so that the view does not tremble.
+    Its sides lie on a grid that is coarse compared with its size, so that the view does not tremble.
     """
 
     _lows: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
@@ -94,11 +95,12 @@ class Frame:
         return _shown(np.stack([np.stack([x[:, 0], y[:, 1]], axis=1) for x, y in corners], axis=1))
 
 
+@final
 @dataclass
 class Trail:
     """The way of one point, cut at the frames into pieces of equal length, so that they make one array.
 
-    Final. Piece i leads from the frame before to frame i through every slot between.
+    Piece i leads from the frame before to frame i through every slot between.
     """
 
     every: int

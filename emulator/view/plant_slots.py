@@ -1,4 +1,4 @@
-"""What moves a plant, and what becomes of a house, slot by slot as the view takes it: of one trial, live or from tables.
+"""The inputs and disturbances of a plant and the energies of a house, slot by slot for the view: of one trial.
 
 Source: docs/view.md.
 """
@@ -6,7 +6,7 @@ Source: docs/view.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -19,11 +19,12 @@ from evedrop.score.household_tally import guesses_of
 from evedrop.view.scene import HouseScene, Moved
 
 
+@final
 class Showing:
-    """Follows one trial of a closed loop, whose slots come in order. Final."""
+    """Follows one trial of a closed loop, whose slots come in order."""
 
     def __init__(self, scenario: Scenario) -> None:
-        assert scenario.plant is not None and scenario.controller is not None and scenario.driven is not None  # noqa: S101, PT018 - its caller knows
+        assert scenario.plant is not None and scenario.controller is not None and scenario.driven is not None  # noqa: S101, PT018 - checked by `of`
         self._plant, self._period = scenario.driven, scenario.controller.period
         self._disturbances = disturbances_of(scenario)
         self._seconds = scenario.slot_seconds or 1.0
@@ -35,11 +36,11 @@ class Showing:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Showing | None:
-        """None of a scenario without a controller."""
+        """An instance for a scenario; None without a controller."""
         return None if scenario.plant is None or scenario.controller is None else cls(scenario)
 
     def take(self, u: Floats, estimates: Mapping[str, Floats]) -> Moved:
-        """The next slots: inputs as decided, (c, m), and estimates as deviations, (c, n)."""
+        """Add the next slots: inputs as decided, (c, m), and estimates as deviations, (c, n)."""
         limited = self._plant.limited(u.T).T
         first, self._next = self._next, self._next + len(u)
         values = np.hstack([self._disturbances[first : self._next], limited])
@@ -54,7 +55,7 @@ class Showing:
         return energy(sums, self._seconds)
 
     def _guessed(self, first: int, estimates: Mapping[str, Floats]) -> dict[str, Floats]:
-        """A guess is of the period that has ended, and is shown from where that began."""
+        """Guesses, shown from the beginning of the period that they are for, which has ended."""
         found = {}
         for name, guess in self._guesses.items():
             pairs = []
@@ -67,7 +68,7 @@ class Showing:
 
 
 def driven_scene(scenario: Scenario) -> dict[str, Any]:
-    """What the view must know of a plant with a controller: entries of its scene."""
+    """The view's scene entries for a plant with a controller."""
     plant, process, house = scenario.plant, scenario.process, scenario.household
     if plant is None or scenario.controller is None:
         return {}

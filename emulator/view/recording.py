@@ -1,13 +1,14 @@
-"""The recording of a run: a file, which cannot hold the run up.
+"""The recording of a run: a file, written in such a way that it cannot delay the run.
 
-Rerun may block when a disk is slow or full. So the run only ever appends to a list, and a thread turns slots into columns
-and writes the file. Viewers read it as it grows; the run knows nothing of them.
+Rerun may block when a disk is slow or full. So the run only appends to a list, and a thread turns slots into columns
+and writes the file. Viewers read the file as it grows; the run does not know of them.
 """
 
 from __future__ import annotations
 
 import threading
 from pathlib import Path
+from typing import final
 
 import numpy as np
 import rerun as rr
@@ -24,14 +25,15 @@ from evedrop.view.scene import Moved, PeerSlots, Scene, SceneSlots, Shown
 __all__ = ["PeerSlots", "Scene", "SceneSlots", "Shown", "ViewRecording"]
 
 _APPLICATION = "evedrop"
-_PERIOD = 0.1  # seconds from one batch to the next, so that a batch is worth its overhead
+_PERIOD = 0.1  # seconds between batches, so that a batch is worth its overhead
 _MOST_SLOTS = 1024  # in a batch
-_MOST_WAITING = 20_000  # slots the file may be behind, before the run waits for it
-_FILE_TIMEOUT = 5.0  # seconds the run waits for the file, before it goes on without one
+_MOST_WAITING = 20_000  # slots that the file may be behind before the run waits for it
+_FILE_TIMEOUT = 5.0  # seconds that the run waits for the file before it continues without one
 
 
+@final
 class ViewRecording:
-    """Writes the recording of one run to `path`. Final; nothing here raises because of the disk: see `failure`."""
+    """Writes the recording of one run to `path`. The disk cannot make any method raise: see `failure`."""
 
     def __init__(self, path: Path, scene: Scene) -> None:
         self.failure: str | None = None
@@ -74,7 +76,7 @@ class ViewRecording:
     def close(self) -> bool:
         """Finish the file, within a time limit.
 
-        True if the interpreter can now exit normally. If not, Rerun hangs, and only os._exit ends the process.
+        True if the interpreter can now exit normally. Otherwise Rerun hangs, and only os._exit ends the process.
         """
         with self._changed:
             self._closing = True
@@ -98,7 +100,7 @@ class ViewRecording:
                 self._changed.notify_all()
             try:
                 self._put(chunks, notes)
-            except Exception as error:  # a thread that dies would leave the run waiting for it
+            except Exception as error:  # if the thread died, the run would wait for it
                 self._give_up(repr(error))
             if closing:
                 break
@@ -116,7 +118,7 @@ class ViewRecording:
         for column in columns:
             column.send(self._file)
         try:
-            # Rerun tells of a file it can no longer write only by never finishing.
+            # When Rerun cannot write a file any more, the only sign is that it never finishes.
             self._file.flush(timeout_sec=_FILE_TIMEOUT)
         except RuntimeError:
             self._give_up("the file could not be written")

@@ -1,4 +1,4 @@
-"""The recording of a run that was made without a view, or in memory, from the tables of its results."""
+"""Makes the recording of a run without a view, or of a run in memory, from the tables of its results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evedrop.score.scorekeeper import event_line
 from evedrop.view.scene import PeerSlots, SceneSlots
 from evedrop.view.scored_slots import open_recording, showing_of
 
-_CHUNK = 1000  # slots handed over at once
+_CHUNK = 1000  # slots recorded at once
 _CODES = {
     "dropped": Action.LOST,
     "state": Action.STATE,
@@ -29,7 +29,7 @@ _CODES = {
 
 
 def replay(folder: Path, path: Path | None = None) -> Path:
-    """Write the recording of a results folder to a path, by default its recording.rrd; the path.
+    """Write the recording of a results folder to a path, by default its recording.rrd; returns the path.
 
     Raises UsageError if the folder's tables cannot be read, or hold no recorded trial.
     """
@@ -43,7 +43,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     _check_shapes(folder, len(scenario.process.A), x, peers)
     inputs, showing = _inputs(results), showing_of(scenario)
     if showing is not None and len(inputs) != len(x):
-        raise UsageError(f"{folder}: inputs.parquet has not the slots of trials.parquet; run the scenario again")
+        raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
     recording = open_recording(scenario, folder.name, path)
     for first in range(0, len(x), _CHUNK):
@@ -69,7 +69,7 @@ def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots
         )
     for name, peer in peers.items():
         if {len(x)} != {len(column) for column in (peer.x_hat, peer.squared_error)}:
-            raise UsageError(f"{folder}: its tables have not the same slots of {name}; run the scenario again")
+            raise UsageError(f"{folder}: its tables do not have the same slots of {name}; run the scenario again")
 
 
 def _first_trial(results: Results, name: str) -> pa.Table:
@@ -81,7 +81,7 @@ def _first_trial(results: Results, name: str) -> pa.Table:
 
 
 def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
-    """True states, ν and whether there was a packet."""
+    """True states, ν, and whether there was a packet."""
     rows = _first_trial(results, name)
     words = rows["sent"].cast(pa.string()).to_pylist()
     nu = np.array([word == "innovation" for word in words], np.bool_)

@@ -1,4 +1,4 @@
-"""What the view is given: the scene before the first slot, then slots in columns. No Rerun in here."""
+"""The view's input: the scene before the first slot, then slots in columns. Does not use Rerun."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class HouseScene:
     load: str
     """Label of its load, one of `Scene.moving`."""
     most: float
-    """The most of it in a minute or what the period is, so that the panel is not as high as wrong guesses are."""
+    """The largest mean load over a minute or a period; the panel need not be as high as wrong guesses."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What the view must know before the first slot."""
+    """Everything that the view needs before the first slot."""
 
     title: str
     run: str
@@ -45,17 +45,17 @@ class Scene:
     n: int
     """Number of states."""
     pace: float
-    """Seconds a slot; 0 as fast as it goes."""
+    """Seconds a slot; 0: as fast as possible."""
     receivers: tuple[Shown, ...]
-    """The legitimate one first."""
+    """The legitimate estimator first."""
     noise: float
     """Trace of Q: the squared error of one step."""
     states: tuple[str, ...] = ()
     """Labels of the states, such as "SOC (%)"; none, or one for each."""
     moving: tuple[str, ...] = ()
-    """Of a closed loop, labels of what moves the plant, such as "P_load (kW)": disturbances, then inputs."""
+    """Labels of a closed loop's disturbances, then inputs, such as "P_load (kW)"."""
     house: HouseScene | None = None
-    """Where the plant is one."""
+    """For a plant that is a house."""
 
 
 @dataclass(frozen=True)
@@ -65,32 +65,32 @@ class PeerSlots:
     x_hat: Floats
     """Estimate in the first recorded trial, (c, n)."""
     P: Floats
-    """Covariance it believes, first recorded trial, (c, n, n)."""
+    """Covariance that it believes in the first recorded trial, (c, n, n)."""
     action: Codes
     """`Action` in the first recorded trial, (c,)."""
     squared_error: Floats
     """|x − x̂|², mean over trials, (c,)."""
     trace: Floats
-    """tr P it believes, mean over trials, (c,)."""
+    """tr P that it believes, mean over trials, (c,)."""
     expected_trace: Floats
     """Trace of the actual error covariance by theory, (c,); NaN where there is none."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What moves the plant of a closed loop over c consecutive slots, in the first recorded trial."""
+    """Disturbances and inputs of a closed loop over c consecutive slots, in the first recorded trial."""
 
     values: Floats
-    """Of `Scene.moving`, (c, q + m)."""
+    """The values of `Scene.moving`, (c, q + m)."""
     energies: Floats | None = None
-    """Of a house, what it has bought and sold since slot 0, in kWh, (c, 2)."""
+    """For a house, the energy bought and sold since slot 0, in kWh, (c, 2)."""
     guesses: Mapping[str, Floats] = field(default_factory=dict)
-    """Receiver → slot, and the load it guesses from then on, of periods that ended in these slots, (2, g)."""
+    """Receiver → slots, and the load it guesses from each slot on, for periods that ended in these slots, (2, g)."""
 
 
 @dataclass(frozen=True)
 class SceneSlots:
-    """c consecutive slots, complete. Its arrays are kept for a while: they must not be changed afterwards."""
+    """c consecutive slots, complete. The view keeps its arrays for a while, so they must not be changed afterwards."""
 
     first: int
     """Number of the first of them."""
@@ -101,7 +101,7 @@ class SceneSlots:
     peers: Mapping[str, PeerSlots]
     """By name, one for each receiver of the scene."""
     moved: Moved | None = None
-    """Of a closed loop."""
+    """For a closed loop."""
     sent: Flags | None = None
     """Whether the sensor sent a packet in the first recorded trial, (c,); None: in every slot."""
 

@@ -1,4 +1,4 @@
-"""A run as the view takes it: what is known of it at the start, and its slots as they are scored."""
+"""A run in the view's form: everything known of it at the start, and its slots as they are scored."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def showing_of(scenario: Scenario) -> Showing | None:
-    """Who follows the shown trial of a closed loop."""
+    """An object that follows the shown trial of a closed loop; None without a controller."""
     from evedrop.view.plant_slots import Showing  # noqa: PLC0415 - only with a view
 
     return Showing.of(scenario)
@@ -28,7 +28,7 @@ def showing_of(scenario: Scenario) -> Showing | None:
 def open_recording(scenario: Scenario, run: str, path: Path) -> ViewRecording:
     """The run's recording, on disk."""
     from evedrop.view.plant_slots import driven_scene  # noqa: PLC0415 - only with a view
-    from evedrop.view.recording import ViewRecording  # noqa: PLC0415 - 0.3 s and 100 MB that a run without view saves
+    from evedrop.view.recording import ViewRecording  # noqa: PLC0415 - saves 0.3 s and 100 MB in a run without a view
     from evedrop.view.scene import Scene, Shown  # noqa: PLC0415 - the same
 
     quality = scenario.quality
@@ -57,9 +57,9 @@ def open_recording(scenario: Scenario, run: str, path: Path) -> ViewRecording:
 
 
 def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
-    """Some slots as the view takes them: the first recorded trial, as levels, and means over all.
+    """Some slots in the view's form: the first recorded trial, as levels, and means over all trials.
 
-    around: the reference from which states are deviations, (n,); showing: of a closed loop, who follows the same trial.
+    around: the reference from which states are deviations, (n,); showing: follows the same trial of a closed loop.
     """
     from evedrop.view.scene import PeerSlots, SceneSlots  # noqa: PLC0415 - only with a view
 

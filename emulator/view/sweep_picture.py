@@ -48,7 +48,7 @@ def _error(row: dict[str, Any]) -> float:
 
 
 def _positions(values: list[Any]) -> list[float]:
-    """Numbers as they are; anything else side by side."""
+    """Numbers unchanged; for all other values, places side by side."""
     if all(isinstance(value, (int, float)) for value in values):
         return [float(value) for value in values]
     return [float(i) for i in range(len(values))]

@@ -1,7 +1,7 @@
-"""The viewer of a run: a window, or a page for browsers; each is fed with the recording, as it is written to disk.
+"""The viewer of a run: a window, or a page for browsers; each reads the recording as it is written to disk.
 
-A recording holds the truth, so none goes to a port where anybody could fetch it: a window gets it through a pipe, a browser
-at an address that cannot be guessed. Neither Rerun nor Zenoh is imported here.
+A recording contains the truth, so none is sent to a port where anybody could fetch it: a window reads it from a pipe, a
+browser from an address that cannot be guessed. Neither Rerun nor Zenoh is imported here.
 
 Source: docs/view.md, who sees it.
 """
@@ -15,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 from urllib.parse import quote
 
 from evedrop.errors import UsageError
@@ -25,7 +26,7 @@ from evedrop.view.viewer_process import HOST, end, is_apart, spawn
 _ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
 _NOTHING = f"rerun+http://{HOST}:9/proxy"
-"""What the page would show by itself: with it Rerun serves the page alone, and opens no port for recordings."""
+"""The page's default source: with it Rerun serves only the page, and opens no port for recordings."""
 
 
 def has_screen() -> bool:
@@ -34,14 +35,14 @@ def has_screen() -> bool:
 
 
 def choose(mode: str) -> str:
-    """One of "native", "web" and "off", from these or "auto": native with a screen, else web.
+    """One of "native", "web" and "off", from these or "auto": native with a screen, otherwise web.
 
     Raises UsageError for any other word, and for "native" without a screen.
     """
     if mode == "auto":
         return "native" if has_screen() else "web"
     if mode not in {"native", "web", "off"}:
-        raise UsageError(f"--view {mode} is no way to view a run; give auto, native, web or off")
+        raise UsageError(f"--view {mode} is not a way to view a run; give auto, native, web or off")
     if mode == "native" and not has_screen():
         raise UsageError(
             "--view native needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; give --view web, and open "
@@ -52,21 +53,21 @@ def choose(mode: str) -> str:
 
 @dataclass(frozen=True)
 class WebAddress:
-    """Where browsers find a view: the page at a port, and what it shows at the next one."""
+    """The address of a view for browsers: the page at one port, its data at the next."""
 
     host: str
     port: int
 
     @classmethod
     def of(cls, text: str) -> WebAddress:
-        """From HOST:PORT. Raises UsageError if it is none."""
+        """Parse HOST:PORT. Raises UsageError if the text is malformed."""
         host, _, port = text.rpartition(":")
         try:
             address, number = ipaddress.IPv4Address(host), int(port)
         except ValueError:
             number = 0
         if not 0 < number < 2**16 - 1:
-            raise UsageError(f"--serve {text} is no address and port; give one such as 127.0.0.1:17450")
+            raise UsageError(f"--serve {text} is not an address and port; give one such as 127.0.0.1:17450")
         return cls(str(address), number)
 
     @property
@@ -75,7 +76,7 @@ class WebAddress:
         return HOST if self.host == "0.0.0.0" else self.host  # noqa: S104 - what was asked for
 
     def check_free(self) -> None:
-        """Raise UsageError if somebody else is there: he would be taken for the viewer."""
+        """Raise UsageError if a port is in use: its owner would be mistaken for the viewer."""
         for port in (self.port, self.port + 1):
             with socket.socket() as probe:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -87,10 +88,11 @@ class WebAddress:
                     ) from error
 
 
+@final
 class Viewer:
-    """A running viewer. Final; made by `start` or `serve`.
+    """A running viewer; made by `start` or `serve`.
 
-    It listens on loopback only unless a stand says otherwise, in a session of its own so that Ctrl-C in the terminal does
+    It listens on loopback only unless a WebAddress says otherwise, in a session of its own so that Ctrl-C in the terminal does
     not reach it, and on Linux it dies with the thread that started it, however that ends.
     """
 
@@ -101,12 +103,12 @@ class Viewer:
         self._followed = followed
         self._served = served
         self.address: str | None = None
-        """What to open in a browser; None for a window. Whoever has it sees the truth."""
+        """The address to open in a browser; None for a window. Anybody who has it sees the truth."""
         self.warning: str | None = None
-        """What the user should know of who else can get at it."""
+        """A warning to the user if others can reach the viewer."""
         if served is None and not is_apart(process):
             self.warning = (
-                "other users of this machine can find the window's port, steer the window and take pictures of what it "
+                "other users of this machine can find the window's port, control the window and take pictures of what it "
                 "shows, for this system allows it no network of its own; --view web, whose address is a secret, or --view "
                 "off keep it from them (docs/view.md, who sees it)"
             )
@@ -117,10 +119,10 @@ class Viewer:
 
     @classmethod
     def start(cls, mode: str, logs: Path, recording: Path, complete: bool = False) -> Viewer | None:
-        """Start one and wait until it is there; None for "off". Its output goes to viewer.log in the folder `logs`.
+        """Start a viewer and wait until it is ready; None for "off". Its output goes to viewer.log in the folder `logs`.
 
-        mode: "native", "web", "off", or "auto". recording: what to show, from its beginning on and as it grows, be there a
-        file already or not; complete: it does not grow.
+        mode: "native", "web", "off", or "auto". recording: the file to show, from its beginning on and as it grows; it need not
+        exist yet. complete: the file does not grow.
 
         Raises UsageError if it cannot be started.
         """
@@ -135,16 +137,16 @@ class Viewer:
                     return cls._page(followed, HOST, HOST, port, free_port(), logs)
                 return cls._window(followed, port, logs)
             except UsageError:
-                # Somebody may have taken a port between our look and the viewer's.
+                # Another process may have taken the port after it was found free.
                 if attempt == _ATTEMPTS - 1:
                     raise
         return None
 
     @classmethod
     def serve(cls, stand: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
-        """Start one for browsers, at a place that is known beforehand; the rest as for `start`.
+        """Start a viewer for browsers at a given address; otherwise as `start`.
 
-        Raises UsageError if it cannot be started, for one because the place is taken.
+        Raises UsageError if it cannot be started, for example because a port is taken.
         """
         stand.check_free()
         followed = Followed(recording, complete)
@@ -164,7 +166,7 @@ class Viewer:
     def _window(cls, followed: Followed, port: int, logs: Path) -> Viewer:
         arguments = ["--port", str(port), *_WINDOW, "-"]
         process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
-        assert process.stdin is not None  # noqa: S101 - it was asked for
+        assert process.stdin is not None  # noqa: S101 - it is a pipe
         feed(followed, process.stdin)
         return cls(process, followed)
 
@@ -173,15 +175,15 @@ class Viewer:
         return self._process.poll() is None
 
     def wait(self) -> None:
-        """Return when it has ended by itself."""
+        """Return when the viewer has ended by itself."""
         self._process.wait()
 
     def complete(self) -> None:
-        """The recording is finished; it stays in view."""
+        """Declare the recording finished; it stays in view."""
         self._followed.complete()
 
     def stop(self) -> None:
-        """End it, for certain within seconds. Harmless if it has ended."""
+        """End the viewer within seconds. Harmless if it has ended."""
         self._followed.complete()
         if self._served is not None:
             self._served.stop()
@@ -190,15 +192,15 @@ class Viewer:
 
 
 def _screen_is_remote() -> bool:
-    """Whether the screen is reached over the network, as that of `ssh -X` is, which a window apart could not."""
+    """Whether the screen is reached over the network, as with `ssh -X`; a window with a network of its own could not use it."""
     display = os.environ.get("DISPLAY", "")
     return not os.environ.get("WAYLAND_DISPLAY") and not display.startswith((":", "/", "unix:"))
 
 
 def open_run(run: Path, mode: str, stand: WebAddress | None = None, recording: Path | None = None) -> Viewer:
-    """A viewer with the recording of a results folder, or another of the same run; for browsers, at a stand if there is one.
+    """A viewer with the recording of a results folder, or with another recording; for browsers, at an address if given.
 
-    Raises UsageError if there is none, or no viewer can be started.
+    Raises UsageError if there is no recording, or no viewer can be started.
     """
     recording = run / "recording.rrd" if recording is None else recording
     if not recording.is_file():

@@ -1,6 +1,6 @@
-"""Rerun's command as a child process of ours. Neither Rerun nor Zenoh is imported here.
+"""Rerun's command as a child process. Neither Rerun nor Zenoh is imported here.
 
-Rerun's own ways to start a viewer listen on every interface; its command, told so, does not.
+Rerun's own functions start viewers that listen on every interface; its command can be told not to.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ HOST = "127.0.0.1"
 _START_SECONDS = 20.0
 _STOP_SECONDS = 3.0
 
-# Rerun's settings as we want them: it reports to nobody what is looked at, and writes nothing into the user's home.
+# Rerun's settings: it reports no usage statistics, and writes nothing to the user's home.
 _CONFIG = Path(__file__).with_name("rerun_config")
 
-# A window listens on a port, for whoever would steer it or take pictures of it, and asks nobody who he is. In a network
-# of its own, which has nothing but a loopback, nobody else finds it. Where the system does not allow us one, it goes without.
+# A window listens on a port for commands and requests for pictures, without authentication. With a network namespace of its
+# own, which has only a loopback interface, no other user can reach it. Where the system does not allow that, it runs without.
 _APART = """
 def apart():
     import fcntl, socket, struct
@@ -56,7 +56,7 @@ def allowed():
 if allowed():
     apart()
 """
-# Ends the viewer together with us, even if we are killed: PR_SET_PDEATHSIG is 1, and survives exec.
+# Ends the viewer together with this process, even if it is killed: PR_SET_PDEATHSIG is 1, and survives exec.
 _GUARD = """
 import ctypes, os, signal, sys
 {first}
@@ -67,7 +67,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 
 
 def guarded(command: Sequence[str], apart: bool = False) -> list[str]:
-    """A command that ends with us, on Linux; apart: in a network of its own, if the system allows it."""
+    """A command that ends with this process, on Linux; apart: with a network of its own, if the system allows it."""
     if sys.platform != "linux":
         return [*command]
     guard = _GUARD.format(first=_APART if apart else "")
@@ -75,7 +75,7 @@ def guarded(command: Sequence[str], apart: bool = False) -> list[str]:
 
 
 def is_apart(process: subprocess.Popen[bytes]) -> bool:
-    """Whether a process has a network of its own, so that nobody can connect to it."""
+    """Whether a process has a network of its own, so that no other process can connect to it."""
     with contextlib.suppress(OSError):
         return os.readlink(f"/proc/{process.pid}/ns/net") != os.readlink("/proc/self/ns/net")
     return False
@@ -91,11 +91,11 @@ def spawn(
     apart: bool = False,
     environment: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Rerun's command with these arguments, on `host` alone; returns when it listens on `port`.
+    """Start Rerun's command with these arguments, only on `host`; returns when it listens on `port`.
 
-    apart: in a network of its own, if the system allows it.
+    apart: with a network of its own, if the system allows it.
 
-    Raises UsageError, with the last lines of its log, if it ends before or does not get there in time.
+    Raises UsageError, with the last lines of its log, if it ends first or is not ready in time.
     """
     with _log(logs) as log:
         start = log.tell()
@@ -122,7 +122,7 @@ def spawn(
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate a viewer, kill it if it does not listen, and wait for its end."""
+    """Terminate a viewer, kill it if it does not end, and wait for it."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -160,7 +160,7 @@ def _is_there(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
 
 
 def _log(logs: Path) -> IO[bytes]:
-    """The log file, or a nameless one if a finished run's folder may not be written to."""
+    """The log file, or an unnamed one if the folder of a finished run is read-only."""
     try:
         make_private(logs)
         return open(logs / "viewer.log", "a+b", opener=private_opener)

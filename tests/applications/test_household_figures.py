@@ -45,10 +45,10 @@ def tables(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"household__grid": "P_net"}, 'household.grid: is "P_net", which is none of plant.inputs; expected one of P_H'),
-        ({"household__load": "P_H"}, 'household.load: is "P_H", which is none of plant.disturbances; expected one of P_so'),
-        ({"household__battery": "soc"}, 'household.battery: is "soc", which is none of process.states; expected one of SOC'),
-        ({"process__states": None}, 'household.battery: is "SOC", which is none of process.states; expected process.st'),
+        ({"household__grid": "P_net"}, 'household.grid: is "P_net", which is not among plant.inputs; expected one of P_H'),
+        ({"household__load": "P_H"}, 'household.load: is "P_H", which is not among plant.disturbances; expected one of P_so'),
+        ({"household__battery": "soc"}, 'household.battery: is "soc", which is not among process.states; expected one of SOC'),
+        ({"process__states": None}, 'household.battery: is "SOC", which is not among process.states; expected process.st'),
         ({"household__grid": None}, "household.grid: is missing; expected"),
         ({"household__window_seconds": 0.0}, "household.window_seconds: is 0.0; expected"),
         ({"household__stove": "x"}, "household.stove: "),
@@ -114,7 +114,7 @@ def test_a_house_needs_a_plant() -> None:
     """And a controller."""
     with pytest.raises(ScenarioError) as caught:
         checked(tables(plant=None, controller=None, legitimate__knows_input=False), "file")
-    assert "household: is there without a [plant] and a [controller]" in caught.value.mistakes[0]
+    assert "household: is given without a [plant] and a [controller]" in caught.value.mistakes[0]
 
 
 def test_the_figures_are_those_of_the_tables(tmp_path: Path) -> None:

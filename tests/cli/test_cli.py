@@ -97,7 +97,7 @@ def test_a_scenario_with_mistakes_starts_nothing(evedrop: Evedrop) -> None:
     assert done.err.splitlines() == [
         "evedrop: eavesdroppers: 2 mistakes, nothing was started",
         "  legitimate.link.quality: is 7; expected a number from 0 to 1, such as 0.9",
-        "  sluts: is no entry of this table; did you mean slots?",
+        "  sluts: is not an entry of this table; did you mean slots?",
     ]
     assert not (evedrop.folder / "x").exists()
 
@@ -222,7 +222,7 @@ def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:
     different = evedrop("diff", "a", "c")
     assert (different.status, different.err) == (1, "")
     assert different.out.startswith("first difference: slot 0, trial 0, legitimate: ")
-    refused(evedrop("diff", "a", "nowhere"), "nowhere is no results folder")
+    refused(evedrop("diff", "a", "nowhere"), "nowhere is not a results folder")
 
 
 def test_check_reports_every_scenario(evedrop: Evedrop) -> None:
@@ -245,7 +245,7 @@ def test_list_new_check_and_run_lead_from_nothing_to_a_run(evedrop: Evedrop) -> 
     assert evedrop("run", "mine.toml", *QUICK).status == 0
     (folder,) = (evedrop.folder / "runs").iterdir()
     assert folder.name.startswith("mine-")
-    refused(evedrop("new", "mine.toml"), "mine.toml is there already")
+    refused(evedrop("new", "mine.toml"), "mine.toml exists already")
 
 
 def test_the_selftest_passes(evedrop: Evedrop) -> None:

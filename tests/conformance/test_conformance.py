@@ -162,15 +162,23 @@ class Apart(Cipher):
 
 SCHEME_RULES = {
     "a trial by itself": (plain_with(Centred), "slot 0, trial 0: Packet.z is ", "no sum over trials"),
-    "the same scheme made twice": (plain_with(Counted), "beside another one of its kind", "keep no state outside"),
+    "the same scheme made twice": (plain_with(Counted), "with another one of its kind", "keep no state outside"),
     "a slot asked for again": (plain_with(estimator=Remembers), "when the slot is asked for again", "Belief.memory"),
-    "packets that were lost": (plain_with(estimator=Peeks), "by what stands in z", "where gamma is true alone"),
+    "packets that were lost": (
+        plain_with(estimator=Peeks),
+        "depending on z where nothing was received",
+        "where gamma is true alone",
+    ),
     "actions that γ tells": (
         plain_with(estimator=Discards),
         "act() says STATE and step() did DISCARDED",
         "reads_packets",
     ),
-    "no worse than prediction": (plain_with(Negative), "for who hears nothing", "decode what encode() has made"),
+    "no worse than prediction": (
+        plain_with(Negative),
+        "for a receiver that hears nothing",
+        "decode what encode() has made",
+    ),
     "slot 0": (NoFirst, "slot 0, trial 0: nu is true", "no state before the first"),
     "sensor and estimator apart": (Apart, "made from shared()", "from the keys alone"),
     "what it says to theory": (
@@ -317,17 +325,17 @@ def test_a_delay_model_that_breaks_a_rule_is_told_which() -> None:
 @pytest.mark.parametrize(
     ("names", "parameters", "said"),
     [
-        ({"scheme": "inovation"}, {}, "--scheme inovation is none; expected MODULE:CLASS, or acknowledged, "),
+        ({"scheme": "inovation"}, {}, "--scheme inovation is unknown; expected MODULE:CLASS, or acknowledged, "),
         ({"scheme": "innovation"}, {"state_probability": 2.0}, "--scheme innovation: state_probability: is 2.0"),
         (
             {"scheme": "innovation"},
             {"threshold": 2},
-            "--set threshold: is no parameter of innovation; expected state_prob",
+            "--set threshold: is not a parameter of innovation; expected state_prob",
         ),
         (
             {"link": "pattern", "scheme": "plain"},
             {"x": 2},
-            "--set x: is no parameter of pattern, plain; expected outcomes",
+            "--set x: is not a parameter of pattern, plain; expected outcomes",
         ),
         (
             {"eavesdropper": "smart", "scheme": "plain"},

@@ -134,7 +134,7 @@ def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
     }
     done = tutorial("check", "home/three.toml", "--set", "modules=nowhere")
     assert done.status == 2
-    assert f'modules: is "{tutorial.folder}/nowhere", which is no folder' in done.err
+    assert f'modules: is "{tutorial.folder}/nowhere", which is not a folder' in done.err
 
 
 def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,14 +201,14 @@ MISTAKES = {
             "reaches for the key of 'noise', and has asked for none"),
     "abstract": ("scheme", "Mine(Scheme):\n    def outcomes(self, mu): return None",
                  "which lacks shared; expected a class with this method"),
-    "other": ("scheme", "Mine(Naive):\n    pass", "which is no Scheme; expected a class that inherits from evedrop.extend"),
+    "other": ("scheme", "Mine(Naive):\n    pass", "which is not a Scheme; expected a class that inherits from evedrop.extend"),
     "absent": ("scheme", "Mein(Plain):\n    pass", "has no Mine; did you mean case_absent:Mein?"),
     "syntax": ("scheme", "Mine(Plain)\n    pass", "cannot be imported (SyntaxError: "),
     "fails": ("scheme", "Mine(Plain):\n    pass\n\nimport nowhere_at_all",
               "ModuleNotFoundError: No module named 'nowhere_at_all', "),
     "needs": ("scheme", "Mine(Plain):\n    parameters = {'depth': 3}",
               "encoding.depth: is missing; the scheme case_needs:Mine needs it"),
-    "table": ("scheme", "Mine(Plain):\n    parameters = ('depth',)", "whose parameters are no table"),
+    "table": ("scheme", "Mine(Plain):\n    parameters = ('depth',)", "whose parameters are not a table"),
     "taken": ("eavesdropper", "Mine(Naive):\n    parameters = {'window': 3}", "one of whose parameters is called window"),
     "belief": ("eavesdropper", "Mine(Naive):\n    def step(self, k, belief, heard): return belief._replace(x_hat=heard.z[0])",
                "slot 0: Belief.x_hat has shape (3,); expected (2, 3)"),

@@ -122,7 +122,7 @@ def test_the_model_is_found_again(
     assert found.chosen.name == name
     for parameter, bound in bounds.items():
         assert found.chosen.spec[parameter] == pytest.approx(spec[parameter], abs=bound)
-    assert "as long as it would have them" in found.goodness
+    assert "as long as the model predicts" in found.goodness
     assert found.bursts.mean == pytest.approx(found.bursts.fitted, rel=0.15)
 
 

@@ -179,7 +179,7 @@ def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
     assert done.status == 2
     assert done.err.splitlines() == [
         "evedrop: link legitimate: 2 mistakes, nothing was changed",
-        "  set.sluts: is nothing that can be changed of a link; expected quality, loss, delay, reorder, duplicate, "
+        "  set.sluts: is not a link setting that can be changed; expected quality, loss, delay, reorder, duplicate, "
         "corrupt, rate or queue",
         "  set.quality: is 1.2; expected a number from 0 to 1, such as 0.9",
     ]

@@ -60,12 +60,12 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "nothing to do": (
         {"faults": []},
-        ["nemesis.faults: has fewer than 1 entries; expected at least so many"],
+        ["nemesis.faults: has fewer than 1 entries; expected at least that many"],
     ),
     "too often": ({"every": 0.5}, ["nemesis.every: is 0.5; expected a number at least 1.0, such as 200"]),
     "two at once": (
         {"lasting": "long", "evry": 3},
-        ['nemesis.lasting: is "long"; expected a number, such as 50', "nemesis.evry: is no entry of this table; did you mean"],
+        ['nemesis.lasting: is "long"; expected a number, such as 50', "nemesis.evry: is not an entry of this table; did you"],
     ),
     "nobody": ({"targets": ["router"]}, ['nemesis.targets.0: is "router"; expected legitimate, eve or mallory']),
     "twice": ({"targets": ["eve", "eve"]}, ["nemesis.targets: has a name twice; expected each once"]),
@@ -74,9 +74,9 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
         ["nemesis.from: is 1000, but the last slot is 999", "nemesis.to: is 1001; expected at most 1000"],
     ),
     "ends before": ({"from": 9, "to": 9}, ["nemesis.to: is 9, not after from, which is 9; expected a later slot"]),
-    "set to nothing": ({"faults": ["set"]}, ["nemesis.set: is missing beside the fault set; expected what changes"]),
-    "set without it": ({"set": {"quality": 0.1}}, ['nemesis.set: is there, but "set" is not among faults']),
-    "state of nobody": ({"faults": ["cut"], "state": "last"}, ['nemesis.state: is there, but "kill" is not among faults']),
+    "set to nothing": ({"faults": ["set"]}, ["nemesis.set: is missing, but the fault set is drawn; expected what changes"]),
+    "set without it": ({"set": {"quality": 0.1}}, ['nemesis.set: is given, but "set" is not among faults']),
+    "state of nobody": ({"faults": ["cut"], "state": "last"}, ['nemesis.state: is given, but "kill" is not among faults']),
     "wrong change": (
         {"faults": ["set"], "set": {"quality": 1.2}},
         ["nemesis.set.quality: is 1.2; expected a number from 0 to 1"],

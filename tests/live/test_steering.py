@@ -132,7 +132,7 @@ def test_two_operators_are_served_in_the_order_they_came() -> None:
     assert run.conductor.told() == [("sensor", "hold")]
     assert [one[1] for one in run.holds(8)] == ["change", "change", "go", "go"]
     assert first.answers[0].slot == second.answers[0].slot == 8
-    assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected it to heal before",)
+    assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected a heal before",)
 
 
 @pytest.mark.parametrize(
@@ -141,13 +141,13 @@ def test_two_operators_are_served_in_the_order_they_came() -> None:
         ({"link": "legitimate", "set": {"quality": 1.2}}, ["set.quality: is 1.2; expected a number from 0 to 1"]),
         ({"heal": "smart"}, ["heal: smart is not cut at slot 5; expected a cut before"]),
         ({"cut": "nobody"}, ['cut: names "nobody"; expected legitimate or smart']),
-        ({"cut": "legitimate"}, ["event.0.cut: legitimate is cut already, from slot 5 on; expected it to heal before"]),
-        ({"kill": "smart"}, ["kill: is nothing that can be done now; expected link with set, cut or heal"]),
-        ({"at": 9, "cut": "smart"}, ["at: is nothing that can be done now; expected link with set, cut or heal"]),
-        ({}, ["event: says not what happens; expected one of"]),
+        ({"cut": "legitimate"}, ["event.0.cut: legitimate is cut already, from slot 5 on; expected a heal before"]),
+        ({"kill": "smart"}, ["kill: cannot be done now; expected link with set, cut or heal"]),
+        ({"at": 9, "cut": "smart"}, ["at: cannot be done now; expected link with set, cut or heal"]),
+        ({}, ["event: does not say what happens; expected one of"]),
         (
             {"link": "smart", "set": {"loss": {"model": "gilbert-elliott", "p": 2.0}, "sluts": 1}},
-            ["set.sluts: is nothing that can be changed", "set.loss.r: is missing", "set.loss.p: is 2.0; expected"],
+            ["set.sluts: is not a link setting", "set.loss.r: is missing", "set.loss.p: is 2.0; expected"],
         ),
     ],
 )

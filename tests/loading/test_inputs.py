@@ -96,7 +96,7 @@ def test_an_event_on_pooled_links_is_looked_at_too() -> None:
     found = mistakes(text)
     assert (
         found[0]
-        == "event.0.set: pool has several links; expected a quality or a loss, of the one link in place of them"
+        == "event.0.set: pool has several links; expected a quality or a loss, for the one link that replaces them"
     )
     assert found[1].startswith('event.1.set.loss.model: is "nope"; expected bernoulli')
     assert parse(BASE + POOLED + event("{ quality = 0.1 }", "pool"), "scenario.toml").slots == 50
@@ -338,7 +338,7 @@ def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(
         (BASE.replace("Refused", "\\u001b[31mred"), "title: is \"\\u001b[31mred\" with the character U+001B in it"),
         (BASE.replace("Refused", "\\u0085"), "with the character U+0085 in it"),
         ('"a\\u001bb" = 1\n' + BASE, "a?b: is a name with a control character, or of more than 200 characters"),
-        (BASE.replace("Refused", "x" * 1000), "title: has more than 200 characters; expected at most so many"),
+        (BASE.replace("Refused", "x" * 1000), "title: has more than 200 characters; expected at most that many"),
         (BASE.replace("slots = 50", "slots = 1000000000000000000"), "slots: is 1000000000000000000; expected a number at most"),
         ("trials = 1000000000000\n" + BASE, "trials: is 1000000000000; expected a number at most 1000000"),
         ("trials = true\n" + BASE, "trials: is true; expected a whole number"),

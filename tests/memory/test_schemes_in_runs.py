@@ -155,7 +155,7 @@ def test_a_scheme_and_its_acknowledgements_go_together() -> None:
 def test_a_queue_and_silence_do_not_go_together() -> None:
     """A link of limited rate counts on a packet in every slot of every trial."""
     slow = {"link": {"quality": 0.8, "rate": 0.5}}
-    assert "legitimate.link.rate: is there, but the scheme withholding may stay silent" in str(
+    assert "legitimate.link.rate: is given, but the scheme withholding may stay silent" in str(
         mistakes("withholding", legitimate=slow)
     )
 

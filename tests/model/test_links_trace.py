@@ -139,7 +139,7 @@ def test_the_rate_of_many_slots_has_its_limit() -> None:
         ({"outcomes": "1" * (MOST_OUTCOMES + 1)}, "outcomes", "are 10000001; expected at most 10000000"),
         ({"outcomes": "1", "once": 1}, "once", "is 1; expected true or false"),
         ({"outcomes": "1", "random_start": "yes"}, "random_start", 'is "yes"; expected true or false'),
-        ({"once": True, "random_start": True}, "random_start", "is there beside once"),
+        ({"once": True, "random_start": True}, "random_start", "is given together with once"),
     ],
 )
 def test_a_mistake_of_a_trace_is_named(given: dict[str, Any], entry: str, said: str) -> None:

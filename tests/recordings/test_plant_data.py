@@ -96,7 +96,7 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
         'line 3: P_solar is "x"; expected a finite number',
         'line 3: P_load is "y"; expected a finite number',
     ]
-    assert found[-1] == "and more of the kind, in 20 of 20 lines"
+    assert found[-1] == "and more such mistakes, in 20 of 20 lines"
     assert len(found) == plant_data._MOST_SAID + 1
 
 

@@ -104,13 +104,13 @@ def test_runs_without_a_trial_in_common_are_not_equal(runs: dict[str, Results]) 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path, runs: dict[str, Results]) -> None:
     """No folder, an empty one, a broken summary and a broken table each say what is wrong."""
-    with pytest.raises(UsageError, match="no results folder"):
+    with pytest.raises(UsageError, match="not a results folder"):
         load_results(tmp_path / "nowhere")
     (tmp_path / "summary.json").write_text("{")
     with pytest.raises(UsageError, match="is not JSON"):
         load_results(tmp_path)
     (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(UsageError, match="is no summary of a run"):
+    with pytest.raises(UsageError, match="is not a run summary"):
         load_results(tmp_path)
     (tmp_path / "summary.json").write_text((next(iter(runs.values())).folder / "summary.json").read_text())
     (tmp_path / "slots.parquet").write_text("PAR1")

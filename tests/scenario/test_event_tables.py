@@ -50,18 +50,21 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
     "no such link": ([{"at": 1, "cut": "mallory"}], 'event.0.cut: names "mallory"; expected legitimate or eve'),
     "no receiver": (
         [{"at": 1, "kill": "router"}],
-        'event.0.kill: names "router": it is none of the receivers; expected',
+        'event.0.kill: names "router": it is not a receiver; expected',
     ),
     "two things": (
         [{"at": 1, "cut": "eve", "note": "x"}],
         "event.0.event: has cut or note at once; expected one of set",
     ),
-    "nothing": ([{"at": 1}], "event.0.event: says not what happens; expected one of set, cut"),
+    "nothing": ([{"at": 1}], "event.0.event: does not say what happens; expected one of set, cut"),
     "no time": ([{"cut": "eve"}], "event.0.at: is missing; expected at = 400"),
     "two times": ([{"at": 1, "from": 2, "to": 3, "cut": "eve"}], "event.0.at: and from are both there"),
-    "no end": ([{"from": 2, "cut": "eve"}], "event.0.to: is missing beside from; expected the slot in which it ends"),
-    "end alone": ([{"at": 2, "to": 3, "cut": "eve"}], "event.0.to: is there without from"),
-    "no lasting thing": ([{"from": 2, "to": 3, "note": "x"}], "event.0.from: is there, but note happens in one slot"),
+    "no end": (
+        [{"from": 2, "cut": "eve"}],
+        "event.0.to: is missing, but from is given; expected the slot in which it ends",
+    ),
+    "end alone": ([{"at": 2, "to": 3, "cut": "eve"}], "event.0.to: is given without from"),
+    "no lasting thing": ([{"from": 2, "to": 3, "note": "x"}], "event.0.from: is given, but note happens in one slot"),
     "set nothing": ([{"at": 1, "link": "eve", "set": {}}], "event.0.set: is empty; expected what changes"),
     "set nowhere": (
         [{"at": 1, "set": {"quality": 0.5}}],
@@ -71,7 +74,7 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
         [{"at": 1, "link": "eve", "set": {"quality": 2.0}}],
         "event.0.set.quality: is 2.0; expected a number",
     ),
-    "set what is not": ([{"at": 1, "link": "eve", "set": {"colour": 2}}], "event.0.set.colour: is nothing that can be"),
+    "set what is not": ([{"at": 1, "link": "eve", "set": {"colour": 2}}], "event.0.set.colour: is not a link setting"),
     "set a model wrongly": (
         [{"at": 1, "link": "eve", "set": {"loss": {"model": "pattern", "outcomes": "12"}}}],
         "event.0.set.loss.outcomes: is ",
@@ -90,7 +93,7 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
     ),
     "cut twice": (
         [{"from": 1, "to": 9, "cut": "eve"}, {"at": 3, "partition": ["eve"]}],
-        "event.1.cut: eve is cut already, from slot 1 on; expected it to heal before",
+        "event.1.cut: eve is cut already, from slot 1 on; expected a heal before",
     ),
     "back and gone at once": (
         [{"from": 1, "to": 5, "kill": "eve"}, {"at": 5, "pause": "eve"}],
@@ -98,13 +101,13 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
     ),
     "state of nobody": (
         [{"at": 1, "cut": "eve", "state": "last"}],
-        "event.0.state: is there without a restart; remove",
+        "event.0.state: is given without a restart; remove",
     ),
     "jams nothing": (
         [{"at": 1, "jam": "acknowledgements"}],
         "event.0.jam: the scheme innovation has no acknowledgements",
     ),
-    "unknown entry": ([{"at": 1, "cut": "eve", "why": "x"}], "event.0.why: is no entry of this table"),
+    "unknown entry": ([{"at": 1, "cut": "eve", "why": "x"}], "event.0.why: is not an entry of this table"),
     "seconds without length": (
         [{"at": 1, "link": "eve", "set": {"delay": {"model": "constant", "value": 1.0, "unit": "seconds"}}}],
         "event.0.set.delay.unit: is seconds; expected slot_seconds",
@@ -160,8 +163,8 @@ def test_all_wrong_events_are_named_at_once() -> None:
             {"delay": {"model": "constnat", "value": 1.0}},
             'delay.model: is "constnat"; expected constant, normal, pareto or',
         ),
-        ({"queue": 5}, "queue: is there without a rate"),
-        ({"reorder": 0.5}, "reorder: is there without a delay"),
+        ({"queue": 5}, "queue: is given without a rate"),
+        ({"reorder": 0.5}, "reorder: is given without a delay"),
         ({"rate": 0.0}, "rate: is 0.0"),
     ],
 )
@@ -276,4 +279,4 @@ def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | No
         assert right(event, eavesdroppers={"spy": spy}).leaks == {"spy": 15}
     else:
         (line,) = mistakes(event, eavesdroppers={"spy": spy})
-        assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is there"
+        assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is present"

@@ -180,7 +180,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "measured without noise": (
         {"plant__output_matrix": [[1.0, 0.0]]},
-        "plant.measurement_noise: is missing beside output_matrix; expected measurement_noise = [[0.01]], or neither",
+        "plant.measurement_noise: is missing, but output_matrix is given; expected measurement_noise = [[0.01]], or neither",
     ),
     "measured states": (
         {"plant__output_matrix": [[1.0]], "plant__measurement_noise": [[0.01]]},
@@ -192,14 +192,14 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "unseen": (
         {"plant__output_matrix": [[1.0, 0.0]], "plant__measurement_noise": [[0.01]]},
-        "plant.output_matrix: leaves the sensor's filter without an end: what it measures must show every state",
+        "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state",
     ),
     "inverse of Q": (
         {
             "process__singular_noise": True,
             "eavesdroppers": {"eve": {"strategy": "bayesian", "link": {"quality": 0.5}}},
         },
-        "eavesdroppers.eve.strategy: is bayesian, which reckons with the inverse of Q, and Q may be singular",
+        "eavesdroppers.eve.strategy: is bayesian, which uses the inverse of Q, and Q may be singular",
     ),
     "reserved": (
         {"eavesdroppers": {"controller": {"strategy": "smart", "link": {"quality": 0.5}}}},
@@ -303,5 +303,5 @@ def test_a_file_that_is_not_there_is_told() -> None:
         "plant.disturbance_file: none.csv cannot be read (No such file or directory); expected"
     )
     assert mistakes(plant__disturbance_file="none.csv") == [
-        "plant.disturbance_file: is there beside disturbance_values; expected one of them"
+        "plant.disturbance_file: is given together with disturbance_values; expected one of them"
     ]

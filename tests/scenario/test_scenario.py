@@ -50,7 +50,7 @@ def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("titel", "x", "titel: is no entry of this table; did you mean title?"),
+        ("titel", "x", "titel: is not an entry of this table; did you mean title?"),
         ("title", "", 'title: is ""; expected a string of at least one character, such as "Two'),
         ("slots", "many", 'slots: is "many"; expected a whole number, such as 2000'),
         ("slots", 2.5, "slots: is 2.5; expected a whole number"),
@@ -171,8 +171,8 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
     ("table", "said"),
     [
         ({**POOL, "links": None}, ["links: is missing; the strategy colluding needs it; expected links = [{ quality"]),
-        ({**POOL, "links": []}, ["links: has fewer than 2 entries; expected at least so many"]),
-        ({**POOL, "links": [{"quality": 2.0}] * 17}, ["links: has more than 16 entries; expected at most so many"]),
+        ({**POOL, "links": []}, ["links: has fewer than 2 entries; expected at least that many"]),
+        ({**POOL, "links": [{"quality": 2.0}] * 17}, ["links: has more than 16 entries; expected at most that many"]),
         ({**POOL, "links": [{"quality": 2.0}, {}]}, ["links.0.quality: is 2.0; expected a number from 0 to 1, such as",
                                                      "links.1.quality: is missing; expected quality = 0.9, or a loss"]),
         ({**POOL, "link": {"quality": 0.5}}, ["link: is set, but the strategy colluding has no such parameter; its ent"]),
@@ -218,7 +218,7 @@ def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entr
     table = {"strategy": strategy, "link": {"quality": 0.8}} if entry == "strategy" else {**POOL, "reads_as": strategy}
     (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
-        f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by what it knows of the schedule, and the scheme '
+        f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by its knowledge of the schedule, and the scheme '
         "plain has none; expected bayesian, constant, likelihood, naive, reference, selective or tracker"
     )
 
@@ -231,20 +231,20 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
     ("link", "said"),
     [
         ({}, "link.quality: is missing; expected quality = 0.9, or a loss model"),
-        ({"quality": 0.9, "loss": BURSTS}, "link.quality: is there beside loss, of which it is the short form"),
+        ({"quality": 0.9, "loss": BURSTS}, "link.quality: is given together with loss, whose short form it is"),
         ({"loss": 3}, "link.loss: is 3; expected a table, such as"),
         ({"loss": {}}, 'link.loss.model: is missing; expected model = "bernoulli", or another'),
         ({"loss": {"model": "gilbert"}}, 'link.loss.model: is "gilbert"; expected bernoulli'),
         ({"loss": {"model": ["x"]}}, 'link.loss.model: is ["x"]; expected bernoulli'),
         ({"loss": {"model": "bernoulli", "quality": 1.5}}, "link.loss.quality: is 1.5; expected a number from 0 to 1"),
         ({"loss": {"model": "gilbert-elliott", "p": 0.1}}, "link.loss.r: is missing; expected r = 0.5"),
-        ({"loss": {**BURSTS, "q": 0.1}}, "link.loss.q: is no parameter of gilbert-elliott; expected bad, good, p or r"),
+        ({"loss": {**BURSTS, "q": 0.1}}, "link.loss.q: is not a parameter of gilbert-elliott; expected bad, good, p or r"),
         ({"loss": {**BURSTS, "p": "often"}}, 'link.loss.p: is "often"; expected a number from 0 to 1'),
         ({"loss": {**BURSTS, "good": True}}, "link.loss.good: is true; expected a number from 0 to 1"),
         ({"loss": {**BURSTS, "bad": float("nan")}}, "link.loss.bad: is nan; expected a number from 0 to 1"),
         ({"loss": {**BURSTS, "p": 0, "r": 0.0}}, "link.loss.p: and r are both 0"),
-        ({"loss": {**CHAIN, "transitions": 0.5}}, "link.loss.transitions: is no matrix"),
-        ({"loss": {**CHAIN, "transitions": []}}, "link.loss.transitions: is no matrix"),
+        ({"loss": {**CHAIN, "transitions": 0.5}}, "link.loss.transitions: is not a matrix"),
+        ({"loss": {**CHAIN, "transitions": []}}, "link.loss.transitions: is not a matrix"),
         ({"loss": {**CHAIN, "transitions": [[0.5, 0.5]]}}, "link.loss.transitions: is not square"),
         ({"loss": {**CHAIN, "transitions": [[0.9, 0.2], [0.5, 0.5]]}}, "link.loss.transitions: row 0 sums to 1.1; expe"),
         ({"loss": {**CHAIN, "transitions": [[1.5, -0.5], [0.5, 0.5]]}}, "link.loss.transitions: row 0 is [1.5, -0.5]; e"),
@@ -333,8 +333,8 @@ def test_large_results_are_a_warning() -> None:
         ("a..b", "empty part"),
         ("", "empty part"),
         ("title.x", "x is not in a table or list"),
-        ("process.A.7.0", "7 is no entry of a list of 2; give 0 to 2"),
-        ("process.A.x", "x is no entry of a list of 2"),
+        ("process.A.7.0", "7 is not an entry of a list of 2; give 0 to 2"),
+        ("process.A.x", "x is not an entry of a list of 2"),
     ],
 )
 def test_a_dotted_key_that_leads_nowhere_is_refused(dotted: str, said: str) -> None:
@@ -393,7 +393,7 @@ def test_a_new_scenario_is_commented_and_has_no_mistake(tmp_path: Path) -> None:
     text = file.read_text()
     for entry in set(Scenario.model_fields) - {"made_with"}:
         assert entry in text, entry
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="exists already"):
         write_new(file)
     with pytest.raises(UsageError, match="cannot be written"):
         write_new(tmp_path / "no" / "folder.toml")

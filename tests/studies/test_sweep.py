@@ -169,7 +169,7 @@ BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (("--over", "sluts=1,2", "--trials", "5"), "sluts: is no entry of this table; did you mean slots?"),
+        (("--over", "sluts=1,2", "--trials", "5"), "sluts: is not an entry of this table; did you mean slots?"),
         (
             ("--over", "encoding.foo=1,2", "--trials", "5"),
             "encoding.foo: is set, but the scheme innovation has no such parameter",

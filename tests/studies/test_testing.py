@@ -226,7 +226,7 @@ def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
     assert "over slots 10 to 59 above 2: FAILED, found 0." in failed
     assert failed.endswith(f"see it again: evedrop montecarlo {kept} --trials 3")
     assert "results: kept/fails" in done.out
-    assert "sluts: is no entry of this table; did you mean slots?" in done.out
+    assert "sluts: is not an entry of this table; did you mean slots?" in done.out
     assert load_results(kept).summary["mode"] == "exact"
     assert 'name="evedrop_results" value="kept/holds"' in (evedrop.folder / "r.xml").read_text()
 

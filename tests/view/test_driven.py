@@ -117,6 +117,6 @@ def test_inputs_that_do_not_fit_are_refused(day: Path, tmp_path: Path) -> None:
     shutil.copytree(day, folder, ignore=shutil.ignore_patterns("*.rrd"))
     pq.write_table(pq.read_table(folder / "inputs.parquet").slice(0, 40), folder / "inputs.parquet")
     with pytest.raises(
-        UsageError, match=r"inputs\.parquet has not the slots of trials\.parquet; run the scenario again"
+        UsageError, match=r"inputs\.parquet does not have the slots of trials\.parquet; run the scenario again"
     ):
         replay(folder)

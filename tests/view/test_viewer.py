@@ -331,7 +331,7 @@ def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "17450", "here:17450", "127.0.0.1:", "127.0.0.1:65535", "127.0.0.1:x"])
 def test_a_place_that_is_none_is_refused(text: str) -> None:
     """An address and a port that has a next one."""
-    with pytest.raises(UsageError, match=r"is no address and port; give one such as 127\.0\.0\.1:17450"):
+    with pytest.raises(UsageError, match=r"is not an address and port; give one such as 127\.0\.0\.1:17450"):
         WebAddress.of(text)
 
 

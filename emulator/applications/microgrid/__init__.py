@@ -1,1 +1,1 @@
-"""A day of a house with solar panels, made once and kept: sun, appliances, and the file they are kept in."""
+"""A day of a house with solar panels, made once and stored: sun, appliances, and the file of the day."""

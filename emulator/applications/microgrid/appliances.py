@@ -1,8 +1,8 @@
-"""The load of a house over a day, from its appliances: how many are switched on when, and what each draws meanwhile.
+"""The load of a house over a day, from its appliances: when they are switched on, and the power that each draws.
 
-When people are at it is the standard load profile's: demandlib gives the household profile of the German energy association
-(BDEW), and an appliance is switched on as often as it says there, more likely where the profile is high. What each draws
-is ours, of the order of its name plate.
+The standard load profile says when people use appliances: demandlib gives the household profile of the German energy
+association (BDEW). An appliance is switched on as often as its entry says, more likely where the profile is high. The
+powers are our own, of the order of those on name plates.
 Source: docs/microgrid.md, the day.
 """
 
@@ -17,23 +17,23 @@ from evedrop.model.process import Floats
 
 SECONDS = 86_400
 STANDBY = 0.07
-"""kW that the house draws when everybody sleeps."""
+"""kW that the house draws when everybody is asleep."""
 
 
 @dataclass(frozen=True)
 class Appliance:
-    """Something that is switched on for a while.
+    """An appliance that is switched on for a while.
 
-    `cycle` and `duty`: the heater of an oven or a hob is switched by its thermostat, on for `duty` of every `cycle` seconds.
+    `cycle` and `duty`: a thermostat switches the heater of an oven or a hob on for `duty` of every `cycle` seconds.
     """
 
     name: str
     power: float
     """kW while it draws."""
     seconds: float
-    """How long it stays on, in the mean."""
+    """How long it stays on, on average."""
     times: float
-    """How often a day it is switched on, in the mean."""
+    """How often a day it is switched on, on average."""
     cycle: int = 1
     duty: float = 1.0
     programme: tuple[tuple[float, float], ...] = ()
@@ -56,7 +56,7 @@ APPLIANCES = (
 
 def household_profile(date: str, yearly: float) -> Floats:
     """Mean power in kW of every second of a day by the BDEW profile H25, for kWh a year, (86 400,). Needs demandlib."""
-    import pandas as pd  # noqa: PLC0415 - of an extra that only this needs
+    import pandas as pd  # noqa: PLC0415 - of an extra that only this function needs
     from demandlib import bdew  # noqa: PLC0415 - the same
 
     quarters = pd.date_range(f"{date[:4]}-01-01", f"{date[:4]}-12-31 23:45", freq="15min")
@@ -70,7 +70,7 @@ def load_power(profile: Floats, seed: int) -> Floats:
     """Load in kW of every second of a day, (86 400,), of a house whose people follow the profile, in any unit."""
     draws = Draws(seed, "appliances")
     load = STANDBY + refrigerator(draws)
-    active = profile - profile.min()  # what is left in the dead of night is no hand at a switch
+    active = profile - profile.min()  # nobody uses appliances at the profile's minimum, at night
     weight = active / active.sum()
     for appliance in APPLIANCES:
         for start in draws.times(appliance.times * weight):
@@ -92,7 +92,7 @@ def refrigerator(draws: Draws) -> Floats:
 
 
 def _drawn(appliance: Appliance, draws: Draws) -> Floats:
-    """What it draws, second by second, from when it is switched on."""
+    """The power it draws, second by second, from the moment it is switched on."""
     level = draws.uniform(0.85, 1.1)
     if appliance.programme:
         parts = [np.full(int(seconds * draws.uniform(0.9, 1.1)), level * kw) for kw, seconds in appliance.programme]

@@ -1,7 +1,7 @@
-"""The day that the microgrid's scenarios run on: made by this module, kept in the repository with where it is from.
+"""The day that the microgrid's scenarios use: made by this module, stored in the repository with its provenance.
 
-`python -m evedrop.applications.microgrid.day FOLDER` makes it again; it needs the extra `data` (pvlib, demandlib).
-A run needs neither.
+`python -m evedrop.applications.microgrid.day FOLDER` makes it again; this needs the extra `data` (pvlib, demandlib).
+A run does not.
 Source: docs/microgrid.md, the day.
 """
 
@@ -28,12 +28,12 @@ _LIBRARIES = ("pvlib", "demandlib", "pandas", "numpy")
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that a day depends on, but the versions of the libraries."""
+    """Everything that a day depends on, except the versions of the libraries."""
 
     date: str = "2024-05-15"
     seed: int = 4
     yearly_load: float = 3600.0
-    """kWh a year, of the profile. What appliances draw is their own; the profile says when."""
+    """kWh a year, for the profile. The profile decides when appliances run, and not the power they draw."""
     roof: Roof = field(default_factory=Roof)
     clouds: Clouds = field(default_factory=Clouds)
 
@@ -51,7 +51,7 @@ def as_csv(powers: Floats) -> str:
 
 
 def provenance(recipe: Recipe, text: str) -> dict[str, Any]:
-    """Where a day is from: recipe, versions, checksum of the table before it was compressed, and its energies in kWh."""
+    """The origin of a day: recipe, versions, checksum of the uncompressed table, and energies in kWh."""
     _, solar, load = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1, unpack=True)
     return {
         "made_by": "python -m evedrop.applications.microgrid.day",

@@ -1,9 +1,11 @@
-"""Random numbers in the order they are asked for, from a named stream: what makes a day, once.
+"""Random numbers from a named stream, in the order in which they are asked for; used to make a day.
 
 Source: docs/mathematics.md, random numbers.
 """
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 
@@ -11,8 +13,9 @@ from evedrop.kernels.elementary import log
 from evedrop.streams import Floats, Stream, normals, root_of_seed, stream_key, uniforms
 
 
+@final
 class Draws:
-    """Numbers of one stream, one after the other. Final."""
+    """The numbers of one stream, one after the other."""
 
     def __init__(self, seed: int, name: str) -> None:
         self._stream = Stream(stream_key(root_of_seed(seed), name), range(1), 1)
@@ -31,11 +34,11 @@ class Draws:
         return normals(self._stream.words(self._ahead(count)))[:, 0, 0]
 
     def exponential(self, mean: float) -> float:
-        """A waiting time."""
+        """An exponentially distributed time."""
         return float(-mean * log(1.0 - self.uniforms(1))[0])
 
     def times(self, rate: Floats) -> list[int]:
-        """Places of a Poisson process, in order: `rate` is how many are expected at each, (places,)."""
+        """Places of a Poisson process, in order: `rate` is the expected number at each, (places,)."""
         total = np.cumsum(rate)
         found, reached = [], self.exponential(1.0)
         while reached < total[-1]:

@@ -1,7 +1,7 @@
-"""The power of a roof's solar panels over a day: a clear sky over a real place, and clouds of our own.
+"""The power of a roof's solar panels over a day: the clear sky over a real place, with simulated clouds.
 
-pvlib gives sun, irradiance and cell temperature. The clouds are an alternation of clear and cloudy spells, each with a depth
-of its own, whose edges take some seconds to cross the panels, and the flicker of what is between.
+pvlib gives sun, irradiance and cell temperature. The clouds alternate between clear and cloudy spells; each cloudy spell has a
+depth of its own, edges that take some seconds to cross the panels, and a flicker.
 Source: docs/microgrid.md, the day.
 """
 
@@ -19,7 +19,7 @@ SECONDS = 86_400
 
 @dataclass(frozen=True)
 class Roof:
-    """Where the panels are and how they lie. Angles in degrees, altitude in metres, peak power in kW."""
+    """Location and orientation of the panels. Angles in degrees, altitude in metres, peak power in kW."""
 
     latitude: float = 37.4
     longitude: float = -6.0
@@ -30,12 +30,12 @@ class Roof:
     peak_power: float = 4.0
     inverter_efficiency: float = 0.96
     temperature_coefficient: float = -0.004
-    """Of power, per kelvin of the cells."""
+    """The change of power per kelvin of the cells' temperature."""
 
 
 @dataclass(frozen=True)
 class Clouds:
-    """Spells in seconds, means of exponential times; depth is the share of the clear sky's power that is left."""
+    """Spells in seconds, means of exponential times; depth is the remaining share of the clear sky's power."""
 
     clear: float = 900.0
     cloudy: float = 240.0
@@ -49,7 +49,7 @@ class Clouds:
 
 def clear_sky(roof: Roof, date: str) -> Floats:
     """Power in kW of every second of a day without clouds, (86 400,). Needs pvlib, of the extra `data`."""
-    import pandas as pd  # noqa: PLC0415 - of an extra that only this needs
+    import pandas as pd  # noqa: PLC0415 - of an extra that only this function needs
     import pvlib  # noqa: PLC0415 - the same
 
     place = pvlib.location.Location(roof.latitude, roof.longitude, roof.time_zone, roof.altitude)

@@ -1,4 +1,4 @@
-"""Strategies of control by their name in a scenario: one file each."""
+"""Control strategies by their name in a scenario: one file each."""
 
 from __future__ import annotations
 

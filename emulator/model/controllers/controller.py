@@ -1,4 +1,4 @@
-"""What a controller is told, and what it must do: from the estimate of a slot to the inputs that are held from then on."""
+"""The base class of controllers and its assignment: from the estimate of a slot to the inputs held from then on."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from evedrop.model.receiver import Flags
 
 @dataclass(frozen=True)
 class Assignment:
-    """What a controller is told. States are deviations from the public reference, which is what it steers to."""
+    """All that a controller knows. States are deviations from the public reference, to which it steers."""
 
     process: Process
-    """Its A is the plant's."""
+    """Its A is the plant's A."""
     plant: Plant
     period: int
-    """Slots from one decision to the next: the inputs are held between them."""
+    """Slots between decisions; the inputs are held between them."""
     slot_seconds: float
-    """What a slot lasts."""
+    """The duration of a slot."""
     state_weights: Floats
     """Diagonal of the weight of the states, (n,)."""
     input_weights: Floats
     """Diagonal of the weight of the inputs, (m,)."""
     rate_weights: Floats
-    """Diagonal of the weight of the inputs' change from one decision to the next, (m,)."""
+    """Diagonal of the weight of the inputs' change between decisions, (m,)."""
     rate_limits: Floats
-    """By how much each input may change from one decision to the next, (m,); inf where there is no limit."""
+    """The largest change of each input between decisions, (m,); inf where there is no limit."""
     parameters: Mapping[str, Any]
-    """The strategy's own."""
+    """The strategy's own parameters."""
 
     @property
     def spec(self) -> dict[str, Any]:
-        """As plain numbers, for a brief, but for process and plant; None for a limit that is none."""
+        """The assignment as plain numbers, for a brief, without process and plant; None for a limit that does not exist."""
         weights = {name: getattr(self, name).tolist() for name in ("state_weights", "input_weights", "rate_weights")}
         limits = [value if np.isfinite(value) else None for value in self.rate_limits.tolist()]
         return {
@@ -52,7 +52,7 @@ class Assignment:
 
     @classmethod
     def of(cls, process: Process, plant: Plant, spec: Mapping[str, Any]) -> Assignment:
-        """From its `spec`."""
+        """The assignment of a `spec`."""
         arrays = {name: np.array(spec[name], np.float64) for name in ("state_weights", "input_weights", "rate_weights")}
         limits = np.array([np.inf if value is None else value for value in spec["rate_limits"]], np.float64)
         return cls(
@@ -67,37 +67,37 @@ class Assignment:
 
 
 class Controller(ABC):
-    """A strategy of control. A file of this folder holds one, registered by its name in a scenario.
+    """A control strategy. Each file of this folder defines one, registered by its name in a scenario.
 
-    `parameters` are the entries that the scenario's `[controller]` gives this strategy, each with an example.
+    `parameters` are the entries of the scenario's `[controller]` for this strategy, each with an example.
     """
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[Mapping[str, Any]] = MappingProxyType({})
-    """Those of `parameters` that may be left out, with their defaults."""
+    """Defaults of the `parameters` that may be left out."""
 
     def __init__(self, assignment: Assignment, trials: int) -> None:
         self.assignment = assignment
         self.trials = trials
         self.failed: Flags = np.zeros(trials, np.bool_)
-        """Where the last decision could not be made, (R,), and the inputs before were held."""
+        """Whether the last decision failed, (R,), so that the previous inputs were held."""
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
         del given
         return []
 
     @classmethod
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
-        """Why it cannot do what is asked: (entry of `[controller]`, what was found and expected)."""
+        """Reasons why it cannot do what is asked: (entry of `[controller]`, value found and expected)."""
         del assignment
         return []
 
     @abstractmethod
     def decide(self, k: int, x_hat: Floats, d: Floats) -> Floats:
-        """The inputs (m, R) from slot k on, which is a multiple of the period; slots come in order.
+        """The inputs (m, R) from slot k on, a multiple of the period; slots come in order.
 
         x_hat: estimate of the state of slot k, (n, R); d: the disturbances of slot k, (q,), or (q, R) where trials differ.
-        Sets `failed`. A trial's inputs must not depend on what other trials there are.
+        Sets `failed`. A trial's inputs must not depend on the other trials.
         """

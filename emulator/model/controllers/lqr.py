@@ -1,12 +1,14 @@
-"""The linear quadratic regulator, its inputs clipped to what may be: no solver, and the same bits on every machine.
+"""The linear quadratic regulator with clipped inputs: it needs no solver, and gives the same bits on every machine.
 
-It minimises Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) over decisions, u′ being the inputs before, as if there were neither
-limits nor disturbances: u = −K [x; u′]. The Riccati equation is solved by the structured doubling algorithm.
+It minimises Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) over decisions, with u′ the previous inputs, ignoring limits
+and disturbances: u = −K [x; u′]. The Riccati equation is solved by the structured doubling algorithm.
 
 Source: Chu, Fan and Lin (2005), Linear Algebra and its Applications 396; docs/mathematics.md, regulator.
 """
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 
@@ -14,20 +16,20 @@ from evedrop.kernels.elementary import inverse
 from evedrop.model.controllers.controller import Assignment, Controller
 from evedrop.model.process import Floats, product
 
-_DOUBLINGS = 60  # 2⁶⁰ decisions: what has not settled by then never will
+_DOUBLINGS = 60  # 2⁶⁰ decisions: an iteration that has not settled after them never will
 _SETTLED = 1e-13
 
 
 def gain(assignment: Assignment) -> Floats:
     """K (m, n + m) of u = −K [x; u′].
 
-    Raises ValueError where no input keeps the weighted states from growing.
+    Raises ValueError if no input keeps the weighted states from growing.
     """
     A, B = held(assignment)
     n, m = B.shape
     weight_u, weight_r = np.diag(assignment.input_weights), np.diag(assignment.rate_weights)
     both = weight_u + weight_r
-    # With v = u − (W_u + W_r)⁻¹ W_r u′ in place of u the weights have no products of inputs and states any more.
+    # With v = u − (W_u + W_r)⁻¹ W_r u′ instead of u the weights have no products of inputs and states.
     share = product(inverse(both), weight_r)
     F = np.zeros((n + m, n + m))
     F[:n, :n], F[:n, n:], F[n:, n:] = A, product(B, share), share
@@ -43,9 +45,9 @@ def gain(assignment: Assignment) -> Floats:
 
 
 def held(assignment: Assignment, entry: Floats | None = None) -> tuple[Floats, Floats]:
-    """A and B from one decision to the next, (n, n) and (n, m), the inputs being held between them.
+    """A and B from one decision to the next, (n, n) and (n, m), with the inputs held in between.
 
-    entry: instead of B how something else enters the states that is held as long, such as B_d.
+    entry: a matrix by which something else that is held enters the states, such as B_d, instead of B.
     """
     A, B = assignment.process.A, assignment.plant.input_matrix if entry is None else entry
     power, driven = np.eye(len(A)), np.zeros(B.shape)
@@ -78,8 +80,9 @@ def _transposed(M: Floats) -> Floats:
     return np.ascontiguousarray(M.T)
 
 
+@final
 class Lqr(Controller):
-    """Clipped: first to what the inputs may change by, then to their limits. Final."""
+    """Clips inputs first to the limits of their change, then to their own limits."""
 
     def __init__(self, assignment: Assignment, trials: int) -> None:
         super().__init__(assignment, trials)
@@ -91,7 +94,7 @@ class Lqr(Controller):
 
     @classmethod
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
-        """Weights that leave an input free, and states that no input keeps in check."""
+        """Weights that leave an input free, and states that no input can keep from growing."""
         both = assignment.input_weights + assignment.rate_weights
         if not np.all(both > 0.0):
             return [

@@ -1,11 +1,11 @@
-"""Model predictive control: at every decision the best inputs of a horizon of decisions, of which the first is applied.
+"""Model predictive control: every decision finds the best inputs over a horizon of decisions and applies the first.
 
-It minimises Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) + soft·‖s‖² over `horizon` decisions of a period each, the
-disturbances staying what they are now, within the limits of inputs and of their change; s is by how much states are beyond
-theirs, which no input may be able to prevent.
+It minimises Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) + soft·‖s‖² over `horizon` decisions of a period each, with
+disturbances constant at their current values, within the limits of inputs and of their change; s is the amount by which
+states exceed their limits, which inputs may be unable to prevent.
 
-Solved by OSQP, of the extra `microgrid`. A solver goes through LAPACK's kind of arithmetic, so its last bits, unlike those of
-everything else that enters a digest, may differ from processor to processor: a live run and the same in memory agree on
+OSQP, of the extra `microgrid`, solves it. A solver's arithmetic is like LAPACK's, so its last bits may, unlike those of
+everything else that enters a digest, differ between processors: a live run and the same run in memory agree on
 one machine.
 Source: docs/microgrid.md, controllers.
 """
@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -33,7 +33,7 @@ _SETTINGS: Mapping[str, Any] = MappingProxyType(
         "eps_abs": 1e-4,
         "eps_rel": 1e-4,
         "max_iter": 4000,
-        # By iterations, not by the clock: the same decision twice from the same numbers.
+        # Adapted by iterations, not by the clock: the same numbers give the same decision.
         "adaptive_rho": True,
         "adaptive_rho_interval": 50,
         "check_termination": 10,
@@ -42,10 +42,11 @@ _SETTINGS: Mapping[str, Any] = MappingProxyType(
 )
 
 
+@final
 class Mpc(Controller):
-    """A solver for every trial, each started from where it was at the decision before. Final.
+    """A solver for every trial, each started from its solution of the previous decision.
 
-    Where a solver finds no solution the inputs before are held, and `failed` says so.
+    Where a solver finds no solution, the previous inputs are held and `failed` is set.
     """
 
     parameters = MappingProxyType({"horizon": 60, "soft": 1000.0})
@@ -53,7 +54,7 @@ class Mpc(Controller):
 
     def __init__(self, assignment: Assignment, trials: int) -> None:
         super().__init__(assignment, trials)
-        import osqp  # noqa: PLC0415 - of an extra, and a tenth of a second that nobody else should wait for
+        import osqp  # noqa: PLC0415 - an optional dependency, and a tenth of a second for those that do not need it
 
         self._programme = programme = _Programme(assignment)
         self._solvers = []
@@ -68,7 +69,7 @@ class Mpc(Controller):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """A horizon that is no number of decisions, a weight that is none."""
+        """A horizon that is not a number of decisions, or a weight that is not positive."""
         found = []
         horizon, soft = given.get("horizon", 1), given.get("soft", 1.0)
         if type(horizon) is not int or not 1 <= horizon <= 1000:
@@ -79,7 +80,7 @@ class Mpc(Controller):
 
     @classmethod
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
-        """Without the solver there is no such controller, and without weights no best inputs."""
+        """A missing or broken solver, and inputs without weight, for which no best inputs exist."""
         if find_spec("osqp") is None:
             return [
                 ("strategy", "is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first")
@@ -110,11 +111,11 @@ class Mpc(Controller):
 
 
 def _broken() -> str | None:
-    """Why the solver, which is installed, cannot be used; None if it can."""
+    """Why the installed solver cannot be used; None if it can."""
     try:
         osqp = import_module("osqp")
         _ = osqp.OSQP, int(osqp.SolverStatus.OSQP_SOLVED)
-    except Exception as error:  # a broken extension module raises anything
+    except Exception as error:  # importing a broken extension module may raise anything
         return f"importing osqp raised {type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
     return None
 
@@ -126,7 +127,7 @@ class _Programme:
     """
 
     def __init__(self, assignment: Assignment) -> None:
-        sparse: Any = import_module("scipy.sparse")  # late: where there is no such controller nobody waits for it
+        sparse: Any = import_module("scipy.sparse")  # imported only where there is such a controller
 
         plant, N = assignment.plant, int(assignment.parameters["horizon"])
         A, B = held(assignment)
@@ -165,7 +166,7 @@ class _Programme:
         ).clip(-_UNBOUNDED, _UNBOUNDED)
 
     def at(self, x: Floats, d: Floats, before: Floats) -> tuple[Floats, Floats, Floats]:
-        """Linear term and limits of the rows for a state x (n,), disturbances d (q,) and the inputs before (m,)."""
+        """Linear term and limits of the rows, for a state x (n,), disturbances d (q,) and the previous inputs (m,)."""
         n, m, N = self._n, self._m, self._N
         moved = np.tile(self._disturbed @ d, N)
         moved[:n] += self._A @ x
@@ -177,7 +178,7 @@ class _Programme:
         return self.linear, self.lower, self.upper
 
     def first(self, solution: Floats, before: Floats) -> Floats:
-        """The first inputs of a solution, (m,): within their limits exactly, which a solver keeps to its tolerance only."""
+        """The first inputs of a solution, (m,), exactly within their limits, which a solver keeps only to its tolerance."""
         u = solution[self._n * self._N : self._n * self._N + self._m]
         u = np.clip(u, before - self._rate, before + self._rate)
         return np.clip(u, self._input_lower, self._input_upper)

@@ -15,7 +15,7 @@ def is_number(value: Any) -> bool:
 
 
 def length_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
-    """A mistake for every one of the names that is given and no length of time."""
+    """A mistake for every one of the names that is given and is not a length of time."""
     return [
         (name, f"is {given[name]!r}; expected a number from 0 to {LONGEST:.0f}")
         for name in names

@@ -1,4 +1,4 @@
-"""Every packet takes equally long."""
+"""The same delay for every packet."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class ConstantDelay(DelayModel):
         return length_mistakes(given, "value")
 
     def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
-        """As given."""
+        """The constant."""
         return np.full(numbers.shape, self._value)
 
     def arrived(self, lag: int) -> float | None:
-        """All or nothing."""
+        """1 if the delay is shorter, otherwise 0."""
         return float(self._value < lag + 1)

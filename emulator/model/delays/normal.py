@@ -1,4 +1,4 @@
-"""Delays that scatter about a mean, as netem's."""
+"""Normally distributed delays, as netem's."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.model.process import Floats
 
 
 class Normal(DelayModel):
-    """Delays max(0, mean + deviation · N(0, 1)), independent: packets overtake each other where they fall so.
+    """Delays max(0, mean + deviation · N(0, 1)), independent, so packets may overtake each other.
 
     Source: docs/mathematics.md, late packets.
     """
@@ -33,7 +33,7 @@ class Normal(DelayModel):
         return length_mistakes(given, "mean", "deviation")
 
     def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
-        """From a standard normal number each."""
+        """Each from a standard normal number."""
         scattered: Floats = self._mean + self._deviation * numbers
         return np.maximum(0.0, scattered)
 

@@ -1,4 +1,4 @@
-"""Delays with a heavy tail: mostly short, now and then very long."""
+"""Delays with a heavy tail: mostly short, occasionally very long."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pareto(DelayModel):
         return found
 
     def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
-        """From a uniform number each, in [0, 1)."""
+        """Each from a uniform number in [0, 1)."""
         stretched: Floats = self._least * exp(log(1.0 - numbers) / -self._shape)
         return np.minimum(LONGEST, stretched)
 

@@ -1,4 +1,4 @@
-"""Delays as they were recorded on a real link, in their order."""
+"""Delays recorded on a real link, in their order."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from evedrop.model.delays.delay import LONGEST, DelayModel
 from evedrop.model.process import Floats
 
 MOST_DELAYS = 900_000
-"""Of all links of a scenario together: its results hold them in their copy of the scenario."""
+"""The most recorded delays of all links of a scenario together: the results contain them in their copy of the scenario."""
 
 
 class RecordedDelay(DelayModel):
-    """The packet of slot k takes `values[k]`, repeated without end; the same in every trial.
+    """The packet of slot k takes `values[k]`, repeated without end, and the same in every trial.
 
-    A scenario names a `file`, whose numbers are put in the place of `values` when it is loaded.
+    A scenario names a `file`; loading it replaces the name by its numbers, as `values`.
     """
 
     parameters = MappingProxyType({"values": [0.5, 2.0, 1.25]})
@@ -33,17 +33,17 @@ class RecordedDelay(DelayModel):
         """Delays, and at least one."""
         values = given.get("values", [0.0])
         if not isinstance(values, list) or not 1 <= len(values) <= MOST_DELAYS:
-            return [("values", f"is no list of 1 to {MOST_DELAYS} delays; expected values = [0.5, 2.0]")]
+            return [("values", f"is not a list of 1 to {MOST_DELAYS} delays; expected values = [0.5, 2.0]")]
         wrong = next((i for i, one in enumerate(values) if not (is_number(one) and 0.0 <= one <= LONGEST)), None)
         if wrong is not None:
-            return [(f"values.{wrong}", f"is no delay; expected a number from 0 to {LONGEST:.0f}")]
+            return [(f"values.{wrong}", f"is not a delay; expected a number from 0 to {LONGEST:.0f}")]
         return []
 
     def delays(self, first: int, numbers: Floats) -> Floats:
-        """By the slot alone."""
+        """The delays of these slots, the same in every trial."""
         places = np.arange(first, first + len(numbers)) % len(self._values)
         return np.repeat(self._values[places][:, None], numbers.shape[1], axis=1)
 
     def arrived(self, lag: int) -> float | None:  # noqa: ARG002 - slots differ
-        """Not alike for all slots."""
+        """None, because slots differ."""
         return None

@@ -1,8 +1,8 @@
-"""The Bayesian eavesdropper: knows the mechanism and not the secret, and weighs every history that is left.
+"""The Bayesian eavesdropper: knows the mechanism but not the secret, and weighs every possible history.
 
 Its posterior is a mixture with a component for each slot j that may have brought the last state packet it received: x_j was
-that packet, and all that came after were innovations. A packet either opens a new component, of itself, or was one more
-innovation for all others.
+that packet, and all later packets were innovations. A packet either starts a new component, or is one more innovation
+for all others.
 
 Source: docs/mathematics.md, bayesian eavesdropper.
 """
@@ -26,14 +26,14 @@ from evedrop.streams import Batch
 _Kind = TypeVar("_Kind", bound=np.generic)
 
 CAPACITY = 12
-"""Components a trial may have; beyond it the two least probable ones become one of the same mean and covariance."""
-_CERTAIN = 300.0  # an exponent at which a packet is the state beyond all doubt, and still far from overflow
-_SURE = 1e300  # odds of any greater amount
-_IMPOSSIBLE = -700.0  # one at which it is not, and still far from underflow
+"""The most components of a trial; beyond it the two least probable ones are merged, with the same mean and covariance."""
+_CERTAIN = 300.0  # an exponent at which a packet is certainly the state, still far from overflow
+_SURE = 1e300  # stands for all larger odds
+_IMPOSSIBLE = -700.0  # an exponent at which it certainly is not, still far from underflow
 
 
 class Bayesian(PacketReader):
-    """Minimum mean square error, but for what is lost where too many components must be told apart.
+    """Minimum mean square error, apart from the loss where too many components would have to be kept.
 
     `Belief.memory` is its `Mixture`.
     """
@@ -50,20 +50,20 @@ class Bayesian(PacketReader):
         self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
 
     def prior(self, first: int = 0) -> Belief:
-        """One component: nothing was received."""
+        """One component, without any reception."""
         belief = super().prior(first)
         n, trials = belief.x_hat.shape
         spread = Factors.alike(Factor.of_triangular(cholesky(belief.P[:, :, 0]).tolist()), (1, trials))
         return belief._replace(memory=Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *spread))
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """One component without spread."""
+        """One component with covariance 0."""
         belief, (n, trials) = super().knowing(k, x, belief), x.shape
         nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
         return belief._replace(memory=Mixture(np.ones((1, trials)), x[:, None, :], *nothing))
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """Predict every component, weigh it by the packet, add that of the packet itself: the mean and covariance of all."""
+        """Predict every component, weight it by the packet and add the packet's own; returns their common mean and covariance."""
         gamma, z = heard.gamma, np.where(heard.gamma, heard.z, 0.0)
         mixture = Mixture(*belief.memory)
         if k == 0:
@@ -80,9 +80,9 @@ class Bayesian(PacketReader):
         return Belief(x_hat, P, action, mixture)
 
     def _weighed(self, of: Mixture, gamma: Flags, z: Floats, leak: Leak) -> tuple[Mixture, Floats]:
-        """The components a slot later, and the probability that the packet is the state, (R,).
+        """The components one slot later, and the probability that the packet is the state, (R,).
 
-        Places that are empty are left out of all that costs: half of them are, most of the time.
+        The costly steps skip empty places, which usually are half of all.
         """
         there = np.flatnonzero(of.weight)
         trial = self._trial_of[there]
@@ -108,7 +108,7 @@ class Bayesian(PacketReader):
     def _type_probabilities(self, ratio: Floats, gamma: Flags) -> tuple[Floats, Floats]:
         """Probabilities that the packet is the state, and that it is not, (R,); 0 and 1 where nothing was received.
 
-        ratio: of the packet's densities as the one and as the other, (R,).
+        ratio: of the packet's densities under the two types, (R,).
         """
         if self._mu_d == 1.0:
             state = gamma.astype(np.float64)
@@ -118,7 +118,7 @@ class Bayesian(PacketReader):
 
 
 def _taken(part: NDArray[_Kind], places: NDArray[np.intp]) -> NDArray[_Kind]:
-    """Some places of the last axis, all of them known to be there."""
+    """Some places of the last axis, all of them valid."""
     return part.take(places, axis=-1, mode="clip")
 
 
@@ -133,12 +133,12 @@ def _squared(white: Floats) -> Floats:
 def _weighed_ratios(
     heard: Flags, weight: Floats, squared: Floats, diagonal: Floats, alone: Floats, leak: Leak
 ) -> Floats:
-    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) of components whose trial received z, (N,); 0 of others.
+    """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) of components whose trial received z, (N,); 0 for all others.
 
     weight: π, (N,); squared: (z − m)ᵀ P⁻¹ (z − m), (N,); diagonal: D of P's factors, (n, N); alone: zᵀ Σ_k⁻¹ z, (N,).
     """
     exponent = 0.5 * (alone - squared)
-    # Most are told apart by far, and need no exponential.
+    # Most packets are far from the threshold, and need no exponential.
     some = np.flatnonzero((exponent > _IMPOSSIBLE) & heard)
     determinant = np.ones(len(some))
     for D, state in zip(diagonal, leak.state_diagonal, strict=True):
@@ -150,9 +150,9 @@ def _weighed_ratios(
 
 
 def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
-    """With a component of each packet z (n, R) in its trial's first empty place, by its probability `state` (R,).
+    """The mixture with a new component for each packet z (n, R), in the trial's first empty place, weighted by `state` (R,).
 
-    Takes the arrays of `of` over: they are not to be used any more.
+    Takes ownership of the arrays of `of`, which must not be used afterwards.
     """
     new = np.flatnonzero(state > NEGLIGIBLE)
     free = of.weight[:, new] == 0.0

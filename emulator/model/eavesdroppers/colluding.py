@@ -1,7 +1,7 @@
-"""Colluding eavesdroppers: several links, one reader. What any of them heard, all of them have.
+"""Colluding eavesdroppers: several links and one reader, which hears what any of the links delivers.
 
-Pooling is done where the links are: a packet reaches the reader if any of its links delivers it. To the reader that is one
-better link, so there is nothing to do here.
+The links themselves are pooled: a packet reaches the reader if any of its links delivers it. For the reader that is one
+better link, so nothing remains to be done here.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The constant eavesdropper: does not listen at all."""
+"""The constant eavesdropper, which does not listen."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evedrop.model.receiver import Flags
 
 
 class ConstantEstimate(PacketTaker):
-    """b_k = 0 always: x̂ = 0 and P = Σ_k. Whoever does worse would do better not to listen.
+    """b_k = 0 always: x̂ = 0 and P = Σ_k. An eavesdropper with a larger error would do better not to listen.
 
     Source: docs/mathematics.md, eavesdroppers.
     """

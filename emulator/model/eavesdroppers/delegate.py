@@ -1,4 +1,4 @@
-"""Eavesdroppers that have something besides a way to read packets, and read them as another strategy does."""
+"""Eavesdroppers with an additional ability that otherwise read packets as another strategy does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evedrop.streams import Batch
 
 
 class Delegate(Eavesdropper):
-    """Reads as `reads_as` does, and is given what that strategy must be given."""
+    """Reads as `reads_as` does, with the keys that that strategy needs."""
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({"reads_as": "smart"})
 
@@ -24,21 +24,21 @@ class Delegate(Eavesdropper):
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
-        """The reader's."""
+        """The reader's streams."""
         return READERS[parameters["reads_as"]].streams(parameters)
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
-        """The reader's."""
+        """The reader's outcomes."""
         return READERS[parameters["reads_as"]].outcomes(parameters, mu_d)
 
     @classmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
-        """As the reader."""
+        """Whether the reader follows γ."""
         return READERS[parameters["reads_as"]].follows_gamma(parameters)
 
     def prior(self, first: int = 0) -> Belief:
-        """The reader's."""
+        """The reader's prior."""
         return self.reader.prior(first)
 
     def act(self, k: int, gamma: Flags) -> Codes:
@@ -46,5 +46,5 @@ class Delegate(Eavesdropper):
         return self.reader.act(k, gamma)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """As the reader."""
+        """The reader's belief."""
         return self.reader.step(k, belief, heard)

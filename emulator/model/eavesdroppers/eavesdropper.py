@@ -1,4 +1,4 @@
-"""What an eavesdropper may be handed, what it must say of itself, and how it is made."""
+"""The base classes of eavesdroppers: what they may know, what they must declare, and how they are made."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ class Knowledge:
     """μ_d."""
     parameters: Mapping[str, Any]
     keys: Mapping[str, bytes]
-    """Of the strategy's streams: `schedule`, and `coin` for its own random numbers."""
+    """Keys of the strategy's streams: `schedule`, and `coin` for its own random numbers."""
 
 
 class Eavesdropper(Receiver):
     """A strategy: how an eavesdropper reads packets.
 
-    A file of this folder holds one strategy. `parameters` are the entries that a scenario must give it, each with an
-    example; `Knowledge.parameters` has what it gives.
+    Each file of this folder defines one strategy. `parameters` are the entries that a scenario must give it, each with an
+    example; `Knowledge.parameters` has the values given.
     """
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     pools_links: ClassVar[bool] = False
-    """Whether it has several links in place of one: what any of them delivers, it hears."""
+    """Whether it has several links instead of one; it hears what any of them delivers."""
     only_against: ClassVar[tuple[str, str] | None] = None
     """The only scheme that `evedrop compare` sets it against, and what it would be against any other; None: all schemes."""
     inverts_noise: ClassVar[bool] = False
@@ -49,40 +49,40 @@ class Eavesdropper(Receiver):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
         del given
         return []
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
-        """The streams whose keys it must be given: of the secret, or `coin`, its own."""
+        """The streams whose keys it must be given: streams of the secret, or its own stream `coin`."""
         del parameters
         return ()
 
     @classmethod
     @abstractmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
-        """What it does with a slot behind a link of any quality μ_e, for the theory; None: no closed form is known."""
+        """Its outcomes behind a link of any quality μ_e, for the theory; None if no closed form is known."""
 
     @classmethod
     @abstractmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
-        """Whether γ alone tells its actions, and these, by the table of `model.update`, its covariances."""
+        """Whether γ alone determines its actions, and its actions, by the table of `model.update`, its covariances."""
 
     @classmethod
     def betrayed(cls, parameters: Mapping[str, Any]) -> int | None:
-        """The slot whose true state must be handed to it, as `Heard.truth`; None for almost everybody."""
+        """The slot whose true state must be given to it as `Reception.truth`; None for almost all strategies."""
         del parameters
         return None
 
-    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:  # noqa: ARG002 - who remembers slots wants theirs
-        """Belief of who, besides what it believes after slot k, is told that slot's state x (n, R)."""
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:  # noqa: ARG002 - overrides use both
+        """The belief after slot k once that slot's true state x (n, R) is known as well."""
         n, trials = x.shape
         return Belief(x, np.zeros((n, n, trials)), belief.action)
 
 
 class PacketTaker(PacketUser, Eavesdropper):
-    """The paper's class: takes a packet for the state, or ignores it.
+    """The paper's class: uses a packet as the state, or ignores it.
 
     Source: docs/mathematics.md, eavesdroppers.
     """
@@ -94,21 +94,21 @@ class PacketTaker(PacketUser, Eavesdropper):
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
-        """By its two probabilities."""
+        """Outcomes from the two probabilities."""
         use_state, use_innovation = cls.use_probabilities(parameters)
         return lambda mu_e: Outcomes.eavesdropper(mu_e, mu_d, use_state, use_innovation)
 
     @classmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:  # noqa: ARG003 - alike for all
-        """By definition."""
+        """True by definition."""
         return True
 
 
 class PacketReader(Eavesdropper):
-    """Looks into the packets, or uses more of them than the state: its covariance is its own affair."""
+    """Looks into the packets, or uses more of them than the state; its covariance is its own affair."""
 
     def act(self, k: int, gamma: Flags) -> Codes:
-        """Not known. Raises NotImplementedError; studies that ask for it refuse the strategy before."""
+        """Unknown. Raises NotImplementedError; studies that need it refuse the strategy before."""
         raise NotImplementedError(
             f"{type(self).__name__} reads the packet of slot {k}: γ alone does not tell its action"
         )
@@ -120,5 +120,5 @@ class PacketReader(Eavesdropper):
 
     @classmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:  # noqa: ARG003 - alike for all
-        """By definition not."""
+        """False by definition."""
         return False

@@ -1,4 +1,4 @@
-"""The genie: knows the type of every packet and uses all that it tells. No eavesdropper without the secret does better."""
+"""The genie: knows the type of every packet and uses all information in it. No eavesdropper without the secret does better."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from evedrop.streams import Batch
 
 
 class Genie(PacketReader):
-    """Exact MMSE given the schedule: an innovation shrinks the noise it hides from Q to Q − QΣ_k⁻¹Q.
+    """Exact MMSE given the schedule: an innovation reduces the noise from Q to Q − QΣ_k⁻¹Q.
 
-    Its belief is true, and its mean error a bound from below on every eavesdropper behind the same link.
+    Its belief is correct, and its mean error is a lower bound for every eavesdropper behind the same link.
 
     Source: docs/mathematics.md, genie.
     """
@@ -38,7 +38,7 @@ class Genie(PacketReader):
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:  # noqa: ARG003 - it has none
-        """States used, innovations read for what they leak."""
+        """States used, innovations read for their leak."""
         return lambda mu_e: Outcomes.genie(mu_e, mu_d)
 
     def act(self, k: int, gamma: Flags) -> Codes:

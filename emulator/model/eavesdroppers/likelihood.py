@@ -1,7 +1,7 @@
-"""The likelihood eavesdropper: settles every packet's type at once by a likelihood ratio, and never looks back.
+"""The likelihood eavesdropper: decides every packet's type at once by a likelihood ratio, and never revises it.
 
 It is easily fooled: an innovation taken for the state starts a false track, next to which true states look like
-innovations for ever after. It is here to show that a cheap detector is no stand-in for the Bayesian one.
+innovations from then on. It shows that a cheap detector cannot replace the Bayesian one.
 
 Source: docs/mathematics.md, bayesian eavesdropper.
 """
@@ -20,7 +20,7 @@ from evedrop.streams import Batch
 
 
 class Likelihood(PacketReader):
-    """A packet is the state if μ_d N(z; A x̂, A P Aᵀ + Q) > (1−μ_d) N(z; 0, Σ_k), else an innovation.
+    """A packet is the state if μ_d N(z; A x̂, A P Aᵀ + Q) > (1−μ_d) N(z; 0, Σ_k), and otherwise an innovation.
 
     `Belief.memory` is P's factors, (n (n−1)/2, R) and (n, R).
     """
@@ -35,13 +35,13 @@ class Likelihood(PacketReader):
         self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
 
     def prior(self, first: int = 0) -> Belief:
-        """Nothing was received."""
+        """The belief without any reception."""
         belief = super().prior(first)
         factor = Factor.of_triangular(cholesky(belief.P[:, :, 0]).tolist())
         return belief._replace(memory=Factors.alike(factor, (self.trials,)))
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """A track of no error."""
+        """A track without error."""
         n, trials = x.shape
         nothing = np.zeros((n * (n - 1) // 2, trials)), np.zeros((n, trials))
         return super().knowing(k, x, belief)._replace(memory=nothing)

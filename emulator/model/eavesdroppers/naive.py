@@ -10,14 +10,14 @@ from evedrop.model.receiver import Flags
 
 
 class Naive(PacketTaker):
-    """b_k = 1 always; it is given nothing.
+    """b_k = 1 always; it needs no knowledge.
 
     Source: the paper, naive eavesdropper.
     """
 
     @classmethod
     def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:  # noqa: ARG003 - it has none
-        """Certain for either type."""
+        """Certain for both types."""
         return 1.0, 1.0
 
     def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike

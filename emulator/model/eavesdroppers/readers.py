@@ -21,7 +21,7 @@ from evedrop.model.registry import Registry
 
 GROUP = "evedrop.eavesdroppers"
 RESERVED = ("strategy", "link", "links", "window")
-"""Entries that the table of every eavesdropper has."""
+"""Entries in the table of every eavesdropper."""
 
 _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "naive": Naive,
@@ -36,7 +36,7 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "tracker": Tracker,
 }
 ANSWERS = Answers()
-"""What the classes of eavesdroppers that are not built in have said of themselves, in this process."""
+"""The answers of eavesdropper classes that are not built in, in this process."""
 READERS: Registry[Eavesdropper] = Registry(
     "eavesdropper",
     Eavesdropper,  # type: ignore[type-abstract]

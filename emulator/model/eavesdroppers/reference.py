@@ -1,4 +1,4 @@
-"""The eavesdropper of references: reads state-secrecy codes with the references it heard itself."""
+"""The eavesdropper of references: reads state-secrecy codes with the references that it heard itself."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from evedrop.streams import Batch
 
 
 class Reference(PacketReader):
-    """Follows the headers as the legitimate estimator does; it is given nothing, for the code has no secret.
+    """Follows the headers as the legitimate estimator does; it needs no knowledge, because the code has no secret.
 
-    Meant for the scheme `acknowledged` alone, against which it is the best there is for unstable A.
+    Intended only for the scheme `acknowledged`, against which it is optimal for unstable A.
 
     Source: docs/mathematics.md, acknowledged references.
     """
@@ -26,16 +26,16 @@ class Reference(PacketReader):
         self._reader = ReferenceReceiver(knowledge.process, batch.trials)
 
     def prior(self, first: int = 0) -> Belief:
-        """With an empty memory of references."""
+        """The prior, without references in memory."""
         return self._reader.prior(first)
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """Whatever is sent with a reference to slot k can be read; the reference that it held is as good as before."""
+        """It can read every packet with a reference to slot k; its previous reference stays valid."""
         _, _, kept, kept_spread, _, named = belief.memory
         known = super().knowing(k, x, belief)
         slot = np.full(self.trials, k, np.int64)
         return known._replace(memory=(known.x_hat, known.P, kept, kept_spread, slot, named))
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """By the reference that the header names."""
+        """Reads with the reference that the header names."""
         return self._reader.step(k, belief, heard)

@@ -14,7 +14,7 @@ from evedrop.streams import Batch
 
 
 class ReplayInformed(Delegate):
-    """Learns x_j in the slot j = `learns_at` from `Reception.truth`; reads as the strategy `reads_as` does before and after.
+    """Learns x_j in the slot j = `learns_at` from `Reception.truth`; otherwise reads as the strategy `reads_as` does.
 
     Source: docs/mathematics.md, further eavesdroppers.
     """
@@ -32,7 +32,7 @@ class ReplayInformed(Delegate):
 
     @classmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:  # noqa: ARG003 - alike for all readers
-        """In one slot it does not."""
+        """False, because of one slot."""
         return False
 
     @classmethod
@@ -41,7 +41,7 @@ class ReplayInformed(Delegate):
         return int(parameters["learns_at"])
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """As the reader; after slot j the state x_j and nothing else. Raises ValueError if it was not handed over there."""
+        """As the reader; after slot j only the state x_j. Raises ValueError if that state was not given to it."""
         belief = self.reader.step(k, belief, heard._replace(truth=None))
         if k != self._learns_at:
             return belief

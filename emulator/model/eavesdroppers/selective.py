@@ -1,4 +1,4 @@
-"""The selective eavesdropper: uses what is sent in clear, and leaves alone what the header says is encrypted."""
+"""The selective eavesdropper: uses packets sent in clear, and ignores those that are encrypted according to the header."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from evedrop.model.receiver import Action, Belief, Reception
 
 
 class Selective(PacketReader):
-    """b_k = 1 where the header is 0, or missing; it is given nothing.
+    """b_k = 1 where the header is 0, or missing; it needs no knowledge.
 
-    Meant for the scheme `encrypted-schedule` alone, against which it is the best there is.
+    Intended only for the scheme `encrypted-schedule`, against which it is optimal.
 
     Source: docs/mathematics.md, schedules by holding time.
     """
@@ -24,7 +24,7 @@ class Selective(PacketReader):
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is in clear."""
-        # The codes 0 and 1 of `Action` are γ itself: the state where anything arrives.
+        # The codes 0 and 1 of `Action` are γ itself: the state where a packet arrives.
         action = heard.gamma.astype(np.uint8)
         if heard.header is not None:
             action = np.where(heard.gamma & (heard.header[0] != 0), np.uint8(Action.DISCARDED), action)

@@ -12,7 +12,7 @@ from evedrop.streams import Batch
 
 
 class Smart(PacketTaker):
-    """b_k = 1 − ν_k; it is given the schedule. Its believed covariance is the true one.
+    """b_k = 1 − ν_k; it knows the schedule. Its believed covariance is the actual one.
 
     Source: the paper, smart eavesdropper.
     """

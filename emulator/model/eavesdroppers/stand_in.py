@@ -1,4 +1,4 @@
-"""What stands for an eavesdropper's class where that must not run: it says of itself what the class says, and cannot be made.
+"""Stand-ins for eavesdroppers' classes where these must not run: they give the classes' answers and cannot be instantiated.
 
 Source: docs/your-own.md, where a class runs.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, final
 
 from evedrop.errors import NoAnswer, NotRegistered
 from evedrop.model.answers import Answers
@@ -16,26 +16,27 @@ from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 _ROUNDING = 1e-9
 _SHARES = ("predicted", "state", "misled", "decoded", "leaked")
-"""Of `Outcomes`, those that sum to 1."""
+"""The entries of `Outcomes` that sum to 1."""
 
 
+@final
 class StandIns:
-    """Makes stand-ins, of classes that `answers` knows or asks. Final."""
+    """Makes stand-ins for classes that `answers` knows or asks."""
 
     def __init__(self, answers: Answers, registry: str) -> None:
-        """registry: the attribute of `evedrop.model.eavesdroppers` that has the classes."""
+        """registry: the attribute of `evedrop.model.eavesdroppers` that contains the classes."""
         self.answers = answers
         self._registry = registry
 
     def __call__(self, name: str) -> type[Eavesdropper]:
-        """What stands for the class of a name. Raises NotRegistered if the name stands for none."""
+        """The stand-in for the class of a name. Raises NotRegistered if there is no such class."""
         try:
             facts = self.answers.ask(name, "class", self._registry)
         except NoAnswer as error:
             raise NotRegistered(name, f", and {error}; expected a class that can be asked about itself") from error
         parameters = facts.get("parameters") if isinstance(facts, dict) else None
         if not isinstance(parameters, dict):
-            raise NotRegistered(name, ", whose answer is none; expected a class that says what its parameters are")
+            raise NotRegistered(name, ", whose answer is invalid; expected a class that declares its parameters")
         base = _TakerElsewhere if facts.get("takes") is True else _Elsewhere
         said = {
             "parameters": parameters,
@@ -61,18 +62,18 @@ def _wrong(what: str, found: Any, expected: str) -> NoAnswer:
 
 
 class _Elsewhere(Eavesdropper):
-    """The methods of a class that are asked of it. Abstract."""
+    """The class methods, answered by the class itself. Abstract."""
 
     _ask: ClassVar[Callable[..., Any]]
     _own_outcomes: ClassVar[bool]
 
     def __new__(cls, *_: object) -> Self:
-        """Raises TypeError: this stands for a class that must not run here."""
+        """Raises TypeError: this is a stand-in for a class that must not run here."""
         raise TypeError(f"{cls.__name__} runs in the eavesdropper's process alone; take Registry.imported there")
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """As the class says."""
+        """The class's answer."""
         found = cls._ask("mistakes", dict(given))
         if not isinstance(found, list) or not all(isinstance(one, list) and len(one) == 2 for one in found):
             raise _wrong("mistakes()", found, "a list of (entry, what is wrong)")
@@ -80,7 +81,7 @@ class _Elsewhere(Eavesdropper):
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
-        """As the class says."""
+        """The class's answer."""
         found = cls._ask("streams", dict(parameters))
         if not isinstance(found, list) or not all(isinstance(one, str) for one in found):
             raise _wrong("streams()", found, "names of streams")
@@ -88,7 +89,7 @@ class _Elsewhere(Eavesdropper):
 
     @classmethod
     def betrayed(cls, parameters: Mapping[str, Any]) -> int | None:
-        """As the class says."""
+        """The class's answer."""
         found = cls._ask("betrayed", dict(parameters))
         if found is not None and (type(found) is not int or found < 0):
             raise _wrong("betrayed()", found, "a slot, from 0 on, or None")
@@ -96,7 +97,7 @@ class _Elsewhere(Eavesdropper):
 
     @classmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
-        """As the class says."""
+        """The class's answer."""
         found = cls._ask("follows_gamma", dict(parameters))
         if not isinstance(found, bool):
             raise _wrong("follows_gamma()", found, "True or False")
@@ -104,7 +105,7 @@ class _Elsewhere(Eavesdropper):
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
-        """As the class says, at every quality that is asked about."""
+        """The class's answer, at every quality that is asked for."""
         known = cls._ask("outcomes", dict(parameters), mu_d)
         if not known:
             return None
@@ -124,18 +125,18 @@ class _Elsewhere(Eavesdropper):
 
 
 class _TakerElsewhere(_Elsewhere, PacketTaker):
-    """The same of a class that takes packets for the state or ignores them. Abstract."""
+    """The same for a class that uses packets as the state or ignores them. Abstract."""
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
-        """By its two probabilities, unless the class has another theory."""
+        """Outcomes from the two probabilities, unless the class has a theory of its own."""
         if cls._own_outcomes:
             return super().outcomes(parameters, mu_d)
         return PacketTaker.outcomes.__func__(cls, parameters, mu_d)  # type: ignore[attr-defined,no-any-return]
 
     @classmethod
     def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:
-        """As the class says."""
+        """The class's answer."""
         found = cls._ask("use_probabilities", dict(parameters))
         if not isinstance(found, list) or len(found) != 2 or not all(map(_is_probability, found)):
             raise _wrong("use_probabilities()", found, "two probabilities")

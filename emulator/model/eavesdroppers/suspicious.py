@@ -1,4 +1,4 @@
-"""The suspicious eavesdropper: tells states from innovations, but not reliably."""
+"""The suspicious eavesdropper: distinguishes states from innovations, but not reliably."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Suspicious(PacketTaker):
         return parameters["use_state"], parameters["use_innovation"]
 
     def uses(self, k: int) -> Flags | None:
-        """Where this slot's coin falls below the probability for the packet's type."""
+        """True where this slot's coin falls below the probability for the packet's type."""
         if k not in self._slots:
             self._slots = self._coins.block(k)
             self._coin = self._coins.uniforms(self._slots)[:, 0, :]

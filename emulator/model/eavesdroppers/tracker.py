@@ -1,8 +1,8 @@
-"""The tracker: follows both tracks of `twin-track`, and goes half-way between them as long as it cannot know which is real.
+"""The tracker: follows both tracks of `twin-track`, and estimates their mean while it cannot know which is real.
 
-A packet fixes one track and says nothing of the coin. So after it there are two uncertainties: the noise since then, which
-is common to all histories, and where the other track is, o = other − last, which no noise moves. The next packet is on
-the track of the last one, or on the other; then o changes its sign, and is known as well as that noise allows.
+A packet fixes one track and says nothing about the coin. Two uncertainties remain after it: the noise since then, which
+is common to all histories, and the position of the other track, o = other − last, which no noise moves. The next packet
+is on the track of the last one, or on the other; then o changes its sign, and is known as precisely as that noise allows.
 
 Source: docs/mathematics.md, twin track.
 """
@@ -24,43 +24,43 @@ from evedrop.model.twins import Twins
 from evedrop.streams import Batch
 
 CAPACITY = 8
-"""Histories that a trial may have of either kind; beyond it the two least probable ones become one."""
+"""The most histories of either kind in a trial; beyond it the two least probable ones are merged."""
 
 
 class FollowedTracks(NamedTuple):
-    """What it knows of R trials' tracks. Of 2R columns the first R have the last track as x, the others its twin."""
+    """Its knowledge of R trials' tracks. Of 2R columns the first R have the last track as x, the others its twin."""
 
     weight: Floats
-    """Of each history, (C, 2R); a trial's sum to 1, or are 0 as long as it has heard no packet."""
+    """The weight of each history, (C, 2R); they sum to 1 in each trial, or are 0 before its first packet."""
     mean: Floats
-    """Of o, other − last track, (n, C, 2R)."""
+    """The mean of o, other − last track, (n, C, 2R)."""
     lower: Floats
-    """Of its covariances' factors, (n (n−1)/2, C, 2R)."""
+    """The factors of its covariances, (n (n−1)/2, C, 2R)."""
     diagonal: Floats
     """(n, C, 2R)."""
     last: Floats
-    """The last packet, carried to this slot, (n, R); before the first 0, the mean of x."""
+    """The last packet, predicted to this slot, (n, R); before the first packet 0, the mean of x."""
     noise_lower: Floats
-    """Of the factors of the noise since the last packet, (n (n−1)/2, R); before the first, of the covariance of x."""
+    """Factors of the noise since the last packet, (n (n−1)/2, R); before the first packet, of the covariance of x."""
     noise_diagonal: Floats
     """(n, R)."""
 
     @property
     def histories(self) -> Mixture:
-        """All that a packet tells apart."""
+        """The part that packets distinguish."""
         return Mixture(*self[:4])
 
     @property
     def noise(self) -> Factors:
-        """Common to all histories."""
+        """The part that is common to all histories."""
         return Factors(self.noise_lower, self.noise_diagonal)
 
 
 class Tracker(PacketReader):
-    """Minimum mean square error, but for what is lost where too many histories must be told apart; it is given nothing.
+    """Minimum mean square error, apart from the loss where too many histories would have to be kept; needs no knowledge.
 
-    Meant for the scheme `twin-track` alone. Told a true state, it knows which track is real, and keeps to it as far as
-    the two are further apart than the noise between two packets. `Belief.memory` is its `FollowedTracks`, 2R columns as (2, R).
+    Intended only for the scheme `twin-track`. Once a true state is betrayed to it, it knows which track is real, and follows it
+    while the two are further apart than the noise between packets. `Belief.memory`: its `FollowedTracks`, 2R columns as (2, R).
     """
 
     only_against = ("twin-track", "goes half-way between two tracks, and there is one")
@@ -75,7 +75,7 @@ class Tracker(PacketReader):
         self._twins = Twins(knowledge.process)
 
     def prior(self, first: int = 0) -> Belief:
-        """Nothing was received."""
+        """The belief without any reception."""
         belief, n = super().prior(first), self.process.n
         sigma = Factors.alike(self._initial, (self.trials,))
         for _ in range(first - 1):
@@ -84,23 +84,23 @@ class Tracker(PacketReader):
         return belief._replace(memory=_stored(FollowedTracks(*none, belief.x_hat, *sigma)))
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """Carry both tracks on, and weigh on which of them the packet is: the mean and covariance of all histories."""
+        """Predict both tracks, and weigh which of them the packet is on; belief: mean and covariance over all histories."""
         tracks = _read(belief.memory)
         if k:
             tracks = self._carried(tracks)
         if heard.gamma.any():
             tracks = self._heard(k, tracks, heard.gamma, heard.z)
         total = summed(tracks.weight)
-        # Until a state is betrayed every history is there twice, to the bit, with the last track as x and as its twin.
+        # Until a state is betrayed, every history exists twice, bit for bit, with the last track as x and as its twin.
         told_apart = total[: self.trials] != total[self.trials :]
         read = np.where(told_apart, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
         action = np.where(heard.gamma, read, np.uint8(Action.LOST))
         return Belief(*_moments(tracks, total), action, _stored(tracks))
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """As of a packet that is known to be on the track of x, which makes that track the real one."""
+        """Treat x as a packet that is known to be on the real track."""
         tracks, R = _read(belief.memory), self.trials
-        # Beside a packet of this very slot there is nothing to weigh: it is x, or it is not and shows where the twin is.
+        # With a packet of this very slot there is nothing to weigh: either it is x, or it shows where the twin is.
         beside: Flags = ~np.any(tracks.noise_diagonal > 0.0, axis=0)
         distance = np.where(beside, tracks.last - x, 0.0)
         tracks = self._heard(k, tracks, ~beside, x)
@@ -110,7 +110,7 @@ class Tracker(PacketReader):
         return super().knowing(k, x, belief)._replace(memory=_stored(FollowedTracks(*after, x, *tracks.noise)))
 
     def _carried(self, of: FollowedTracks) -> FollowedTracks:
-        """A slot later."""
+        """The tracks one slot later."""
         A = self.process.A
         mean = self.process.predict(of.mean.reshape(len(A), -1)).reshape(of.mean.shape)
         (spread,) = grown(A, of.histories.spread, _nothing(len(A)))
@@ -118,11 +118,11 @@ class Tracker(PacketReader):
         return FollowedTracks(of.weight, mean, *spread, self.process.predict(of.last), *noise)
 
     def _heard(self, k: int, of: FollowedTracks, gamma: Flags, z: Floats) -> FollowedTracks:
-        """With z (n, R) on one of the tracks where gamma (R,): that becomes the last one."""
+        """The tracks with z (n, R) on one of them where gamma (R,): that one becomes the last track."""
         z = np.where(gamma, z, of.last)
         heard_of: Flags = np.any(of.weight > 0.0, axis=0)
         begun = gamma & ~(heard_of[: self.trials] | heard_of[self.trials :])
-        # Where nothing was received the noise may be 0, and is not asked for.
+        # Where nothing was received the noise may be 0, and is not needed.
         noise = Factors(*(np.where(gamma, *pair) for pair in zip(of.noise, self._any_noise, strict=True)))
         histories = _split(of.histories, gamma, z - of.last, noise) if len(of.weight) else of.histories
         if begun.any():
@@ -143,7 +143,7 @@ class Tracker(PacketReader):
         return Mixture(*(np.where(_twice(where), *pair) for pair in zip(one, of, strict=True)))
 
     def _few(self, of: Mixture, changed: Flags) -> Mixture:
-        """Weights that sum to 1 where they have changed (R,), no more histories than there is room for, and no gaps."""
+        """Weights that sum to 1 where they changed (R,), at most as many histories as there is capacity for, and no gaps."""
         total = summed(of.weight)
         total = _twice(np.where(changed, total[: self.trials] + total[self.trials :], 1.0))
         of = pruned(of._replace(weight=of.weight / total))
@@ -155,13 +155,13 @@ class Tracker(PacketReader):
 
 
 def _split(of: Mixture, gamma: Flags, distance: Floats, noise: Factors) -> Mixture:
-    """Every history twice where gamma (R,): the new place is on the last track, or on the other one, which is the last then.
+    """Duplicate every history where gamma (R,): the new place is on the last track, or on the other, which becomes the last.
 
-    distance: of the new place from the last track, (n, R); noise: covariance of the last track, positive definite.
+    distance: from the last track to the new place, (n, R); noise: covariance of the last track, positive definite.
     """
     n, R = distance.shape
     gamma, distance, noise = _twice(gamma), _twice(distance), Factors(*(_twice(part) for part in noise))
-    # Given the place, o by one triangularisation, as of the leak: of (o + noise, o).
+    # The distribution of o given the new place, by one triangularisation of (o + noise, o), as for the leak.
     U, V = of.spread.unit(), noise.unit()
     rows = [[*u, *v] for u, v in zip(U, V, strict=True)] + [[*u, *[0.0] * n] for u in U]
     joint = orthogonalised(rows, [*of.diagonal, *noise.diagonal])
@@ -188,12 +188,12 @@ def _split(of: Mixture, gamma: Flags, distance: Floats, noise: Factors) -> Mixtu
         np.where(gamma, of.weight * exp(evidence - most), 0.0), mean, np.concatenate(below), joint.diagonal[n:]
     )
     same = of._replace(weight=of.weight * exp(-most))
-    # What was the last track's history is the other one's now.
+    # The history of the last track is now that of the other one.
     return Mixture(*(np.concatenate([a, np.roll(b, R, axis=-1)], axis=-2) for a, b in zip(same, other, strict=True)))
 
 
 def _moments(of: FollowedTracks, total: Floats) -> tuple[Floats, Floats]:
-    """Mean and covariance of x in every trial, (n, R) and (n, n, R); total: of the weights, (2R,)."""
+    """Mean and covariance of x in every trial, (n, R) and (n, n, R); total: sum of the weights, (2R,)."""
     n, R = of.last.shape
     weight, mean, lower, diagonal = (part[..., R:] for part in of.histories)
     middle = np.array([summed(weight * row) for row in mean])
@@ -216,15 +216,15 @@ def _twice(part: NDArray[Any]) -> NDArray[Any]:
 
 
 def _upon(order: NDArray[np.intp], part: Floats) -> NDArray[np.intp]:
-    """An order of histories (C, 2R) for a part of theirs, (C, 2R) or (…, C, 2R)."""
+    """An order of histories (C, 2R) for one of their arrays, (C, 2R) or (…, C, 2R)."""
     return np.broadcast_to(order, part.shape)
 
 
 def _stored(tracks: FollowedTracks) -> tuple[Floats, ...]:
-    """With the trials as last axis."""
+    """The arrays with the trials as last axis."""
     return (*(part.reshape(*part.shape[:-1], 2, part.shape[-1] // 2) for part in tracks.histories), *tracks[4:])
 
 
 def _read(memory: tuple[NDArray[Any], ...]) -> FollowedTracks:
-    """The same as columns."""
+    """The tracks of a memory, with 2R columns."""
     return FollowedTracks(*(part.reshape(*part.shape[:-2], 2 * part.shape[-1]) for part in memory[:4]), *memory[4:])

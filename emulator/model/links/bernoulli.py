@@ -1,4 +1,4 @@
-"""The paper's link: every packet is received with the same probability, independently of all else."""
+"""The paper's link: every packet is received with the same probability, independently of everything else."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Bernoulli(LossModel):
 
     @property
     def quality(self) -> float:
-        """As given."""
+        """The parameter."""
         return self._quality
 
     @property

@@ -1,4 +1,4 @@
-"""Checks that loss models share, and how a message writes the value it complains of."""
+"""Checks that loss models share, and the way in which messages write values."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-_SHOWN = 60  # characters of a value that a message repeats
+_SHOWN = 60  # characters of a value that messages repeat
 
 
 def toml_of(value: Any) -> str:
-    """A value as a scenario writes it, in one line."""
+    """A value as a scenario would write it, in one line."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {toml_of(inner)}" for key, inner in value.items()) + " }" if value else "{}"
     if isinstance(value, list):
@@ -22,7 +22,7 @@ def toml_of(value: Any) -> str:
 
 
 def as_toml(value: Any) -> str:
-    """The same for a message: cut where it is long."""
+    """The same for a message: a long value is cut."""
     text = toml_of(value[: _SHOWN + 1] if isinstance(value, (str, list)) else value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
@@ -39,14 +39,14 @@ def is_probability(value: Any) -> bool:
 
 
 def number_mistakes(given: Mapping[str, Any], name: str, least: float, most: float) -> list[tuple[str, str]]:
-    """A mistake if the entry is there and no number from `least` to `most`."""
+    """A mistake if the entry is given and is not a number from `least` to `most`."""
     if name not in given or is_number(given[name], least, most):
         return []
     return [(name, f"is {as_toml(given[name])}; expected a number from {least:g} to {most:g}")]
 
 
 def probability_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
-    """A mistake for every one of the names that is given and no probability."""
+    """A mistake for every one of the names that is given and is not a probability."""
     return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, 1.0)]
 
 
@@ -60,7 +60,7 @@ def flag_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]
 
 
 def word_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
-    """A mistake if the entry is there and no word of zeros and ones."""
+    """A mistake if the entry is given and is not a word of zeros and ones."""
     word = given.get(name, "1")
     if isinstance(word, str) and word and not set(word) - {"0", "1"}:
         return []

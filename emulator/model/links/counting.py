@@ -1,4 +1,4 @@
-"""How much the number of delivered packets scatters from trial to trial, behind a link that remembers.
+"""The variance, over trials, of the number of packets delivered by a link with a memory.
 
 Source: docs/mathematics.md, losses in bursts (rate of one trial).
 """
@@ -11,14 +11,14 @@ from evedrop.model.process import Floats
 
 
 def count_variance(transitions: Floats, law: Floats, quality: Floats, slots: int) -> float:
-    """Variance of the number of packets delivered in so many slots by a chain in its stationary law.
+    """Variance of the number of packets that a chain in its stationary law delivers in `slots` slots.
 
-    transitions (states, states), law (states,), quality (states,): as of `Chain`; slots ≥ 1. Exact, by doubling: a number
-    of products of matrices that grows with the logarithm of the slots.
+    transitions (states, states), law (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the number
+    of matrix products grows with the logarithm of the slots.
     """
     mean = float(law @ quality)
     centred = quality - mean
-    # Without its stationary part the chain's powers fade, and nothing large is subtracted from anything large.
+    # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
     fading = transitions - law
     own = np.eye(len(law))
     power, partial, total = own - np.outer(np.ones(len(law)), law), np.zeros_like(own), np.zeros_like(own)

@@ -1,4 +1,4 @@
-"""Losses by distance: a radio link whose power falls along the way, is shadowed, and fades."""
+"""Losses by distance: a radio link whose power decreases with distance, with shadowing and fading."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from evedrop.model.receiver import Codes
 
 _NEPER = 0.23025850929940458  # ln 10 / 10: decibels as a natural logarithm
 _LONGEST_BLOCK = 1_000_000
-_AT_ONCE = 8192  # packets whose fates are decided at once
-_SAMPLE = 4096  # slots from which the mean quality of a moving link is taken
+_AT_ONCE = 8192  # packets whose fates are decided together
+_SAMPLE = 4096  # slots over which the mean quality of a moving link is computed
 
 
 class Distance(LossModel):
     """Received where the signal-to-noise ratio of the slot is at least `threshold` dB.
 
-    In dB it is, d metres apart,
+    In dB the ratio at a distance of d metres is
 
         reference_snr − 10 · exponent · log₁₀(d / reference_distance) + X + 10 · log₁₀ g
 
     with X ~ N(0, shadowing²), drawn every `shadowing_block` slots, and g ~ Exp(1), the power of Rayleigh fading, drawn every
-    `fading_block` slots. Nearer than the reference distance the power is that at it. Sender and receiver stand, or move.
+    `fading_block` slots. Below the reference distance the power is that at the reference distance. Sender and receiver may move.
 
-    Uniforms: column 0 is the fading, column 1 the shadowing, each of the first slot of its block (or of the slot in which the
-    link begins, if that is within one), so that two links given the same uniforms fade and are shadowed alike, wherever
+    Uniforms: column 0 is the fading, column 1 the shadowing, each from the first slot of its block (or the slot in which the
+    link begins, if that is within the block), so that two links with the same uniforms fade and are shadowed together, wherever
     their receivers are.
 
     Source: docs/mathematics.md, path loss.
@@ -75,12 +75,12 @@ class Distance(LossModel):
         self._nearest = reference_distance * reference_distance
         self._deviation = shadowing * _NEPER
         self._shadowing_block, self._fading_block = shadowing_block, fading_block
-        self._fade: Floats | None = None  # of the block at hand, (R,)
+        self._fade: Floats | None = None  # of the current block, (R,)
         self._shadow: Floats | None = None
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Positions that are some, numbers within bounds, blocks of slots, and two places that are not one."""
+        """Mistakes in positions, numbers outside their bounds, and a sender and receiver in the same place."""
         ways = {name: way_mistakes(given[name]) for name in ("sender", "receiver") if name in given}
         found = [(name, what) for name, mistakes in ways.items() for what in mistakes]
         for name, least, most in (
@@ -105,31 +105,31 @@ class Distance(LossModel):
 
     @property
     def quality(self) -> float:
-        """The mean of `quality_at`: of the slots up to the last waypoint if there are some, of 4096 of them if there are more."""
+        """The mean of `quality_at` over the slots up to the last waypoint, or over 4096 of them if there are more."""
         slots = np.unique(np.linspace(0, self._settled, min(_SAMPLE, self._settled + 1)).astype(np.int64))
         return float(delivery_probability(self._needed(slots.astype(np.float64)), self._deviation).mean())
 
     @property
     def memoryless(self) -> bool:
-        """Whether nothing is drawn for more than a slot."""
+        """Whether nothing is drawn for longer than a slot."""
         return self._fading_block == 1 and (self._shadowing_block == 1 or self._deviation == 0.0)
 
     @property
     def settles(self) -> bool:
-        """After the last waypoint."""
+        """True: the quality is constant after the last waypoint."""
         return True
 
     def quality_at(self, slots: range) -> Floats:
-        """The probability that the fading makes up for distance and shadowing, averaged over the shadowing; to 1e-11."""
+        """The probability that the fading compensates distance and shadowing, averaged over the shadowing; to 1e-11."""
         needed, places = np.unique(
             self._needed(np.arange(slots.start, slots.stop, dtype=np.float64)), return_inverse=True
         )
         return delivery_probability(needed, self._deviation)[places]
 
     def rate_variance(self, slots: range) -> float:
-        """Exact where `fading_block` divides `shadowing_block` or there is no shadowing; else an upper bound.
+        """Exact where `fading_block` divides `shadowing_block` or there is no shadowing; otherwise an upper bound.
 
-        The bound holds the shadowing for the least common multiple of both: what two slots share only makes them more alike.
+        The bound holds the shadowing for the least common multiple of both: sharing more only makes slots more alike.
         """
         outer = math.lcm(self._fading_block, self._shadowing_block) if self._deviation else self._fading_block
         moving = range(slots.start, min(slots.stop, max(slots.start, -(-self._settled // outer) * outer)))
@@ -151,12 +151,12 @@ class Distance(LossModel):
         return count_variance(needed, slots.start, outer, self._fading_block, self._deviation)
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
-        """Lost where fading and shadowing together bring less than the slot needs."""
+        """Lost where fading and shadowing together give less power than the slot needs."""
         step = max(1, _AT_ONCE // uniforms.shape[2])
         return np.concatenate([self._fates(first + i, uniforms[i : i + step]) for i in range(0, len(uniforms), step)])
 
     def _fates(self, first: int, uniforms: Floats) -> Codes:
-        """The same, of so few that what is computed on the way stays in the cache."""
+        """The same for so few slots that intermediate results fit into the cache."""
         slots = range(first, first + len(uniforms))
         needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
         power, self._fade = _held(slots, self._fading_block, uniforms[:, 0], self._fade, _exponential)
@@ -166,11 +166,11 @@ class Distance(LossModel):
         return fates_of(power < needed[:, None])
 
     def _gain(self, u: Floats) -> Floats:
-        """The shadowing's factor of the power: of the normal number that the upper 52 bits of a uniform one give."""
+        """The shadowing's factor of the power: from the normal quantile of the upper 52 bits of a uniform number."""
         return exp(self._deviation * normal_quantile((np.floor(u * 2.0**52) + 0.5) * 2.0**-52))
 
     def _needed(self, slots: Floats) -> Floats:
-        """Power that fading and shadowing must bring in each slot, (slots,), over its mean at no shadowing."""
+        """Power that fading and shadowing must give in each slot, (slots,), relative to its mean without shadowing."""
         (x, y), (to_x, to_y) = (way.at(slots) for way in self._ways)
         along, across = to_x - x, to_y - y
         square = along * along + across * across
@@ -179,16 +179,16 @@ class Distance(LossModel):
 
 
 def _exponential(u: Floats) -> Floats:
-    """Exponential numbers of mean 1."""
+    """Exponential numbers with mean 1."""
     return -log(1.0 - u)
 
 
 def _held(
     slots: range, block: int, u: Floats, before: Floats | None, draw: Callable[[Floats], Floats]
 ) -> tuple[Floats, Floats]:
-    """What was drawn for the block of each slot, (slots, R) or (1, R), and for the last slot, (R,).
+    """The number drawn for the block of each slot, (slots, R) or (1, R), and that for the last slot, (R,).
 
-    before: of the slot before the first, if there is one; nothing is changed in place, so that it stays as it was.
+    before: that of the slot before the first, if there is one; it is never changed in place.
     """
     begins = np.arange(slots.start, slots.stop) % block == 0
     if before is None:
@@ -204,7 +204,7 @@ def _held(
 
 
 def _meeting(sender: Way, receiver: Way) -> int | None:
-    """A slot of a waypoint in which both are at one place, if there is one."""
+    """A slot of a waypoint in which both are in one place, if there is one."""
     slots = np.array(sorted({*sender.slots, *receiver.slots}), np.float64)
     (x, y), (to_x, to_y) = sender.at(slots), receiver.at(slots)
     same = np.flatnonzero((x == to_x) & (y == to_y))

@@ -1,6 +1,6 @@
-"""What is expected of a link that fades and is shadowed: theory, which enters no digest and so may use numpy's functions.
+"""Expectations for a link with fading and shadowing: theory, which enters no digest and may therefore use numpy's functions.
 
-A slot that needs power c is delivered where g · e^{sZ} ≥ c, of g ~ Exp(1), the fading, and Z ~ N(0, 1), the shadowing.
+A slot that needs power c is delivered where g · e^{sZ} ≥ c, with fading g ~ Exp(1) and shadowing Z ~ N(0, 1).
 
 Source: docs/mathematics.md, path loss.
 """
@@ -20,7 +20,7 @@ def shadowing_rule(deviation: float) -> tuple[Floats, Floats]:
     """Nodes e^{−sz} and weights of the mean over the shadowing; s is the deviation in nepers of power, both (nodes,).
 
     The trapezoidal rule: its error is about exp(−π²/(sh)) for a step h, because exp(−c e^{−sz}) is bounded for |Im z| <
-    π/(2s). With the step taken here it is below 1e-11, where Gauss–Hermite's rule of 128 nodes is off by 1e-3 at 30 dB.
+    π/(2s). With the step used here it is below 1e-11, while a Gauss–Hermite rule of 128 nodes is off by 1e-3 at 30 dB.
     """
     if deviation == 0.0:
         return np.ones(1), np.ones(1)
@@ -40,12 +40,12 @@ def delivery_probability(needed: Floats, deviation: float) -> Floats:
 
 
 def count_variance(needed: Floats, first: int, outer: int, inner: int, deviation: float) -> float:
-    """Variance of the number of slots delivered, of consecutive slots from `first` on that need these powers, (slots,).
+    """Variance of the number of delivered slots among consecutive slots from `first` on that need these powers, (slots,).
 
-    outer: slots for which the shadowing holds; inner: for which the fading does, a divisor of it.
+    outer: slots for which the shadowing is held; inner: slots for which the fading is held, a divisor of outer.
 
-    Given the shadowing of a block, the fading of its parts is independent, and of two slots j, i of one part both are
-    delivered with the smaller of their probabilities, exp(−max(c_j, c_i) e^{−sZ}).
+    Given the shadowing of a block, the fading of its parts is independent, and two slots j, i of one part are both delivered
+    with the smaller of their probabilities, exp(−max(c_j, c_i) e^{−sZ}).
     """
     if first % outer + len(needed) <= outer:
         outer = inner if first % inner + len(needed) <= inner else -(-(first % inner + len(needed)) // inner) * inner
@@ -64,7 +64,7 @@ def count_variance(needed: Floats, first: int, outer: int, inner: int, deviation
 
 def _variance_of(parts: Floats, deviation: float) -> float:
     """The same for whole blocks, (blocks, parts, slots), the powers of each part in ascending order."""
-    pairs = 2.0 * np.arange(parts.shape[2]) + 1.0  # in how many of all pairs of a part a slot needs the most
+    pairs = 2.0 * np.arange(parts.shape[2]) + 1.0  # the number of pairs in a part in which a slot needs the most
     second, mean = 0.0, np.zeros(len(parts))
     for node, weight in zip(*shadowing_rule(deviation), strict=True):
         delivered = np.exp(-parts * node)

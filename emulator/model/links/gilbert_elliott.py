@@ -1,4 +1,4 @@
-"""Losses in bursts: a link that is now good, now bad, and stays so for a while."""
+"""Losses in bursts: a link that alternates between a good and a bad state, and stays in each for a while."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.model.receiver import Codes, Flags
 
 
 class GilbertElliott(LossModel):
-    """Goes bad with probability p and good again with r, each slot; loses with probability `good` or `bad` in each state.
+    """Turns bad with probability p and good with r in each slot; loses with probability `good` or `bad` in each state.
 
     At slot 0 the state has its stationary law: bad with probability p/(p+r). With good = 0 and bad = 1 a burst's length
     is geometric with mean 1/r.
@@ -33,12 +33,10 @@ class GilbertElliott(LossModel):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """All are probabilities, and the link must be able to change."""
+        """All are probabilities, and p and r are not both 0."""
         found = probability_mistakes(given, "p", "r", "good", "bad")
         if not found and given.get("p") == 0.0 and given.get("r") == 0.0:
-            found.append(
-                ("p", "and r are both 0, so the link keeps a state that nothing tells; expected p or r above 0")
-            )
+            found.append(("p", "and r are both 0, so the link stays in an unknown state; expected p or r above 0"))
         return found
 
     @property
@@ -59,15 +57,15 @@ class GilbertElliott(LossModel):
         return Chain(transitions, np.array([1.0 - bad, bad]), np.array([1.0 - self._good, 1.0 - self._bad]))
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
-        """By the state of every slot and a second uniform number."""
+        """From the state of every slot and a second uniform number."""
         bad, v = self._states(uniforms[:, 0, :]), uniforms[:, 1, :]
         in_good, in_bad = v < self._good, v < self._bad
         return fates_of(in_good ^ (bad & (in_good ^ in_bad)))
 
     def _states(self, u: Floats) -> Flags:
-        """Bad or not, (slots, R): a u below p turns good into bad, one below r turns bad into good.
+        """Bad or not, (slots, R): a u below p turns good into bad, a u below r turns bad into good.
 
-        Slot by slot in two operations on truth values: what comes of good, and whether bad comes to something else.
+        Slot by slot with two boolean operations: the state after good, and whether the state after bad differs from it.
         """
         states = u < self._p
         differs = states ^ (u >= self._r)

@@ -1,4 +1,4 @@
-"""What a loss model is: from random numbers to which packets are lost. The rest of a link is in `evedrop.model.slot.link`."""
+"""The base class of loss models: from random numbers to lost packets. The rest of a link is in `evedrop.model.slot.link`."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from evedrop.model.receiver import Codes, Flags
 
 
 class Fate(IntEnum):
-    """What becomes of a packet on a link."""
+    """The outcome of a packet on a link."""
 
     DELIVERED = 0
     LOST = 1
     """Erased by the link's loss model."""
     CORRUPTED = 2
-    """Damaged on the way, which its checksum tells."""
+    """Damaged on the way, as its checksum shows."""
     OVERFLOW = 3
     """The queue before a link of limited rate was full."""
     CUT = 4
     """Sent while the link was cut."""
     LATE = 5
-    """Delayed by more slots than the receiver can still make use of."""
+    """Delayed by more slots than the receiver accepts."""
     DOWN = 6
-    """Its receiver was down on the way."""
+    """Its receiver was down when it arrived."""
     PAUSED = 7
-    """Its receiver was paused on the way."""
+    """Its receiver was paused when it arrived."""
     UNDERWAY = 8
     """Still under way when the run ended."""
     UNSENT = 9
-    """There was no packet: the scheme stayed silent."""
+    """No packet was sent: the scheme stayed silent."""
 
 
 REASONS = tuple(fate.name.lower() for fate in Fate if fate not in (Fate.DELIVERED, Fate.UNSENT))
-"""Why a packet is lost, in the order of `Fate`."""
+"""The reasons for losses, in the order of `Fate`."""
 
 
 def losses(fates: Codes) -> dict[str, NDArray[np.uint32]]:
@@ -51,32 +51,32 @@ def losses(fates: Codes) -> dict[str, NDArray[np.uint32]]:
 
 
 def fates_of(lost: Flags) -> Codes:
-    """`Fate` codes from what is lost."""
+    """`Fate` codes from flags of losses."""
     codes: Codes = lost.view(np.uint8)
     return codes
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A Markov chain of link states, at slot 0 in its stationary law."""
+    """A Markov chain of link states, which at slot 0 is in its stationary law."""
 
     transitions: Floats
     """Row: from, column: to, (states, states)."""
     law: Floats
-    """Stationary, (states,)."""
+    """The stationary law, (states,)."""
     quality: Floats
     """Probability that a packet is delivered in each state, (states,)."""
 
     @property
     def independent(self) -> bool:
-        """Whether every packet's fate is independent of all others' and alike: a single state, as in the paper."""
+        """Whether the fates of all packets are independent and identically distributed: a single state, as in the paper."""
         return len(self.law) == 1
 
 
 class LossModel(ABC):
-    """Decides fates from uniform numbers, for all trials at once, slot after slot.
+    """Decides fates from uniform numbers, for all trials at once, slot by slot.
 
-    A file of this folder holds one model, and its name in a scenario is that of the file. `parameters` are the entries
+    Each file of this folder defines one model, whose name in a scenario is the file's name. `parameters` are the entries
     that the scenario gives it, each with an example.
     """
 
@@ -86,7 +86,7 @@ class LossModel(ABC):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
         del given
         return []
 
@@ -96,13 +96,13 @@ class LossModel(ABC):
         """Mean probability that a packet is delivered."""
 
     def quality_at(self, slots: range) -> Floats:
-        """Probability that the packet of each of these slots is delivered, (slots,): not given the past."""
+        """Unconditional probability that the packet of each of these slots is delivered, (slots,)."""
         return np.full(len(slots), self.quality)
 
     def rate_variance(self, slots: range) -> float:
         """Variance, over trials, of one trial's fraction of delivered packets over these slots.
 
-        From the chain, or from independence; a model with neither has its own.
+        From the chain, or from independence; a model with neither must override it.
         """
         chain, count = self.chain, len(slots)
         if chain is not None:
@@ -112,23 +112,23 @@ class LossModel(ABC):
 
     @property
     def memoryless(self) -> bool:
-        """Whether the fates of different slots are independent of each other, be they alike, different, or certain."""
+        """Whether the fates of different slots are independent of each other, whether identical in law, different or certain."""
         return self.chain is not None and self.chain.independent
 
     @property
     def settles(self) -> bool:
-        """Whether the probability of a delivery is the same from some slot on, so that an error can have a limit."""
+        """Whether the probability of a delivery is constant from some slot on, so that an error can have a limit."""
         return self.chain is not None
 
     @property
     def chain(self) -> Chain | None:
-        """The Markov chain that the losses follow, from which theory can reckon; None if there is none."""
+        """The Markov chain of the losses, for the theory; None if there is none."""
         return None
 
     @abstractmethod
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """`Fate` of each packet of the next slots, (slots, R), from uniforms (slots, uniforms_per_slot, R).
 
-        first: the first of the slots, which follow on those of the call before. What a model remembers it replaces and
-        never changes in place, so that a shallow copy of it can go on from where it was.
+        first: the first of the slots, which follow those of the previous call. A model replaces its memory and never changes it
+        in place, so that a shallow copy of the model can continue from the same point.
         """

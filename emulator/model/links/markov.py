@@ -16,9 +16,9 @@ from evedrop.model.links.link import Chain, LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 
-_SUM = 1e-9  # how far a row may be from summing to 1
+_SUM = 1e-9  # how far the sum of a row may be from 1
 _MOST_STATES = 64
-_FEW = 24  # marks up to which it is quicker to compare with each than to search
+_FEW = 24  # up to this number of marks, comparing with each is quicker than searching
 
 
 class Markov(LossModel):
@@ -39,7 +39,7 @@ class Markov(LossModel):
         self._opening = _bounds(self._stationary[None])[0]
         bounds = _bounds(matrix)
         self._marks = np.unique(bounds)
-        # Row j: the state that each state goes to for a u that j of the marks do not exceed.
+        # Row j: the next state of each state, for a u that is at least j of the marks.
         self._next = np.array([(u >= bounds).sum(axis=1) for u in (-1.0, *self._marks)], np.intp)
         self._state: NDArray[np.intp] | None = None  # in the slot before, (R,)
 
@@ -64,18 +64,18 @@ class Markov(LossModel):
 
     @property
     def chain(self) -> Chain:
-        """As given, without the states that the chain never comes back to, and so is never in."""
+        """The given chain without its transient states, in which it never is."""
         met = self._stationary > 0.0
         return Chain(self._transitions[met][:, met], self._stationary[met], 1.0 - self._loss[met])
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
-        """By the state of every slot and a second uniform number."""
+        """From the state of every slot and a second uniform number."""
         return fates_of(uniforms[:, 1, :] < self._loss[self._states(uniforms[:, 0, :])])
 
     def _states(self, u: Floats) -> NDArray[np.intp]:
-        """The state of every slot, (slots, R): where u is among all states' bounds, and then what that makes of the state.
+        """The state of every slot, (slots, R): the place of u among the bounds of all states, then the next state for that place.
 
-        The first is done for all slots at once; the rest is a look into a table for each slot.
+        The first step is done for all slots at once; the second is a table look-up for each slot.
         """
         places = _rank(self._marks, u)
         places *= len(self._loss)
@@ -93,9 +93,9 @@ class Markov(LossModel):
 
 
 def _bounds(rows: Floats) -> Floats:
-    """Where the uniform numbers of each state but the last end, (rows, states − 1).
+    """The upper ends of the ranges of uniform numbers for each next state but the last, (rows, states − 1).
 
-    Sums of rows are rounded: the last state that a row can lead to takes what is left.
+    Sums of rows are rounded: the last state that can follow gets the remainder.
     """
     bounds: Floats = np.cumsum(rows, axis=1)
     last = rows.shape[1] - 1 - np.argmax(rows[:, ::-1] > 0.0, axis=1)
@@ -104,7 +104,7 @@ def _bounds(rows: Floats) -> Floats:
 
 
 def _rank(marks: Floats, u: Floats) -> NDArray[np.intp]:
-    """How many of the marks, which ascend, each u is not below; the shape of u."""
+    """The number of marks, in ascending order, that each u reaches; has the shape of u."""
     if len(marks) > _FEW:
         return np.searchsorted(marks, u.reshape(-1), side="right").reshape(u.shape)
     rank = np.zeros(u.shape, np.intp)
@@ -123,7 +123,7 @@ def _square(rows: Any) -> TypeGuard[list[list[Any]]]:
 
 def _matrix_mistakes(rows: Any) -> list[str]:
     if not isinstance(rows, list) or not rows or any(not isinstance(row, list) for row in rows):
-        return ["is no matrix; expected a list of rows"]
+        return ["is not a matrix; expected a list of rows"]
     if len(rows) > _MOST_STATES or not _square(rows):
         return [f"is not square, or has more than {_MOST_STATES} rows; expected one row a state"]
     found = []
@@ -133,12 +133,12 @@ def _matrix_mistakes(rows: Any) -> list[str]:
         elif abs(sum(row) - 1.0) > _SUM:
             found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
     if not found and not _common(rows):
-        found.append("falls apart into states that never meet; expected one that can be reached from all")
+        found.append("has several recurrent classes; expected a state that can be reached from all others")
     return found
 
 
 def _common(rows: list[list[float]]) -> bool:
-    """Whether there is a state that can be reached from all, so that there is one recurrent class and one stationary law."""
+    """Whether some state can be reached from all others, so that there is one recurrent class and one stationary law."""
     reaches = (np.array(rows) > 0.0) | np.eye(len(rows), dtype=np.bool_)
     for _ in range(len(rows).bit_length()):
         reaches = reaches @ reaches
@@ -148,8 +148,8 @@ def _common(rows: list[list[float]]) -> bool:
 def stationary(transitions: Floats) -> Floats:
     """The law π with π T = π, (states,), of a chain with one recurrent class.
 
-    By elimination of one state after the other without a subtraction, so that nothing cancels and every machine finds
-    the same bits. A state that nothing leaves for those before it is recurrent on its own.
+    States are eliminated one after the other without subtraction, so that nothing cancels and every machine computes the
+    same bits. A state from which no earlier state can be reached is recurrent on its own.
 
     Source: Grassmann, Taksar, Heyman (1985).
     """
@@ -175,5 +175,5 @@ def stationary(transitions: Floats) -> Floats:
 
 
 def _in_order(values: Iterable[float]) -> float:
-    """Their sum, each added to those before it: Python's own `sum` rounds otherwise from 3.12 on."""
+    """The sum, added in order: Python's own `sum` rounds differently from 3.12 on."""
     return reduce(add, values, 0.0)

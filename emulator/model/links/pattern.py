@@ -1,4 +1,4 @@
-"""Losses by rote: a given sequence of outcomes, over and over."""
+"""Losses in a given pattern: a sequence of outcomes that repeats."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pattern(LossModel):
 
     @property
     def memoryless(self) -> bool:
-        """Everything is certain."""
+        """True: nothing is random."""
         return True
 
     def quality_at(self, slots: range) -> Floats:
@@ -43,11 +43,11 @@ class Pattern(LossModel):
         return np.asarray(~self._lost[np.arange(slots.start, slots.stop) % len(self._lost)], np.float64)
 
     def rate_variance(self, slots: range) -> float:  # noqa: ARG002 - no trial differs from another
-        """None."""
+        """0, because all trials are equal."""
         return 0.0
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
-        """By the slot alone."""
+        """The outcomes of these slots, the same in every trial."""
         slots, _, trials = uniforms.shape
         places = np.arange(first, first + slots) % len(self._lost)
         return fates_of(np.repeat(self._lost[places][:, None], trials, axis=1))

@@ -13,11 +13,11 @@ from evedrop.model.links.link import Chain, Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 
-_MOST_STATES = 1024  # of the chain of all links: more of them, and its transitions would fill the memory
+_MOST_STATES = 1024  # of the joint chain of all links: the transitions of a larger one would fill the memory
 
 
 class Pooled(LossModel):
-    """Of independent loss models, each with its own random numbers. Not to be named in a scenario: see `colluding`."""
+    """Pools independent loss models, each with its own random numbers. Scenarios cannot name it: see `colluding`."""
 
     parameters: ClassVar[Mapping[str, Any]] = {}
 
@@ -27,7 +27,7 @@ class Pooled(LossModel):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """None: each link is asked for its own."""
+        """None: each link is checked by itself."""
         del given
         return []
 
@@ -41,14 +41,14 @@ class Pooled(LossModel):
 
     @property
     def chain(self) -> Chain | None:
-        """The states of all links side by side; None if the losses of one follow no chain, or these are too many."""
+        """The joint states of all links; None if a link's losses do not follow a chain, or if there are too many states."""
         chains = [model.chain for model in self._models]
         known = [chain for chain in chains if chain is not None]
         small = prod(len(chain.law) for chain in known) <= _MOST_STATES
         return reduce(_both, known) if small and len(known) == len(chains) else None
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
-        """Of each packet, by the links' own: `pooled`."""
+        """The pooled fate of each packet."""
         each, start = [], 0
         for model in self._models:
             each.append(model.fates(first, uniforms[:, start : start + model.uniforms_per_slot]))
@@ -57,7 +57,7 @@ class Pooled(LossModel):
 
 
 def pooled(fates: Sequence[Codes]) -> Codes:
-    """`Fate` of the packets of several links, (slots, R) each, as one: delivered if by any, else lost as on the first."""
+    """`Fate` of the packets of several links, (slots, R) each: delivered if any delivers, otherwise lost as on the first."""
     result = fates[0].copy()
     for other in fates[1:]:
         result[other == Fate.DELIVERED] = Fate.DELIVERED

@@ -1,4 +1,4 @@
-"""Losses as they were recorded: a trace of outcomes, read once or over and over, from its beginning or from anywhere."""
+"""Recorded losses: a trace of outcomes, read once or repeatedly, from its beginning or from a random place."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ MOST_OUTCOMES = 10_000_000
 
 
 class RecordedLoss(LossModel):
-    """Delivered in slot k where `outcomes` has a 1 at place k, counted from a beginning and, unless `once`, round and round.
+    """Delivered in slot k where `outcomes` has a 1 at place k from the beginning; unless `once`, the trace repeats.
 
-    The beginning is place 0, alike in all trials; with `random_start` it is ⌊u · length⌋, of u the trial's uniform number of
-    the first slot that the link is asked for, so that trials see different parts of the recording. A scenario names a file,
-    which becomes `outcomes` when it is loaded.
+    The beginning is place 0, the same in all trials; with `random_start` it is ⌊u · length⌋, where u is the trial's uniform
+    number of the first slot asked for, so that trials see different parts of the recording. A scenario names a file,
+    which is replaced by `outcomes` when the scenario is loaded.
 
-    Uniforms: column 0 is where the trial begins (first slot alone).
+    Uniforms: column 0 is the place where the trial begins (used in the first slot only).
 
     Source: docs/links.md, traces.
     """
@@ -41,12 +41,12 @@ class RecordedLoss(LossModel):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """A word of zeros and ones, not too long, and flags that do not contradict each other."""
+        """A word of zeros and ones of limited length, and flags that do not contradict each other."""
         found = word_mistakes(given, "outcomes") + flag_mistakes(given, "once", "random_start")
         if not found and len(given.get("outcomes", "")) > MOST_OUTCOMES:
             found.append(("outcomes", f"are {len(given['outcomes'])}; expected at most {MOST_OUTCOMES}"))
         if given.get("once") is True and given.get("random_start") is True:
-            what = "is there beside once, so that trials would run out of the recording; expected one of the two"
+            what = "is given together with once, so that trials would run out of the recording; expected one of the two"
             found.append(("random_start", what))
         return found
 
@@ -57,26 +57,26 @@ class RecordedLoss(LossModel):
 
     @property
     def memoryless(self) -> bool:
-        """Everything is certain, unless trials begin anywhere."""
+        """True: nothing is random, unless trials begin at random places."""
         return not self._random
 
     def quality_at(self, slots: range) -> Floats:
-        """0 or 1, or for a random start the fraction of ones: every place is as likely as any other."""
+        """0 or 1, or, for a random start, the fraction of ones: every place is equally likely."""
         if self._random:
             return np.full(len(slots), self.quality)
         return np.asarray(~self._lost[self._places(slots.start, slots.stop)], np.float64)
 
     def rate_variance(self, slots: range) -> float:
-        """For a random start that of the count in a window that lies anywhere on the ring; else 0."""
+        """For a random start, the variance of the count in a window at a random place on the ring; otherwise 0."""
         if not self._random:
             return 0.0
         length = len(self._lost)
         delivered = np.concatenate(([0], np.cumsum(~self._ring)))
-        rest = len(slots) % length  # whole rounds bring every trial the same
+        rest = len(slots) % length  # whole rounds give every trial the same count
         return float(np.var(delivered[rest : rest + length] - delivered[:length])) / len(slots) ** 2
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
-        """By the slot, and by where the trial began."""
+        """The outcomes by slot and by the place where the trial began."""
         slots, _, trials = uniforms.shape
         places = self._places(first, first + slots)
         if not self._random:
@@ -87,7 +87,7 @@ class RecordedLoss(LossModel):
         return fates_of(self._ring[places[:, None] + self._begin])
 
     def _places(self, first: int, stop: int) -> NDArray[np.intp]:
-        """Where in the recording these slots are. Raises ValueError if it is read once, and over."""
+        """The places of these slots in the recording. Raises ValueError if it is read only once and too short."""
         if self._once and stop > len(self._lost):
             raise ValueError(f"the recording has {len(self._lost)} outcomes and slot {stop - 1} was asked for")
         return np.arange(first, stop) % len(self._lost)

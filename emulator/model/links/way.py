@@ -1,9 +1,9 @@
-"""Where a sender or a receiver is in every slot: at one place, or on straight lines between waypoints."""
+"""The position of a sender or receiver in every slot: fixed, or on straight lines between waypoints."""
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -11,26 +11,27 @@ from evedrop.model.links.checks import as_toml, is_number
 from evedrop.model.process import Floats
 
 FARTHEST = 1e9
-"""Metres."""
+"""The largest coordinate, in metres."""
 _MOST_WAYPOINTS = 10_000
 _EXPECTED = "expected a position [x, y] in metres, or waypoints [[slot, x, y], …]"
 
 
+@final
 class Way:
-    """Positions by slot. Final.
+    """Positions by slot.
 
-    given: [x, y], or [[slot, x, y], …] with slots increasing. Before its first waypoint it stands there, after its last one
-    too; between two it goes straight and evenly.
+    given: [x, y], or [[slot, x, y], …] with increasing slots. Before the first waypoint and after the last one it stands there;
+    between two waypoints it moves straight and evenly.
     """
 
     def __init__(self, given: list[Any]) -> None:
         rows = given if isinstance(given[0], list) else [[0, *given]]
         self._slots, self._x, self._y = np.array(rows, np.float64).T
         self.slots = [int(row[0]) for row in rows]
-        """Of the waypoints."""
+        """The slots of the waypoints."""
 
     def at(self, slots: Floats) -> tuple[Floats, Floats]:
-        """Its place, x and y in metres, each (slots,). The same bits on every machine."""
+        """Its position, x and y in metres, each (slots,), with the same bits on every machine."""
         last = len(self._slots) - 1
         leg = np.searchsorted(self._slots, slots, side="right") - 1
         here, there = np.clip(leg, 0, last), np.clip(leg + 1, 0, last)
@@ -41,7 +42,7 @@ class Way:
 
 
 def way_mistakes(given: Any) -> list[str]:
-    """What is wrong with a position or waypoints."""
+    """Mistakes in a position or in waypoints."""
     if not isinstance(given, list) or not given:
         return [f"is {as_toml(given)}; {_EXPECTED}"]
     if not isinstance(given[0], list):

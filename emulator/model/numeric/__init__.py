@@ -1,1 +1,1 @@
-"""Numerical building blocks whose bits are the same on every machine."""
+"""Numerical building blocks that give the same bits on every machine."""

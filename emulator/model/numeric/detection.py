@@ -1,4 +1,4 @@
-"""Quickest detection, at the sensor, of a changed rate of acknowledgements: CUSUM in whole numbers, so that it is exact.
+"""The sensor's quickest detection of a changed rate of acknowledgements: CUSUM in whole numbers, and therefore exact.
 
 Source: docs/mathematics.md, detecting an attack.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +16,20 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
-_FINEST = 4  # largest denominator of the ratio of the scores: the finer, the more states, and the delay hardly falls
-_HIGHEST = 1024  # states of the chain that is solved
+_FINEST = 4  # largest denominator of the ratio of scores: finer ratios need more states and hardly reduce the delay
+_HIGHEST = 1024  # states of the largest chain that is solved
 
 Statistic = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Chart:
-    """S ← max(0, S + score), an alarm where S ≥ threshold. Scores are whole numbers, one of them positive."""
+    """S ← max(0, S + score), with an alarm where S ≥ threshold. Scores are whole numbers, one of them positive."""
 
     acknowledged: int
     """Score of a packet that is acknowledged."""
     missing: int
-    """Score of one that is not."""
+    """Score of a packet that is not acknowledged."""
     threshold: int
 
     def start(self, trials: int) -> Statistic:
@@ -36,20 +37,20 @@ class Chart:
         return np.zeros(trials, np.int64)
 
     def step(self, S: Statistic, acknowledged: Flags, sent: Flags | None = None) -> Statistic:
-        """S after a slot, (R,), from the acknowledgements that arrived; unchanged where nothing was sent, or after an alarm."""
+        """S after a slot, (R,), from the acknowledgements received; unchanged where nothing was sent, or after an alarm."""
         after = np.maximum(0, S + np.where(acknowledged, self.acknowledged, self.missing))
         counts = self.alarms(S) if sent is None else self.alarms(S) | ~sent
         return np.where(counts, S, after)
 
     def alarms(self, S: Statistic) -> Flags:
-        """Where the alarm is raised, (R,)."""
+        """Whether the alarm is raised, (R,)."""
         flags: Flags = self.threshold <= S
         return flags
 
     def run_length(self, rate: float) -> float:
         """Mean number of packets until the alarm from S = 0, if each is acknowledged with this probability. Exact.
 
-        From S = 0 it is the longest, so it bounds the mean delay after a change at any time. inf if there is no alarm.
+        The mean is longest from S = 0, so it bounds the mean delay after a change at any time. inf if there is never an alarm.
         """
         chain = np.zeros((self.threshold, self.threshold))
         for s in range(self.threshold):
@@ -60,34 +61,35 @@ class Chart:
         return _steps_to_leave(chain)
 
 
+@final
 class CusumBatch:
-    """A chart over a batch of trials, slot by slot. Final."""
+    """A chart over a batch of trials, slot by slot."""
 
     def __init__(self, chart: Chart, trials: int) -> None:
         self._chart = chart
         self._S = chart.start(trials)
 
     def take(self, acknowledged: Flags, sent: Flags | None = None) -> Flags:
-        """Where the alarm is raised in this slot, (R,), and was not before."""
+        """Whether the alarm is raised in this slot, (R,), for the first time."""
         before = self._chart.alarms(self._S)
         self._S = self._chart.step(self._S, acknowledged, sent)
         return self._chart.alarms(self._S) & ~before
 
 
 def chart_for(normal: float, attacked: float, mean_packets: float) -> Chart:
-    """The chart for a change of rate, with the least threshold whose false alarms are `mean_packets` apart or more.
+    """The chart for a change of rate, with the least threshold whose false alarms are `mean_packets` or more apart.
 
-    normal, attacked: probabilities that a packet is acknowledged, before and after. The scores are whole numbers in the
-    ratio of the logarithms of the likelihood ratios, as nearly as small numbers can be; where one of these is infinite,
-    a single packet of that kind settles it.
+    normal, attacked: probabilities that a packet is acknowledged, before and after. The ratio of the scores approximates, with
+    small whole numbers, that of the logarithms of the likelihood ratios; where one of these is infinite, a single packet of
+    that kind raises the alarm.
 
-    Raises ValueError if the rates are no different probabilities, if the normal one is certain, or if no chart of
-    1024 states is so slow.
+    Raises ValueError if the rates are not two different probabilities, if the normal one is certain, or if no chart of
+    1024 states has so few false alarms.
     """
     if not (0.0 < normal < 1.0 and 0.0 <= attacked <= 1.0 and normal != attacked):
         raise ValueError(f"rates {normal} and {attacked}; expected two different ones, the normal one between 0 and 1")
     falls = attacked < normal
-    # Scores of the kind of packet that speaks for an attack, and of the kind that speaks against it.
+    # Scores of packets that are evidence for an attack, and of packets that are evidence against it.
     kinds = [(attacked, normal), (1.0 - attacked, 1.0 - normal)]
     against, speaks = kinds if falls else kinds[::-1]
     up = math.log(speaks[0] / speaks[1])
@@ -113,17 +115,17 @@ def chart_for(normal: float, attacked: float, mean_packets: float) -> Chart:
 
 
 def _whole(up: float, down: float) -> tuple[int, int]:
-    """Small whole numbers, from 1 on, in about this ratio."""
+    """Small whole numbers, at least 1, in approximately this ratio."""
     larger = Fraction(max(up, down) / min(up, down)).limit_denominator(_FINEST)
     pair = larger.numerator, larger.denominator
     return pair if up >= down else pair[::-1]
 
 
 def _steps_to_leave(chain: Floats) -> float:
-    """Mean number of steps from state 0 until the chain, whose rows need not sum to 1, is left; inf if it never is.
+    """Mean number of steps from state 0 until the chain is left; its rows need not sum to 1. inf if it is never left.
 
-    States are eliminated from the last one down with sums and quotients alone, so that a mean of 10¹⁰ is as exact as
-    one of 10 (Grassmann, Taksar, Heyman, 1985).
+    States are eliminated from the last one down by sums and quotients only, so that a mean of 10¹⁰ is as exact as a mean
+    of 10 (Grassmann, Taksar, Heyman, 1985).
     """
     states = len(chain)
     moves = chain.copy()
@@ -134,7 +136,7 @@ def _steps_to_leave(chain: Floats) -> float:
         out = float(moves[last, :last].sum() + leaves[last])
         if out == 0.0:
             return math.inf
-        # A score reaches a few states only, and elimination keeps it so.
+        # A score reaches only a few states, and elimination preserves that.
         sources, targets = np.flatnonzero(moves[:last, last]), np.flatnonzero(moves[last, :last])
         enters = moves[sources, last] / out
         steps[sources] += enters * steps[last]

@@ -1,7 +1,7 @@
-"""Covariances as U D Uᵀ, U lower triangular with a unit diagonal: for many at a time, with + − × ÷ alone.
+"""Covariances as U D Uᵀ, U lower triangular with a unit diagonal: many at a time, with only + − × ÷.
 
-Beside a process that grows as ρ^k, a covariance has eigenvalues as far apart as ρ^{2k} and soon cannot be factored any
-more. Its factors can be carried along instead, because what is small in them stays accurate by itself.
+With a process that grows as ρ^k, the eigenvalues of a covariance are as far apart as ρ^{2k}, and it soon cannot be factored
+any more. Its factors can be propagated instead, because their small entries stay accurate.
 
 Source: Thornton (1976), weighted Gram-Schmidt; docs/mathematics.md, bayesian eavesdropper.
 """
@@ -17,11 +17,11 @@ from evedrop.kernels.elementary import Rows
 from evedrop.model.process import Floats
 
 Entry = Floats | float
-"""Of many matrices at once, or alike in all of them."""
+"""An entry of many matrices at once, or the same number in all of them."""
 
 
 class Factor(NamedTuple):
-    """U D Uᵀ of one matrix, of plain numbers."""
+    """U D Uᵀ of one matrix, in plain numbers."""
 
     unit: Rows
     """U, (n, n)."""
@@ -30,7 +30,7 @@ class Factor(NamedTuple):
 
     @classmethod
     def of_triangular(cls, L: Rows) -> Factor:
-        """Of L Lᵀ, L lower triangular with a diagonal that is not negative."""
+        """The factor of L Lᵀ, L lower triangular with a non-negative diagonal."""
         n = len(L)
         unit = [[L[i][j] / L[j][j] if L[j][j] > 0.0 else 0.0 for j in range(i)] for i in range(n)]
         return cls(
@@ -39,16 +39,16 @@ class Factor(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """U D Uᵀ of many matrices, of any shape S of the batch."""
+    """U D Uᵀ of many matrices, in a batch of any shape S."""
 
     lower: Floats
-    """Below U's diagonal, row by row, (n (n−1)/2, S)."""
+    """U below its diagonal, row by row, (n (n−1)/2, S)."""
     diagonal: Floats
     """D, (n, S)."""
 
     @classmethod
     def alike(cls, one: Factor, shape: tuple[int, ...]) -> Factors:
-        """Of equal matrices."""
+        """The factors of equal matrices."""
         lower = [value for i, row in enumerate(one.unit) for value in row[:i]]
         columns = ((len(values), *(1 for _ in shape)) for values in (lower, one.diagonal))
         return cls(
@@ -74,7 +74,7 @@ def grown(A: Floats, P: Factors, *noises: Factor) -> list[Factors]:
     results = []
     for noise in noises:
         rows = [[*left, *right] for left, right in zip(carried, noise.unit, strict=True)]
-        own = [noise.diagonal[0] * row[0] for row in noise.unit]  # of U's first row the first entry alone is not 0
+        own = [noise.diagonal[0] * row[0] for row in noise.unit]  # in U's first row only the first entry is not 0
         first = [left + right for left, right in zip(products, own, strict=True)]
         results.append(orthogonalised(rows, [*P.diagonal, *noise.diagonal], first))
     return results
@@ -83,10 +83,10 @@ def grown(A: Floats, P: Factors, *noises: Factor) -> list[Factors]:
 def orthogonalised(
     rows: Sequence[list[Entry]], weights: Sequence[Entry], first: Sequence[Entry] | None = None
 ) -> Factors:
-    """Factors of W diag(weights) Wᵀ, from the rows of W, (n, m), and m weights, none negative.
+    """Factors of W diag(weights) Wᵀ, from the rows of W, (n, m), and m non-negative weights.
 
-    By weighted Gram-Schmidt of the rows, so that nothing is formed whose eigenvalues are further apart than those of the
-    factors. The first weight must have the batch's shape. first: the products of the first row with all, if known.
+    Weighted Gram-Schmidt on the rows avoids matrices whose eigenvalues are further apart than those of the factors. The
+    first weight must have the batch's shape. first: the products of the first row with all rows, if known.
     """
     work = list(rows)
     n, shape = len(work), np.shape(weights[0])
@@ -107,7 +107,7 @@ def orthogonalised(
 
 
 def _times(a: Entry, b: Entry) -> Entry:
-    """Their product; what is 0 or 1 in all matrices costs nothing."""
+    """The product of two entries; an entry that is 0 or 1 in all matrices costs nothing."""
     for one, other in ((a, b), (b, a)):
         if isinstance(one, float) and one in {0.0, 1.0}:
             return other if one else 0.0
@@ -115,9 +115,9 @@ def _times(a: Entry, b: Entry) -> Entry:
 
 
 def _dot(left: Sequence[Entry], right: Sequence[Entry]) -> Entry:
-    """Sum of products, without those that are 0 in all matrices."""
+    """Sum of products, skipping those that are 0 in all matrices."""
     total: Entry = 0.0
-    ours = False  # what `_times` gives may be one of the factors themselves
+    ours = False  # `_times` may return one of its arguments
     for a, b in zip(left, right, strict=True):
         term = _times(a, b)
         if isinstance(total, float) and total == 0.0:

@@ -1,9 +1,11 @@
-"""A one-time pad for numbers: what is masked looks like any number of its range, whatever it was.
+"""A one-time pad for numbers: a masked number looks like a random number of its range, whatever its value is.
 
 Source: docs/mathematics.md, masking.
 """
 
 from __future__ import annotations
+
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +14,18 @@ from evedrop.model.process import Floats, Process
 from evedrop.streams import Batch, BlockReader
 
 DEVIATIONS = 16.0
-"""The range reaches at least so many standard deviations of the state to either side: beyond lies less than 2⁻¹⁸⁹."""
+"""The range extends at least this many standard deviations of the state to either side; beyond lies less than 2⁻¹⁸⁹."""
 _RANGE_BITS = 53  # so that every number of the range is a float64
 _HALF = 2**52
 
 
+@final
 class Mask:
-    """Adds the pad of a slot to a state, modulo a public range, and takes it off again.
+    """Adds the pad of a slot to a state, modulo a public range, and removes it again.
 
-    Final. State i of slot k is rounded to a grid of 2⁵³ points over [−H, H), H the least power of two above
-    16 √Σ_k[i, i]; the pad, uniform on the same grid, is added modulo 2H. So what is masked is finite, is uniform on the
-    grid whatever the state, and says nothing about it. Slots may be asked for in any order; in order is quick.
+    State i of slot k is rounded to a grid of 2⁵³ points over [−H, H), with H the least power of two above 16 √Σ_k[i, i];
+    the pad, uniform on the same grid, is added modulo 2H. The masked state is therefore finite, uniform on the grid
+    whatever the state is, and reveals nothing about it. Slots may be asked for in any order; in order is quick.
     """
 
     def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
@@ -39,18 +42,18 @@ class Mask:
         return self._turned(k, x, 1)
 
     def reveal(self, k: int, z: Floats) -> Floats:
-        """The state on its grid, (n, R), from what `hide` made of it."""
+        """The state on its grid, (n, R), from the result of `hide`."""
         return self._turned(k, z, -1)
 
     def steps(self, k: int) -> Floats:
-        """Distance of the grid's points in slot k, (n,): what masking rounds to."""
+        """Distance of the grid's points in slot k, (n,): the resolution of masking."""
         return np.ldexp(1.0, self._exponent(k) + 1 - _RANGE_BITS)
 
     def _turned(self, k: int, values: Floats, sign: int) -> Floats:
         exponent = self._exponent(k)[:, None]
         shift = _RANGE_BITS - 1 - exponent
         H = np.ldexp(1.0, exponent)
-        # A state beyond 16 deviations is cut to the range, not wrapped around it.
+        # A state beyond 16 deviations is clipped to the range, not wrapped.
         points = np.rint(np.ldexp(np.minimum(np.maximum(values, -H), H), shift)).astype(np.int64)
         points = np.minimum(points, _HALF - 1)
         turned = (points + _HALF + sign * self._pad(k)) & (2 * _HALF - 1)
@@ -65,7 +68,7 @@ class Mask:
         return pad
 
     def _exponent(self, k: int) -> NDArray[np.int32]:
-        """The exponents of H in slot k, (n,); of the last two slots asked for, or anew."""
+        """The exponents of H in slot k, (n,); those of the last two slots are cached."""
         if k not in self._exponents:
             if k < self._k:
                 self._k, self._sigma = 0, self._process.initial_covariance[:, :, None]

@@ -1,4 +1,4 @@
-"""Mixtures of normal distributions, one for every trial of a batch: pruned, merged, summed, whatever the batch.
+"""Mixtures of normal distributions, one for every trial of a batch: pruning, merging and sums that no batch size changes.
 
 Source: docs/mathematics.md, bayesian eavesdropper.
 """
@@ -14,18 +14,18 @@ from evedrop.model.numeric.factored import Factors, orthogonalised
 from evedrop.model.process import Floats
 
 NEGLIGIBLE = 1e-12
-"""Probability up to which a component is dropped."""
+"""The largest probability of a component that is dropped."""
 
 
 class Mixture(NamedTuple):
-    """Up to C components for every trial; what has the weight 0 is none. A component keeps its place."""
+    """Up to C components for every trial; a weight of 0 marks an empty place. A component keeps its place."""
 
     weight: Floats
     """(C, R); sums to 1 in every trial."""
     mean: Floats
     """(n, C, R)."""
     lower: Floats
-    """Of the covariances' factors, (n (n−1)/2, C, R)."""
+    """The covariances' factors, (n (n−1)/2, C, R)."""
     diagonal: Floats
     """(n, C, R)."""
 
@@ -36,7 +36,7 @@ class Mixture(NamedTuple):
 
 
 def summed(values: Floats) -> Floats:
-    """Sum over components: (C, R) → (R,), one after the other, so that places that are empty in a trial change no bit."""
+    """Sum over components, (C, R) → (R,), one after the other, so that empty places change no bit."""
     total = np.zeros(values.shape[1:])
     for row in values:
         total += row
@@ -44,7 +44,7 @@ def summed(values: Floats) -> Floats:
 
 
 def pruned(of: Mixture) -> Mixture:
-    """Without what is negligible, and without places that no trial needs."""
+    """The mixture without negligible components, and without places that no trial needs."""
     weight = np.where(of.weight > NEGLIGIBLE, of.weight, 0.0)
     used = np.flatnonzero(weight.any(axis=1))
     count = int(used[-1]) + 1 if used.size else 0
@@ -59,7 +59,7 @@ def with_a_place(part: Floats, axis: int) -> Floats:
 
 
 def merge(of: Mixture, trials: NDArray[np.intp]) -> None:
-    """Make one of the two least probable components of some trials, in place; the other place is empty then."""
+    """Merge the two least probable components of some trials, in place; the second place is then empty."""
     weight = of.weight[:, trials]
     weight = np.where(weight > 0.0, weight, np.inf)
     columns = np.arange(len(trials))

@@ -1,4 +1,4 @@
-"""State-secrecy code: the state less what the user is known to have, by its acknowledgements."""
+"""State-secrecy code: the state minus a state that the user is known to have from its acknowledgements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evedrop.streams import Batch
 
 
 class AcknowledgedEncoder(Encoder):
-    """z_k = x_k − L^{k−t} x_t, t the last acknowledged slot; x_k itself before the first acknowledgement."""
+    """z_k = x_k − L^{k−t} x_t, with t the last acknowledged slot; x_k itself before the first acknowledgement."""
 
     def __init__(self, process: Process, trials: int) -> None:
         self._code = ReferenceCode(process)
@@ -26,11 +26,11 @@ class AcknowledgedEncoder(Encoder):
         self._x: Floats
 
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - references say more
-        """The packet of slot k, which must follow the one before."""
+        """The packet of slot k, which must follow the slot before."""
         self._slot = np.where(k - self._slot <= self._code.longest, self._slot, NONE)
         self._reference = self._code.carry(np.where(self._slot == NONE, 0.0, self._reference))
         self._k, self._x = k, x.copy()
-        # A reference of 0 is subtracted where there is none: x − 0 is x.
+        # Where there is no reference, 0 is subtracted: x − 0 is x.
         return Packet(x - self._reference, np.zeros(x.shape[1], np.bool_), self._slot[None].copy())
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
@@ -42,10 +42,10 @@ class AcknowledgedEncoder(Encoder):
 
 
 class Acknowledged(Scheme):
-    """Subtracts a reference that the user holds; an eavesdropper that missed it once has lost it for good.
+    """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
 
-    There is no secret: what tells the receivers apart is which packets they heard, and that the sensor knows it of one of
-    them. So it stands and falls with acknowledgements that are neither blocked nor forged.
+    There is no secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme
+    therefore depends on acknowledgements that are neither blocked nor forged.
 
     Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
     """
@@ -57,7 +57,7 @@ class Acknowledged(Scheme):
     header = ("slot t of the reference; −1: none, z is the state",)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """Nothing."""
+        """The references; nothing is secret."""
         return NoInnovations(
             self.process,
             batch.trials,
@@ -66,7 +66,7 @@ class Acknowledged(Scheme):
         )
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """Keeps the references that it may have acknowledged."""
+        """A receiver that keeps the references it may have acknowledged."""
         return ReferenceReceiver(self.process, batch.trials)
 
     def outcomes(self, mu: float) -> Outcomes:

@@ -13,7 +13,7 @@ MOST_SLOTS = 1_000_000
 
 
 def count_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
-    """A mistake if the entry is given and no number of slots from 1 on."""
+    """A mistake if the entry is given and is not a number of slots from 1 on."""
     value = given.get(name, 1)
     if type(value) is int and 1 <= value <= MOST_SLOTS:
         return []
@@ -21,7 +21,7 @@ def count_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]
 
 
 def choice_mistakes(given: Mapping[str, Any], name: str, choices: Sequence[str]) -> list[tuple[str, str]]:
-    """A mistake if the entry is given and none of the choices."""
+    """A mistake if the entry is given and is not one of the choices."""
     value = given.get(name, choices[0])
     if isinstance(value, str) and value in choices:
         return []

@@ -27,18 +27,18 @@ class CipherEncoder(Encoder):
 
 
 class CipherEstimator(Receiver):
-    """Takes the mask off every packet it receives, and has the state."""
+    """Unmasks every packet it receives, and so has the state."""
 
     def __init__(self, process: Process, trials: int, mask: Mask) -> None:
         super().__init__(process, trials)
         self._mask = mask
 
     def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
+        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
         return gamma.astype(np.uint8)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, else (the state, 0)."""
+        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
         action = self.act(k, heard.gamma)
         state = self._mask.reveal(k, np.where(heard.gamma, heard.z, 0.0))
         return Belief(
@@ -49,7 +49,7 @@ class CipherEstimator(Receiver):
 
 
 class Cipher(Scheme):
-    """Masks every packet. What an eavesdropper hears is independent of the state, so the best it can do is not to listen.
+    """Masks every packet. Packets are independent of the state, so an eavesdropper can do no better than not to listen.
 
     Source: docs/mathematics.md, stream cipher.
     """

@@ -20,7 +20,7 @@ from evedrop.streams import Batch
 
 
 class EncryptedScheduleEncoder(Encoder):
-    """z_k = x_k, masked from `threshold` slots after the last acknowledged one on; the header says which."""
+    """z_k = x_k, masked from `threshold` slots after the last acknowledged slot on; the header tells whether."""
 
     def __init__(self, threshold: int, trials: int, mask: Mask) -> None:
         self._threshold = threshold
@@ -34,23 +34,23 @@ class EncryptedScheduleEncoder(Encoder):
         return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Go on in clear where slot k is acknowledged."""
+        """Send in clear again where slot k is acknowledged."""
         self._held.acknowledged(k, acknowledged)
 
 
 class EncryptedScheduleEstimator(Receiver):
-    """Takes the mask off the packets that have one, and has the state from any."""
+    """Unmasks the packets that are masked, and has the state from every packet."""
 
     def __init__(self, process: Process, trials: int, mask: Mask) -> None:
         super().__init__(process, trials)
         self._mask = mask
 
     def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
+        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
         return gamma.astype(np.uint8)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, else (the state, 0)."""
+        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
         action = self.act(k, heard.gamma)
         encrypted = heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
         masked = np.where(encrypted, heard.z, 0.0)
@@ -63,10 +63,10 @@ class EncryptedScheduleEstimator(Receiver):
 
 
 class EncryptedSchedule(Scheme):
-    """Encrypts from `threshold` slots after the last acknowledged one until the next acknowledgement; 1 is always.
+    """Encrypts from `threshold` slots after the last acknowledged slot until the next acknowledgement; with 1, always.
 
-    For a sensor that can afford to encrypt some packets. Where acknowledgements are blocked it encrypts them all: more
-    than it wanted to pay for, but secret.
+    For a sensor that can afford to encrypt only some packets. Where acknowledgements are blocked it encrypts all of them,
+    which costs more than intended but preserves secrecy.
 
     Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, schedules by holding time.
     """

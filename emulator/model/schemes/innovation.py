@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch, BlockReader
 
 
+@final
 class SharedSecret(Shared):
     """ν_k and χ_k of every slot, from the streams `schedule` and `noise`.
 
-    Final. χ_k = A L_{k−1} ξ_k with L Lᵀ = Σ_{k−1} factored by QR. Addressed by slot: a lost packet desynchronises
-    nobody. Noise is drawn only where it is asked for.
+    χ_k = A L_{k−1} ξ_k with L Lᵀ = Σ_{k−1} factored by QR. Both are addressed by slot, so a lost packet desynchronises
+    no one. Noise is drawn only where it is needed.
 
     Source: docs/mathematics.md, encoding noise.
     """
@@ -75,7 +76,7 @@ class InnovationEncoder(Encoder):
 
 
 class InnovationEstimator(Receiver):
-    """The exact MMSE estimator that holds the secret.
+    """The exact MMSE estimator with the secret.
 
     Source: Theorem IV.1 (covariance) and docs/mathematics.md, legitimate estimator.
     """
@@ -100,7 +101,7 @@ class InnovationEstimator(Receiver):
 
 
 class Innovation(Scheme):
-    """The paper's scheme; needs no acknowledgements. `state_probability` is μ_d."""
+    """The paper's scheme, which needs no acknowledgements. `state_probability` is μ_d."""
 
     best_reader = "bayesian"
     sends_states_and_innovations = True

@@ -1,4 +1,4 @@
-"""No scheme at all: every packet is the state. The baseline that keeps nothing secret."""
+"""No encoding: every packet is the state. The baseline, which keeps nothing secret."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transmission scheduling: stay silent while the user still knows enough."""
+"""Transmission scheduling: silence while the user still knows enough."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evedrop.streams import Batch
 
 
 class ScheduledEncoder(Encoder):
-    """z_k = x_k from `threshold` slots after the last acknowledged one; silence before."""
+    """z_k = x_k from `threshold` slots after the last acknowledged slot on; silence before that."""
 
     def __init__(self, threshold: int, trials: int) -> None:
         self._threshold = threshold
@@ -34,10 +34,10 @@ class ScheduledEncoder(Encoder):
 
 
 class Scheduled(Scheme):
-    """Sends from `threshold` slots after the last acknowledged one until the next acknowledgement; 1 is always.
+    """Sends from `threshold` slots after the last acknowledged slot until the next acknowledgement; with 1, always.
 
-    There is no secret. An eavesdropper that misses the one packet after a silence stays blind through the next. Where
-    acknowledgements are blocked the sensor sends in every slot, as `plain` does.
+    There is no secret. An eavesdropper that misses the only packet after a silence knows nothing new until after the next
+    silence. Where acknowledgements are blocked, the sensor sends in every slot, as `plain` does.
 
     Source: Leong, Quevedo, Dolz, Dey (2019); docs/mathematics.md, schedules by holding time.
     """
@@ -66,9 +66,9 @@ class Scheduled(Scheme):
         )
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """Uses whatever arrives."""
+        """A receiver that uses every packet."""
         return PlainEstimator(self.process, batch.trials)
 
-    def outcomes(self, mu: float) -> None:  # noqa: ARG002 - no link makes its slots alike
-        """Its slots are not alike: see `closed_forms.scheduled`."""
+    def outcomes(self, mu: float) -> None:  # noqa: ARG002 - its slots differ behind any link
+        """None, because its slots differ: see `closed_forms.scheduled`."""
         return

@@ -1,11 +1,11 @@
-"""What a scheme is: an encoder for the sensor, the estimator that can read it, and what the two of them need and cost."""
+"""The base class of schemes: an encoder for the sensor, the estimator that can read it, and what both need and cost."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,24 +26,24 @@ class Packet(NamedTuple):
     nu: Flags
     """ν_k, (R,): true for an innovation. Never sent; the sensor's own record."""
     header: NDArray[np.int64] | None = None
-    """What is sent in clear beside z, (h, R); None for a scheme that has no header."""
+    """Sent in clear with z, (h, R); None for a scheme without a header."""
     sent: Flags | None = None
-    """Whether anything is sent, (R,); None for a scheme that sends in every slot."""
+    """Whether a packet is sent, (R,); None for a scheme that sends in every slot."""
 
 
 class Encoder(ABC):
-    """Makes packets of states, slot by slot."""
+    """Makes packets from states, slot by slot."""
 
     @abstractmethod
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The packet of slot k, from x_k and A x_{k−1}, both (n, R)."""
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:  # noqa: B027 - most schemes need none
-        """Take the acknowledgements (R,) of the packets of slot k, as they reached the sensor; before slot k + 1 is sent."""
+        """Receive the acknowledgements (R,) of slot k that reached the sensor; called before slot k + 1 is sent."""
 
 
 class Shared(ABC):
-    """What sensor and legitimate estimator share, and the two sides made from it. Read ahead in blocks; slots in order."""
+    """The secret that sensor and legitimate estimator share, and both sides made from it. Slots must be read in order."""
 
     @abstractmethod
     def nu(self, k: int) -> Flags:
@@ -62,8 +62,9 @@ class Shared(ABC):
         """The legitimate estimator's side."""
 
 
+@final
 class NoInnovations(Shared):
-    """What the two sides of a scheme without innovations share: ν = 0 and χ = 0 always. Final."""
+    """The shared part of a scheme without innovations: ν = 0 and χ = 0 always."""
 
     def __init__(
         self, process: Process, trials: int, encoder: Callable[[], Encoder], estimator: Callable[[], Receiver]
@@ -91,10 +92,10 @@ class NoInnovations(Shared):
 
 
 class Scheme(ABC):
-    """One way to fill packets. The keys of `secret_streams` are the secret; all else about a scheme is public.
+    """One way to fill packets. The keys of `secret_streams` are the secret; everything else about a scheme is public.
 
-    A file of this folder holds one scheme, and its name in a scenario is that of the file with - for _. `parameters` are
-    the entries that the scenario's `[encoding]` gives it, each with an example; they are the constructor's arguments.
+    Each file of this folder defines one scheme, whose name in a scenario is the file's name with - for _. `parameters` are
+    the entries in the scenario's `[encoding]`, each with an example; they are the constructor's arguments.
 
     Source: docs/schemes.md.
     """
@@ -103,20 +104,20 @@ class Scheme(ABC):
     secret_streams: ClassVar[tuple[str, ...]] = ()
     """The streams that the sensor draws from."""
     estimator_streams: ClassVar[tuple[str, ...]] = ()
-    """Those of them whose keys the legitimate estimator holds as well."""
+    """The streams among these whose keys the legitimate estimator has as well."""
     needs_acknowledgements: ClassVar[bool] = False
     """Whether the encoder depends on `Encoder.acknowledged`."""
     reads_packets: ClassVar[bool] = False
-    """Whether what the estimator does with a slot depends on more than γ and the secret, so that `Receiver.act` cannot
-    tell it and only a simulation of packets can follow it."""
+    """Whether the estimator's action depends on more than γ and the secret, so that `Receiver.act` cannot know it and only a
+    simulation of packets can follow it."""
     may_be_silent: ClassVar[bool] = False
-    """Whether there are slots in which it sends nothing, so that its packets have `Packet.sent`."""
+    """Whether it sends nothing in some slots, so that its packets have `Packet.sent`."""
     header: ClassVar[tuple[str, ...]] = ()
-    """What each number of the header means."""
+    """The meaning of each number of the header."""
     secret_words: ClassVar[tuple[int, int]] = (0, 0)
-    """64-bit words of shared secret that a slot uses: so many, and so many more for each state."""
+    """64-bit words of shared secret that a slot uses: a fixed number, and a number per state."""
     initial_secret_words: ClassVar[tuple[int, int]] = (0, 0)
-    """The same, of what a trial uses once."""
+    """The same for the words that a trial uses once."""
     best_reader: ClassVar[str] = "naive"
     """The strategy that, without the secret, reads its packets best. `evedrop compare` has attackers read with it."""
     sends_states_and_innovations: ClassVar[bool] = False
@@ -129,28 +130,28 @@ class Scheme(ABC):
     def __init__(self, process: Process, state_probability: float = 1.0) -> None:
         self.process = process
         self.state_probability = state_probability
-        """Probability that a slot k ≥ 1 holds the state, public: μ_d; 1 for a scheme that has no such parameter."""
+        """Probability that the packet of a slot k ≥ 1 contains the state, which is public: μ_d; 1 without such a parameter."""
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """What is wrong with parameters that are all known, if not all there: (entry, what was found and expected)."""
+        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
         del given
         return []
 
     @abstractmethod
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """What the two sides share; keys holds those of `secret_streams`."""
+        """The shared part of both sides; keys: those of `secret_streams`."""
 
     def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
         """The sensor's side alone."""
         return self.shared(keys, batch).encoder()
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
-        """The legitimate estimator's side alone; keys holds those of `estimator_streams`."""
+        """The legitimate estimator's side alone; keys: those of `estimator_streams`."""
         return self.shared(keys, batch).estimator()
 
     def initial_state(self, keys: Mapping[str, bytes], batch: Batch) -> Floats | None:
-        """x_0 (n, R), if the secret decides it; None where the process alone does."""
+        """x_0 (n, R), if the secret decides it; None if the process alone does."""
         del keys, batch
         return None
 
@@ -161,12 +162,12 @@ class Scheme(ABC):
 
     @property
     def secret_bits(self) -> int:
-        """Shared secret that a slot uses up: bits of the streams' words, all of them expanded from 256-bit keys."""
+        """Shared secret that a slot uses up: bits of the streams' words, all expanded from 256-bit keys."""
         return self._bits(self.secret_words)
 
     @property
     def initial_secret_bits(self) -> int:
-        """The same, of what a trial uses up once."""
+        """The same for the bits that a trial uses up once."""
         return self._bits(self.initial_secret_words)
 
     def _bits(self, words: tuple[int, int]) -> int:
@@ -175,9 +176,9 @@ class Scheme(ABC):
 
     @abstractmethod
     def outcomes(self, mu: float) -> Outcomes | None:
-        """What the legitimate estimator does with a slot, behind a link of quality μ; None: its slots are not alike.
+        """The outcomes at the legitimate estimator behind a link of quality μ; None if its slots differ.
 
-        Acknowledgements, where they are needed, may be lost or blocked at will, but not forged.
+        Acknowledgements, where they are needed, may be lost or blocked in any way, but not forged.
         """
 
     def error_floor(self, slots: int) -> tuple[Floats, bool] | None:
@@ -189,6 +190,6 @@ class Scheme(ABC):
         return None
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes | None:
-        """What a user of packets, with P(b=1 | ν), does with a slot; None: no such closed form."""
+        """The outcomes at a receiver that uses packets with P(b=1 | ν); None if there is no closed form."""
         del mu_e, use_state, use_innovation
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import final
 
 import numpy as np
 
@@ -18,10 +19,11 @@ from evedrop.streams import Batch, BlockReader
 _SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
 
 
+@final
 class TwinTracks:
     """x_0 and y_0 ~ N(0, Σ0) from the stream `start`, their distance d_k = A^k (y_0 − x_0), and the coins from `track`.
 
-    Final. Slots in order are quick; any other order is correct.
+    Asking for slots in order is quick; any other order is correct.
     """
 
     def __init__(self, process: Process, keys: Mapping[str, bytes], batch: Batch) -> None:
@@ -37,7 +39,7 @@ class TwinTracks:
         self._coins: Flags
 
     def distance(self, k: int) -> Floats:
-        """d_k, (n, R): from the process's track to its twin's."""
+        """d_k, (n, R): the distance from the process's track to its twin's."""
         if k < self._k:
             self._k, self._distance = 0, self._apart
         while self._k < k:
@@ -46,7 +48,7 @@ class TwinTracks:
         return self._distance
 
     def on_twin(self, k: int) -> Flags:
-        """Whether the packet of slot k is on the twin's track, (R,): a fair coin."""
+        """Whether the packet of slot k is on the twin's track, (R,), by a fair coin."""
         if k not in self._slots:
             self._slots = self._reader.block(k)
             self._coins = self._reader.uniforms(self._slots)[:, 0, :] < 0.5
@@ -55,7 +57,7 @@ class TwinTracks:
 
 
 class TwinTrackEncoder(Encoder):
-    """z_k = x_k, or x_k + d_k, slot 0 included."""
+    """z_k = x_k, or x_k + d_k, in slot 0 as well."""
 
     def __init__(self, tracks: TwinTracks) -> None:
         self._tracks = tracks
@@ -67,14 +69,14 @@ class TwinTrackEncoder(Encoder):
 
 
 class TwinTrackEstimator(Receiver):
-    """Knows x_0 before anything is sent, and the track of every packet."""
+    """Knows x_0 before the first packet, and the track of every packet."""
 
     def __init__(self, process: Process, trials: int, tracks: TwinTracks) -> None:
         super().__init__(process, trials)
         self._tracks = tracks
 
     def prior(self, first: int = 0) -> Belief:
-        """x̂ = x_0, P = 0, carried on to the slot before `first`."""
+        """x̂ = x_0, P = 0, predicted up to the slot before `first`."""
         n = self.process.n
         x_hat, P = self._tracks.initial, np.zeros((n, n, self.trials))
         for _ in range(first - 1):
@@ -82,11 +84,11 @@ class TwinTrackEstimator(Receiver):
         return Belief(x_hat, P, np.zeros(self.trials, np.uint8))
 
     def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where anything arrives: the codes 0 and 1 of `Action` are γ itself."""
+        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
         return gamma.astype(np.uint8)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, else (z, 0) or (z − d_k, 0)."""
+        """(A x̂, A P Aᵀ + Q) if lost, otherwise (z, 0) or (z − d_k, 0)."""
         action = self.act(k, heard.gamma)
         z = select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
         return Belief(
@@ -97,10 +99,10 @@ class TwinTrackEstimator(Receiver):
 
 
 class TwinTrack(Scheme):
-    """Two tracks, of which only who shares the secret knows which is the process's own.
+    """Two tracks; only with the secret can a receiver tell which of them is the process's own.
 
-    x_0 is part of the secret, so the process must start from `initial_state`. No strategy that is told the schedule of
-    states and innovations is meant for it; none holds the key of `track` or `start`.
+    x_0 is part of the secret, so the process must start from `initial_state`. Strategies that know the schedule of states and
+    innovations do not apply to it, and no strategy has the key of `track` or `start`.
 
     Source: docs/mathematics.md, twin track.
     """

@@ -1,4 +1,4 @@
-"""Withholding: send the state with probability p, else nothing at all."""
+"""Withholding: send the state with probability p, and otherwise nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evedrop.streams import Batch
 
 
 class WithholdingEncoder(Encoder):
-    """z_k = x_k where the schedule says so; the other slots stay silent."""
+    """z_k = x_k where the schedule says so, and silence in the other slots."""
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
@@ -30,10 +30,10 @@ class WithholdingEncoder(Encoder):
 
 
 class Withholding(Scheme):
-    """Sends in slot 0 and then with probability p = `state_probability`, by a coin that only the sensor has to toss.
+    """Sends in slot 0 and then with probability p = `state_probability`, by a coin that only the sensor needs.
 
-    Whoever receives a packet has the state; only the rates tell receivers apart. So there is no secret: the estimator
-    needs none, and an eavesdropper that knew the schedule would gain nothing.
+    A receiver of a packet has the state, so receivers differ only in their rates. There is no secret: the estimator needs none,
+    and an eavesdropper that knew the schedule would gain nothing.
 
     Source: Tsiamis, Gatsis, Pappas (2017); docs/mathematics.md, withholding.
     """
@@ -58,7 +58,7 @@ class Withholding(Scheme):
         )
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """Uses whatever arrives."""
+        """A receiver that uses every packet."""
         return PlainEstimator(self.process, batch.trials)
 
     def outcomes(self, mu: float) -> Outcomes:
@@ -66,6 +66,6 @@ class Withholding(Scheme):
         return self.eavesdropper_outcomes(mu, 1.0, 1.0)
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
-        """Nobody can be misled by what is not sent."""
+        """Silent slots mislead no receiver."""
         del use_innovation
         return Outcomes.eavesdropper(mu_e, self.state_probability, use_state, 0.0)

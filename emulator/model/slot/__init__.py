@@ -1,1 +1,1 @@
-"""What happens in a slot: process, packets, links, beliefs."""
+"""The parts of a slot: process, packets, links and beliefs."""

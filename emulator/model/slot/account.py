@@ -1,9 +1,10 @@
-"""The account of a link: what became of its packets, slot by slot, and how its losses and delays are distributed."""
+"""The account of a link: the outcomes of its packets, slot by slot, and the distributions of its losses and delays."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,30 +14,31 @@ from evedrop.model.receiver import Flags
 from evedrop.model.slot.link import Fates
 
 COUNTED_BURSTS = 64
-"""Bursts of so many packets and more are counted together."""
+"""Bursts of at least this many packets are counted together."""
 
 
 @dataclass(frozen=True)
 class Account:
-    """What became of the packets of c slots on one link."""
+    """The outcomes of the packets of c slots on one link."""
 
     delivered: Flags
-    """Passed on in their own slot, (c, R)."""
+    """Whether the packet was delivered in its own slot, (c, R)."""
     lost: Mapping[str, NDArray[np.uint32]]
     """Reason → packets of each slot lost for it, (c,)."""
     late: NDArray[np.uint16] | None
-    """Packets of earlier slots passed on in each slot, without second copies, (c, R); None where none can be."""
+    """Packets of earlier slots delivered in each slot, without second copies, (c, R); None where there can be none."""
     bursts: NDArray[np.uint32]
     """Runs of packets lost to the loss model that ended in these slots, by length: 1, 2, … and 64 or more. A slot without a
-    packet ends one."""
+    packet ends a run."""
     delays: NDArray[np.uint32]
-    """Packets of these slots that came through, by the slots they took: 0, 1, …, the window, and more."""
+    """Packets of these slots that were not lost, by their delay in slots: 0, 1, …, the window, and more."""
     unsent: NDArray[np.uint32] | None = None
-    """Trials of each slot in which there was no packet, (c,); None where there was one in all."""
+    """Trials of each slot without a packet, (c,); None if all trials had one."""
 
 
+@final
 class Accountant:
-    """Keeps the account of one link. Final; slots in order."""
+    """Keeps the account of one link; slots must be added in order."""
 
     def __init__(self, window: int, trials: int) -> None:
         self._window = window
@@ -45,7 +47,7 @@ class Accountant:
         self._run = np.zeros(trials, np.int64)  # how many of its last packets each trial has lost
 
     def account(self, slots: range, fates: Fates) -> Account:
-        """Of the next slots."""
+        """The account of the next slots."""
         return Account(
             fates.in_time,
             losses(fates.codes),
@@ -72,9 +74,9 @@ class Accountant:
         return counts
 
     def _bursts(self, lost: Flags) -> NDArray[np.uint32]:
-        """Lengths of the runs that a packet ended which was not lost."""
+        """Lengths of the runs that were ended by a packet that was not lost."""
         rows = np.arange(1, len(lost) + 1)[:, None]
-        # The row, from 1, of the last packet that was not lost, up to each row; 0 where there is none in these slots.
+        # For each row, the last row up to it, from 1, whose packet was not lost; 0 if there is none in these slots.
         kept = np.maximum.accumulate(np.where(lost, 0, rows), axis=0)
         before = np.vstack([np.zeros((1, lost.shape[1]), kept.dtype), kept[:-1]])
         lengths = rows - 1 - before + np.where(before == 0, self._run, 0)

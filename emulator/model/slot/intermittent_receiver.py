@@ -1,7 +1,7 @@
-"""A receiver that follows the slots as they come, late packets included: it runs its recursion once more where they belong.
+"""A receiver that follows the slots as they come, with late packets: it repeats its recursion from where they belong.
 
-A packet of slot j that arrives in slot k > j still fixes x_j, or gives w_{j−1}: with the window's packets and the belief
-before them kept, the belief after slot k is what it would be had the packet been in time.
+A packet of slot j that arrives in slot k > j still fixes x_j, or gives w_{j−1}: because the window's packets and the belief
+before them are kept, the belief after slot k is the same as if the packet had been in time.
 
 Source: docs/mathematics.md, late packets.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from evedrop.model.slot.transit import Arrival, Late
 
 @dataclass
 class _Slot:
-    """One of the window's slots, with all that has arrived of it."""
+    """One of the window's slots, with everything that has arrived of it."""
 
     k: int
     heard: Reception
@@ -30,10 +31,11 @@ class _Slot:
     """Trials whose packet has just arrived."""
 
 
+@final
 class Follower:
-    """A receiver with its belief. Final.
+    """A receiver with its belief.
 
-    first: the first slot that it will take; window: slots by which a packet may be late and still be used.
+    first: the first slot; window: slots by which a packet may be late and still be used.
     """
 
     def __init__(self, receiver: Receiver, window: int = 0, first: int = 0) -> None:
@@ -41,9 +43,9 @@ class Follower:
         self._history: deque[_Slot] = deque(maxlen=window)
         self.belief = receiver.prior(first)
         self.late = np.zeros(receiver.trials, np.uint16)
-        """Packets of earlier slots that the last slot brought and that were news, in each trial."""
+        """Packets of earlier slots that arrived in the last slot and were not known before, in each trial."""
         self.late_used = np.zeros(receiver.trials, np.uint16)
-        """Those of them that were used, and not discarded."""
+        """The packets among them that were used, and not discarded."""
 
     def take(self, k: int, arrival: Arrival) -> Belief:
         """The belief after slot k."""
@@ -60,7 +62,7 @@ class Follower:
         return self.belief
 
     def miss(self, slots: range) -> None:
-        """Go through slots in which nothing was received, because the receiver was not there; the window is forgotten."""
+        """Pass slots in which nothing was received because the receiver was away; the window is cleared."""
         trials = self.belief.x_hat.shape[1]
         nothing = Reception(np.zeros(trials, np.bool_), np.zeros_like(self.belief.x_hat))
         for k in slots:
@@ -68,7 +70,7 @@ class Follower:
         self._history.clear()
 
     def _merge(self, late: Late) -> bool:
-        """Put late packets where they belong; whether there is news in them. A second copy is none."""
+        """Store late packets in their slots; returns whether any of them is new. A second copy is not."""
         slot = next((slot for slot in self._history if slot.k == late.k), None)
         if slot is None:
             return False
@@ -85,7 +87,7 @@ class Follower:
         return True
 
     def _again(self, first: int) -> None:
-        """Compute the beliefs from slot `first` of the window once more."""
+        """Compute the beliefs from slot `first` of the window again."""
         belief: Belief | None = None
         for slot in self._history:
             if slot.k < first:
@@ -99,10 +101,11 @@ class Follower:
             self.belief = belief
 
 
+@final
 class Absence:
-    """What becomes of an estimate that nobody looks after: it is carried on from slot to slot. Final.
+    """The estimate of a receiver that is away: it is predicted from slot to slot.
 
-    What is not there believes nothing; this is what it will believe of these slots once it is back.
+    A receiver that is away believes nothing; these are its beliefs for these slots once it is back.
     """
 
     def __init__(self, process: Process, belief: Belief) -> None:

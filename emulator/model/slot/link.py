@@ -1,8 +1,8 @@
 """A link: the way from the router to one receiver, from random numbers and a timeline to the fate of every packet.
 
 A packet sent in slot k meets, in this order: the queue of a link of limited rate, a cut, the loss model, corruption, the
-delay, the receiver's own window for late packets, and the receiver, which may be down. The first that stops it is the
-reason for which it is lost.
+delay, the receiver's own window for late packets, and the receiver, which may be down. The first that stops the packet is
+the reason for its loss.
 
 Source: docs/mathematics.md, links; docs/links.md.
 """
@@ -13,7 +13,7 @@ import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,20 +26,20 @@ from evedrop.model.receiver import Codes, Flags
 from evedrop.streams import Batch, BlockReader
 
 NEVER = 2**62
-"""A slot that no run comes to."""
+"""A slot that no run reaches."""
 
 
 class Fates(NamedTuple):
-    """What becomes of the packets of c slots."""
+    """The fates of the packets of c slots."""
 
     codes: Codes
     """`Fate`, (c, R)."""
     delays: NDArray[np.uint32] | None = None
-    """How many slots after its own each packet arrives, (c, R); None: all in their own."""
+    """How many slots after its own each packet arrives, (c, R); None: all arrive in their own."""
     again: Flags | None = None
-    """Whether a second copy arrives with it, (c, R); None: none does."""
+    """Whether a second copy arrives with it, (c, R); None: there are no copies."""
     rests: Floats | None = None
-    """The part of a slot that the first trial's packets take besides, (c,); None where there are no delays."""
+    """The remaining fraction of a slot in the delay of the first trial's packets, (c,); None where there are no delays."""
 
     @property
     def in_time(self) -> Flags:
@@ -53,17 +53,17 @@ class Fates(NamedTuple):
         return delivered if self.delays is None else delivered & (self.delays[row] == 0)
 
     def copied(self) -> Fates:
-        """The same in arrays of its own, of which some may be silenced."""
+        """A copy with arrays of its own, so that packets may be silenced in it."""
         return Fates(self.codes.copy(), self.delays, None if self.again is None else self.again.copy())
 
     def silence(self, row: int, sent: Flags) -> None:
-        """Make the packets of one slot that are not sent (R,) unsent, in place."""
+        """Mark the packets of one slot that are not sent (R,) as unsent, in place."""
         self.codes[row][~sent] = Fate.UNSENT
         if self.again is not None:
             self.again[row] &= sent
 
     def part(self, slots: slice = slice(None), trials: slice = slice(None)) -> Fates:
-        """Of some of the slots and some of the trials."""
+        """The fates of some of the slots and some of the trials."""
         return Fates(
             self.codes[slots, trials],
             None if self.delays is None else self.delays[slots, trials],
@@ -74,7 +74,7 @@ class Fates(NamedTuple):
 
 @dataclass(frozen=True)
 class ReceiverOutage:
-    """Slots start ≤ k < stop in which a receiver is not there."""
+    """Slots start ≤ k < stop in which a receiver is away."""
 
     start: int
     stop: int
@@ -83,32 +83,32 @@ class ReceiverOutage:
 
 @dataclass(frozen=True)
 class Change:
-    """From slot `at` on, a link's settings are others, or it is cut or whole again."""
+    """From slot `at` on, a link has other settings, or it is cut or healed."""
 
     at: int
     settings: Mapping[str, Any] | None = None
-    """As in `LinkSchedule.settings`; None leaves them."""
+    """As in `LinkSchedule.settings`; None keeps them."""
     cut: bool | None = None
-    """None leaves it."""
+    """None keeps the state."""
 
 
 @dataclass(frozen=True)
 class LinkSchedule:
-    """All that is known of a link in advance: its settings at slot 0, and when they change."""
+    """Everything that is known of a link in advance: its settings at slot 0, and their changes."""
 
     settings: Mapping[str, Any]
-    """`loss`: {"model": …}; and, where they are not the default, `delay`: {"model": …}, `reorder`, `duplicate`, `corrupt`:
+    """`loss`: {"model": …}; and, where they differ from the default, `delay`: {"model": …}, `reorder`, `duplicate`, `corrupt`:
     probabilities, `rate` in packets a slot with `queue` in packets."""
     window: int = 0
     """Slots by which a packet may be late for its receiver."""
     changes: tuple[Change, ...] = ()
     outages: tuple[ReceiverOutage, ...] = ()
     correlation: tuple[str, float] | None = None
-    """Whose losses these are tied to, and how strongly."""
+    """The receiver whose losses these are tied to, and how strongly."""
 
     @classmethod
     def of(cls, spec: Mapping[str, Any]) -> LinkSchedule:
-        """From plain values, as `plain` gives them."""
+        """The schedule from plain values, as `plain` returns them."""
         return cls(
             spec["settings"],
             spec["window"],
@@ -118,7 +118,7 @@ class LinkSchedule:
         )
 
     def plain(self) -> dict[str, Any]:
-        """As values that a brief can hold."""
+        """The schedule as values that a brief can contain."""
         return {
             "settings": dict(self.settings),
             "window": self.window,
@@ -129,31 +129,33 @@ class LinkSchedule:
 
 
 def streams_of(receiver: str, course: LinkSchedule) -> tuple[str, ...]:
-    """The random streams of a receiver's link: losses, delays, everything else that may befall, and correlation."""
+    """The random streams of a receiver's link: losses, delays, all other faults, and correlation."""
     names = (f"link/{receiver}", f"delay/{receiver}", f"fate/{receiver}")
     return names if course.correlation is None else (*names, f"mix/{receiver}", f"link/{course.correlation[0]}")
 
 
+@final
 @dataclass
 class _State:
-    """What a link remembers from slot to slot: all that must be copied to decide some slots once more. Final."""
+    """The memory of a link between slots: it is copied so that slots can be decided again."""
 
     settings: Mapping[str, Any]
     loss: LossModel
     cut: bool = False
     free: float = 0.0
-    """When the queue will have sent all that is in it, in slots."""
+    """When the queue will have sent all its packets, in slots."""
 
     def copied(self) -> _State:
-        """The same, to be changed apart; a loss model never changes what it holds in place."""
+        """A copy that may change; a loss model never changes its memory in place."""
         return replace(self, loss=copy.copy(self.loss))
 
 
+@final
 @dataclass
 class Link:
-    """One receiver's link. Final. Must be read in order, any number of slots at a time.
+    """One receiver's link. Slots must be read in order, any number at a time.
 
-    keys: of `streams_of`.
+    keys: the keys of `streams_of`.
     """
 
     course: LinkSchedule
@@ -170,12 +172,12 @@ class Link:
         self._changes = sorted(self.course.changes, key=lambda change: change.at)
 
     def planned(self, slots: range) -> Fates:
-        """As `fates`, of slots that may still be amended."""
+        """The fates of the next slots, which may still be amended."""
         self._before = (self._state.copied(), slots)
         return self.fates(slots)
 
     def amended(self, at: int, changes: Iterable[Change]) -> Fates:
-        """The slots last planned from `at` on, decided once more; these changes replace all that were due from then on."""
+        """The fates of the last planned slots from `at` on, decided again; the changes replace all later changes."""
         if self._before is None or at not in self._before[1]:
             raise ValueError(f"slot {at} is not among those last planned")
         self._state, slots = self._before
@@ -186,7 +188,7 @@ class Link:
         return self.planned(range(at, slots.stop))
 
     def fates(self, slots: range) -> Fates:
-        """What becomes of the packets of the next slots in every trial."""
+        """The fates of the packets of the next slots in every trial."""
         marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
         bounds = [slots.start, *marks, slots.stop]
         parts = []
@@ -206,7 +208,7 @@ class Link:
             self._state.cut = change.cut
 
     def _unchanged(self, slots: range) -> Fates:
-        """The fates of slots throughout which the settings are the same."""
+        """The fates of slots during which the settings stay the same."""
         settings, shape = self._state.settings, (len(slots), self.batch.trials)
         codes = self._state.loss.fates(slots.start, self._loss_uniforms(slots))
         befalls = any(settings.get(name) for name in ("reorder", "duplicate", "corrupt"))
@@ -229,7 +231,7 @@ class Link:
         return Fates(codes, whole, again, rests)
 
     def _delays(self, slots: range, chances: Floats | None) -> Floats | None:
-        """In slots, (c, R), before the queue's; None if there are none."""
+        """The delays in slots, (c, R), without the queue's; None if there are none."""
         settings = self._state.settings
         if settings.get("delay") is None:
             return None
@@ -242,7 +244,7 @@ class Link:
         return delays
 
     def _queue(self, slots: range) -> tuple[Floats, Flags]:
-        """How long the packet of each slot waits for those before it, in slots, (c,), and whether it finds no place."""
+        """The time that each slot's packet waits in the queue, in slots, (c,), and whether the queue is full."""
         rate, places = float(self._state.settings["rate"]), int(self._state.settings["queue"])
         waits, full = np.zeros(len(slots)), np.zeros(len(slots), np.bool_)
         for row, k in enumerate(slots):
@@ -254,7 +256,7 @@ class Link:
         return waits, full
 
     def _received(self, slots: range, codes: Codes, delays: NDArray[np.uint32] | None) -> Codes:
-        """The fates once it is seen whether the receiver can take what the network delivers."""
+        """The fates after checking whether the receiver can accept the packets that the network delivers."""
         arrives: NDArray[np.int64] = np.arange(slots.start, slots.stop)[:, None]
         sent = arrives
         if delays is not None:
@@ -269,7 +271,7 @@ class Link:
         return codes
 
     def _loss_uniforms(self, slots: range) -> Floats:
-        """Of this link's own stream, or in some slots of the one that its losses are tied to."""
+        """Uniform numbers of this link's own stream, or in some slots of the stream to which its losses are tied."""
         width = self._state.loss.uniforms_per_slot
         own = self._uniforms("link", slots, width)
         if self.course.correlation is None:
@@ -307,5 +309,5 @@ def _joined(parts: list[Fates]) -> Fates:
 
 
 def link_of(loss: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
-    """A link that does nothing but lose: its loss model, `{"model": …}`, and the key of its losses."""
+    """A link that only loses packets: by a loss model, `{"model": …}`, and the key of its losses."""
     return Link(LinkSchedule({"loss": loss}), "it", {"link/it": key}, batch)

@@ -1,4 +1,4 @@
-"""The probabilities of a link: how likely a packet of each slot is there some slots later, piece by piece of its course.
+"""The probabilities of a link: how likely each slot's packet has arrived some slots later, segment by segment.
 
 Source: docs/mathematics.md, late packets.
 """
@@ -17,25 +17,25 @@ from evedrop.model.links.link import Chain
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import LinkSchedule
 
-_FAR = 10**8  # a slot by which everything that moves has come to rest
+_FAR = 10**8  # a slot in which all movement has ended
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Slots from `start` on, until the next segment, in which a link's settings are the same."""
+    """Slots from `start` on, until the next segment, with constant link settings."""
 
     start: int
     chain: Chain
-    """That the losses follow; of losses without a memory that differ from slot to slot, a single state."""
+    """The chain of the losses; a single state for losses without a memory that differ from slot to slot."""
     passes: float
-    """Probability that a packet that is not lost comes through: 1 − corrupt, and 0 while the link is cut."""
+    """Probability that a packet that is not lost gets through: 1 − corrupt, and 0 while the link is cut."""
     arrived: Floats
-    """Probability that a packet that comes through is there 0, 1, … slots later, (window + 1,)."""
+    """Probability that a packet that gets through has arrived 0, 1, … slots later, (window + 1,)."""
     quality_at: Callable[[range], Floats] | None = None
-    """Of losses that differ from slot to slot: probability that a packet is not lost, (c,)."""
+    """For losses that differ from slot to slot: probability that a packet is not lost, (c,)."""
 
     def quality(self, slots: range) -> Floats:
-        """Probability that a packet comes through in each slot and state, (c, states)."""
+        """Probability that a packet gets through in each slot and state, (c, states)."""
         if self.quality_at is not None:
             return self.passes * self.quality_at(slots)[:, None]
         return np.repeat(self.passes * self.chain.quality[None], len(slots), axis=0)
@@ -43,15 +43,15 @@ class Segment:
 
 @dataclass(frozen=True)
 class LinkLaw:
-    """A link's segments, and when its receiver is not there."""
+    """A link's segments, and the outages of its receiver."""
 
     segments: tuple[Segment, ...]
     outages: tuple[tuple[int, int, bool], ...] = ()
-    """First slot, first slot after, and whether the receiver keeps its state."""
+    """First slot, first slot after the outage, and whether the receiver keeps its state."""
 
     @classmethod
     def steady(cls, chain: Chain) -> LinkLaw:
-        """Of a link that does nothing but lose, by a chain."""
+        """The law of a link that only loses packets, by a chain."""
         return cls((Segment(0, chain, 1.0, np.ones(1)),))
 
     @property
@@ -61,7 +61,7 @@ class LinkLaw:
 
     @property
     def last(self) -> Chain:
-        """What the link comes to: its last segment's chain, with the packets that arrive in the end."""
+        """The link in its last state: the last segment's chain, counting every packet that eventually arrives."""
         segment = self.segments[-1]
         gone = any(stop > _FAR for _, stop, _ in self.outages)
         quality = segment.quality(range(_FAR, _FAR + 1))[0] * (0.0 if gone else segment.arrived[-1])
@@ -69,16 +69,16 @@ class LinkLaw:
 
     @property
     def alike(self) -> Chain | None:
-        """A single state, if every packet's fate is independent of all others' and alike, and none is late; as in the paper."""
+        """A single state, if the fates of all packets are independent and identical in law and none is late, as in the paper."""
         one = len(self.segments) == 1 and not self.outages and self.window == 0
         return self.last if one and self.segments[0].quality_at is None and self.segments[0].chain.independent else None
 
 
 def law_of(course: LinkSchedule) -> LinkLaw | None:
-    """The law of a link, from all that is known of it in advance; None if theory does not know it.
+    """The law of a link, from everything that is known of it in advance; None if theory does not cover it.
 
-    It does not know losses with a memory that is no chain, or that never settle, queues, delays that are no independent
-    draws, and receivers that are away while packets are under way.
+    It does not cover losses with a memory that is not a chain, losses that never settle, queues, delays that are not
+    independent draws, and receivers that are away while packets are under way.
     """
     segments = []
     for start, settings, cut in stretches(course):
@@ -96,7 +96,7 @@ def law_of(course: LinkSchedule) -> LinkLaw | None:
 
 
 def stretches(course: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool]]:
-    """First slots of stretches in which a link's settings are the same, with them and whether it is cut."""
+    """The first slots of stretches with constant link settings, with the settings and whether the link is cut."""
     settings, cut = course.settings, False
     marks = [(0, settings, False)]
     for change in sorted(course.changes, key=lambda one: one.at):

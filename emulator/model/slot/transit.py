@@ -1,8 +1,8 @@
-"""Packets under way on a link: what arrives in each slot, in time, late, or twice."""
+"""Packets under way on a link: those that arrive in each slot, in time, late, or twice."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,37 +14,38 @@ from evedrop.model.slot.link import Fates
 
 
 class Late(NamedTuple):
-    """Packets of an earlier slot, or once more of this one, that arrive now."""
+    """Packets of an earlier slot, or second copies from this slot, that arrive now."""
 
     k: int
     """The slot they were sent in."""
     heard: Reception
     """The packets; γ marks the trials in which one arrives."""
     copy: bool = False
-    """Whether these are second copies of packets that have arrived."""
+    """Whether these are second copies of packets that have arrived already."""
 
 
 class Arrival(NamedTuple):
-    """All that arrives at a receiver in a slot."""
+    """Everything that arrives at a receiver in a slot."""
 
     heard: Reception
     """The slot's own packets."""
     late: tuple[Late, ...] = ()
 
 
+@final
 class Transit:
-    """Final. Slots must be passed on in order; packets wait here until they arrive."""
+    """Holds packets until they arrive. Slots must be passed on in order."""
 
     def __init__(self) -> None:
         self._due: dict[int, list[Late]] = {}
 
     @property
     def busy(self) -> bool:
-        """Whether anything is under way."""
+        """Whether any packets are under way."""
         return bool(self._due)
 
     def arrival(self, k: int, fates: Fates, row: int, z: Floats, header: NDArray[np.int64] | None = None) -> Arrival:
-        """What arrives in slot k, whose packets z (n, R) and header (h, R) have the fates of one row."""
+        """The packets that arrive in slot k, whose own packets z (n, R) and header (h, R) have the fates of one row."""
         codes, delays, again = fates.codes[row], fates.delays, fates.again
         delivered: Flags = codes == Fate.DELIVERED
         due = self._due.pop(k, [])

@@ -1,1 +1,1 @@
-"""What theory says: expectations, limits, bounds, and the choice of parameters."""
+"""Theory: expectations, limits, bounds, and the choice of parameters."""

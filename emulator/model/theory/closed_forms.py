@@ -1,4 +1,4 @@
-"""Closed forms of schemes that the outcomes of a slot alone do not give: bounds, and chains with a memory.
+"""Closed forms for schemes to which the outcomes of single slots are not enough: bounds, and chains with a memory.
 
 Source: docs/mathematics.md, twin track, acknowledged references, schedules by holding time.
 """
@@ -13,9 +13,9 @@ from evedrop.model.process import Floats, Process
 
 
 def twin_track_bound(process: Process, slots: int) -> Floats:
-    """½ tr A^k Σ0 A^kᵀ for k = 0 … slots−1, (slots,): no eavesdropper of twin tracks has a smaller mean squared error.
+    """½ tr A^k Σ0 A^kᵀ for k = 0 … slots−1, (slots,): a lower bound on the squared error of any eavesdropper of twin tracks.
 
-    Holds for μ_e = 1 and unlimited means, without coin and starts. inf once it overflows.
+    Holds for μ_e = 1 and unlimited means, without knowledge of coin and starts. inf once it overflows.
 
     Source: docs/mathematics.md, twin track.
     """
@@ -33,8 +33,8 @@ def reference_covariances(process: Process, received: float, acknowledged: tuple
     """E P_k of a reader of state-secrecy codes with L = A, for k = 0 … slots−1, (slots, n, n); inf from where it overflows.
 
     received: the probability that it hears a packet. acknowledged: the probabilities that the packet is acknowledged to
-    the sensor and it heard it, and that it is acknowledged and it did not. With P⁻ and R⁻ the error and the error of the
-    reference, each carried on,
+    the sensor and was heard by the reader, and that it is acknowledged and was not heard. With P⁻ and R⁻ the error and the
+    error of the reference, each predicted by one slot,
 
         P_k = R⁻ if heard, else P⁻;   R_k = P_k if acknowledged, else R⁻;   R = 0 before the first acknowledgement,
 
@@ -61,10 +61,10 @@ def reference_covariances(process: Process, received: float, acknowledged: tuple
 
 @dataclass(frozen=True)
 class SensorChain:
-    """What the sensor does, as a Markov chain, and what that does to one receiver's error.
+    """The sensor's behaviour as a Markov chain, and its effect on one receiver's error.
 
-    Entry [s, r] of the two matrices is the probability, in state s, that the receiver's error is reset to 0, or carried
-    on, and that the next state is r. All slots start in `start`.
+    Entry [s, r] of the two matrices is the probability, in state s, that the receiver's error is reset to 0, or predicted,
+    and that the next state is r. All slots start in `start`.
 
     Source: docs/mathematics.md, schedules by holding time.
     """
@@ -114,10 +114,10 @@ class SensorChain:
 
 
 def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:
-    """A receiver of the scheme `scheduled`; state s is a holding time of s + 1, the last one of threshold and more.
+    """The chain for a receiver of the scheme `scheduled`; state s is a holding time of s + 1, the last: threshold or more.
 
     received: the probability that it hears a packet that is sent. acknowledged: the probabilities that such a packet is
-    acknowledged to the sensor and it heard it, and that it is acknowledged and it did not.
+    acknowledged to the sensor and was heard by the receiver, and that it is acknowledged and was not heard.
 
     Source: docs/mathematics.md, schedules by holding time.
     """
@@ -129,7 +129,7 @@ def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]
 
 
 def encrypted_schedule(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:
-    """The selective eavesdropper of the scheme `encrypted-schedule`; states and arguments as those of `scheduled`.
+    """The chain for the selective eavesdropper of `encrypted-schedule`; states and arguments as for `scheduled`.
 
     The last state's entry of `law` is the fraction of packets that are encrypted.
 
@@ -152,7 +152,7 @@ def _blank(threshold: int) -> tuple[Floats, Floats, Floats]:
 def _hear(
     reset: Floats, carried: Floats, s: int, unacknowledged: int, received: float, acknowledged: tuple[float, float]
 ) -> None:
-    """A packet is sent in state s: acknowledged, the next state is 0."""
+    """Enter the outcomes of a packet sent in state s; after an acknowledgement the next state is 0."""
     heard, unheard = acknowledged
     reset[s, 0] += heard
     carried[s, 0] += unheard

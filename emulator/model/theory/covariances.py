@@ -1,7 +1,7 @@
-"""What theory says of a receiver's error covariance: its expectation in every slot, its limit, its bounds, its tails.
+"""A receiver's error covariance by theory: its expectation in every slot, its limit, its bounds and its tails.
 
-Everything follows from how likely a slot's outcomes are (`Outcomes`). Two covariances must be told apart: the actual
-one of the error, and the one the receiver believes, which ignores that innovations may have misled it
+Everything follows from the probabilities of a slot's outcomes (`Outcomes`). Two covariances must be distinguished: the
+actual one of the error, and the one that the receiver believes, which ignores that innovations may have misled it
 (`Outcomes.believed`).
 
 Source: docs/mathematics.md, expectations.
@@ -13,22 +13,23 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
 from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
-_BLOCK = 256  # slots computed from one starting point: long enough to hide Python, few enough to set up in 3 ms
-_LARGEST_POWER = 1e100  # of A's entries within a block, far from overflow
+_BLOCK = 256  # slots computed from one starting point: long enough to hide Python's overhead, quick to set up (3 ms)
+_LARGEST_POWER = 1e100  # bound on A's entries within a block, far from overflow
 _ROUNDING = 1e-12
 LARGEST_OPERATOR = 512
-"""Rows of a linear operator whose limit is worked out: some seconds; more than that and no limit is said."""
+"""The most rows of a linear operator whose limit is computed, which takes some seconds; beyond it no limit is given."""
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Probabilities of what a receiver does with a slot k ≥ 1; `predicted`, `decoded`, `leaked`, `state`, `misled` sum to 1.
+    """Probabilities of a receiver's actions in a slot k ≥ 1; `predicted`, `decoded`, `leaked`, `state`, `misled` sum to 1.
 
     Source: docs/mathematics.md, expectations.
     """
@@ -48,7 +49,7 @@ class Outcomes:
 
     @classmethod
     def legitimate(cls, mu: float, mu_d: float) -> Outcomes:
-        """The estimator that holds the secret, behind a link of quality μ; μ_d is P(ν = 0)."""
+        """The estimator with the secret, behind a link of quality μ; μ_d is P(ν = 0)."""
         return cls(predicted=1.0 - mu, state=mu * mu_d, misled=0.0, decoded=mu * (1.0 - mu_d), initial=1.0 - mu)
 
     @classmethod
@@ -65,7 +66,7 @@ class Outcomes:
 
     @classmethod
     def genie(cls, mu_e: float, mu_d: float) -> Outcomes:
-        """Who knows the type of every packet and uses all that it tells, behind a link of quality μ_e.
+        """A receiver that knows the type of every packet and uses all information in it, behind a link of quality μ_e.
 
         Source: docs/mathematics.md, genie.
         """
@@ -73,20 +74,20 @@ class Outcomes:
 
     @property
     def believed(self) -> Outcomes:
-        """The same with every used packet taken for the state, which is what the receiver's own covariance assumes."""
+        """The same with every used packet counted as the state, as the receiver's own covariance assumes."""
         return replace(self, state=self.state + self.misled, misled=0.0)
 
     @property
     def kept(self) -> float:
-        """Probability that the error is carried on to the next slot: not to 0, not to f_k."""
+        """Probability that the error is predicted to the next slot, and set neither to 0 nor to f_k."""
         return self.predicted + self.decoded + self.leaked
 
 
 OutcomesAt = Callable[[float], Outcomes]
-"""From the quality of a link to what its receiver does with a slot."""
+"""Maps the quality of a link to the outcomes at its receiver."""
 
 NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
-"""Who is told nothing: its error covariance is that of the state itself."""
+"""The outcomes of a receiver without packets: its error covariance is that of the state itself."""
 
 
 def state_covariances(process: Process, slots: int) -> Floats:
@@ -118,8 +119,9 @@ def misled_covariances(process: Process, slots: int) -> Floats:
         return 2.0 * noise_covariances(process, slots)
 
 
+@final
 class ExpectedCovariance:
-    """E P_k of a receiver, the next slots at a time from k = 0. Final.
+    """E P_k of a receiver, a number of slots at a time from k = 0.
 
     E_0 = p_0 Σ0, E_k = p_k (A E_{k−1} Aᵀ) + p_d Q + p_i f_k with p_k = `kept`, solved for a block of slots at once: for
     j slots beyond s, with F = √p_k A and W_j = Σ_{l<j} A^l Q A^lᵀ,
@@ -128,8 +130,8 @@ class ExpectedCovariance:
                   + 2 p_i Σ_{l<j} F^l (W_{j−l} − Q) F^lᵀ,
 
     all terms positive semidefinite, so nothing cancels. Values do not depend on how many slots are asked for at a time.
-    From the slot where a value leaves double precision, every entry is inf. What is leaked differs from slot to slot, and
-    its recursion is followed slot by slot.
+    From the slot where a value exceeds double precision, every entry is inf. Leaks differ from slot to slot, so their
+    recursion is computed slot by slot.
 
     Source: Theorem IV.3 (proof, corrected), Theorem V.2 (corrected); docs/mathematics.md, expectations.
     """
@@ -221,7 +223,7 @@ def expected_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:
 
 
 def radius(process: Process) -> float:
-    """ρ(A), exactly 1 for a marginally stable process whatever its eigenvalues' rounding.
+    """ρ(A), exactly 1 for a marginally stable process whatever the rounding of its eigenvalues.
 
     Source: docs/mathematics.md, limits.
     """
@@ -230,9 +232,9 @@ def radius(process: Process) -> float:
 
 
 def stability_bound(process: Process, mu: float) -> float:
-    """(1 − ρ⁻²)/μ: a receiver behind a link of quality μ, never misled, has a bounded error iff μ_d lies above it.
+    """(1 − ρ⁻²)/μ: a receiver behind a link of quality μ that is never misled has a bounded error iff μ_d exceeds it.
 
-    0 for ρ = 1: any μ_d > 0 will do. 1 or more: no μ_d ≤ 1 lies above it. inf for μ = 0 and ρ ≥ 1: none at all.
+    0 for ρ = 1: any μ_d > 0 exceeds it. 1 or more: no μ_d ≤ 1 does. inf for μ = 0 and ρ ≥ 1.
 
     Source: docs/mathematics.md, limits.
     """
@@ -251,7 +253,7 @@ def lyapunov(process: Process, kept: float) -> Floats:
 
 
 def limit(process: Process, outcomes: Outcomes) -> Floats:
-    """Limit of E P_k, (n, n), all inf if it is unbounded: p_d S(1 − kept), for whoever is never misled.
+    """Limit of E P_k, (n, n), all inf if it is unbounded: p_d S(1 − kept) for a receiver that is never misled.
 
     Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics.md, limits and genie.
     """
@@ -278,8 +280,8 @@ def limit_trace(process: Process, outcomes: Outcomes) -> float:
 def tail_index(process: Process, outcomes: Outcomes) -> float:
     """Exponent α of P(tr P_k > t) ~ t^−α for large k: −ln(1 − p_r) / (2 ln ρ). inf where there is no heavy tail.
 
-    inf too for whoever is misled, and for whoever never uses a state: tr P_k then stays within a factor of its own,
-    growing expectation.
+    inf too for a receiver that is misled or never uses a state: tr P_k then stays within a factor of its own, growing
+    expectation.
 
     Source: docs/mathematics.md, heavy tails.
     """
@@ -292,7 +294,7 @@ def tail_index(process: Process, outcomes: Outcomes) -> float:
 
 
 def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
-    """Whether tr P_k has no finite variance in the limit, so that a sample mean proves nothing: α ≤ 2.
+    """Whether tr P_k has infinite variance in the limit, so that a sample mean proves nothing: α ≤ 2.
 
     Source: docs/mathematics.md, heavy tails.
     """

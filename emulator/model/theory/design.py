@@ -1,4 +1,4 @@
-"""Choosing μ_d: what is admissible, what is secret against whom, what is best, and what it costs.
+"""The choice of μ_d: which values are admissible, secret against which eavesdropper, optimal, and at what cost.
 
 Source: docs/mathematics.md, design.
 """
@@ -22,13 +22,13 @@ Interval = tuple[float, float]
 
 _EQUAL = 1e-12  # relative difference below which two traces count as equal
 _XTOL = 1e-13
-_NEAREST = 1e-9  # distance to a pole, relative to the interval, from where differences are looked at
-_ATTAINED = 1e-5  # a maximum nearer than this to the open end of the interval is none
+_NEAREST = 1e-9  # smallest distance to a pole, relative to the interval, at which differences are computed
+_ATTAINED = 1e-5  # a maximum nearer than this to the open end of the interval is not a maximum
 
 
 @dataclass(frozen=True)
 class Adversary:
-    """An eavesdropper as the design sees it."""
+    """An eavesdropper as the design needs to know it."""
 
     name: str
     mu_e: float
@@ -38,15 +38,15 @@ class Adversary:
     use_innovation: float
     """P(b = 1 given ν = 1)."""
     reads_leak: bool = False
-    """Whether it uses what innovations leak: the genie, with the probabilities of smart."""
+    """Whether it uses the leak of innovations: the genie, with the probabilities of smart."""
 
     @classmethod
     def who(cls, name: str, mu_e: float, half: Outcomes) -> Adversary:
-        """From what it would do with a slot behind a link that loses nothing, at μ_d = 1/2."""
+        """From its outcomes behind a lossless link at μ_d = 1/2."""
         return cls(name, mu_e, 2.0 * half.state, 2.0 * half.misled, half.leaked > 0.0)
 
     def outcomes(self, mu_d: float) -> Outcomes:
-        """What it does with a slot."""
+        """Its outcomes in a slot."""
         if self.reads_leak:
             return Outcomes.genie(self.mu_e, mu_d)
         return Outcomes.eavesdropper(self.mu_e, mu_d, self.use_state, self.use_innovation)
@@ -54,7 +54,7 @@ class Adversary:
 
 @dataclass(frozen=True)
 class Against:
-    """What can be had against one eavesdropper."""
+    """The secrecy that can be had against one eavesdropper."""
 
     bound: float
     """Lower end of the μ_d at which its error is bounded: (1 − ρ⁻²)/μ_e for smart; inf if there is no such μ_d."""
@@ -69,12 +69,12 @@ class Against:
     trace: float
     """J_e at the scenario's own μ_d."""
     difference: float
-    """J_r = J_e − J there: the gain. nan if both are unbounded."""
+    """J_r = J_e − J at that μ_d: the gain. nan if both are unbounded."""
     violated: tuple[tuple[int, int], ...]
     """(first, last) of each stretch of the run's slots k ≥ 1 in which tr E P_k < tr E Pᵉ_k does not hold at the
     scenario's own μ_d."""
     relative_from: int | None
-    """First slot k ≥ 1 from which on it holds to the end of the run; None if not in the last slot. 1 is the paper's
+    """First slot k ≥ 1 from which on it holds until the end of the run; None if it fails in the last slot. 1 is the paper's
     "for all k"."""
 
     def as_dict(self) -> dict[str, Any]:
@@ -97,24 +97,24 @@ class Design:
     """ρ(A)."""
     mu: float
     mu_d: float
-    """The scenario's own."""
+    """The scenario's own μ_d."""
     bound: float
     """(1 − ρ⁻²)/μ: the legitimate error is bounded iff μ_d lies above it."""
     admissible: Interval | None
     """(lo, 1], the μ_d of a bounded legitimate error; None if there are none."""
     minimum: float | None
-    """μ_d_min for the asked Ω; None if none was asked."""
+    """μ_d_min for the Ω asked for; None if none was."""
     trace: float
     """J at the scenario's own μ_d; inf if unbounded."""
     plain_trace: float
-    """J(1): what the same link gives when every packet is the state."""
+    """J(1): the error over the same link if every packet is the state."""
     eavesdroppers: dict[str, Against]
     left_out: dict[str, str] = field(default_factory=dict)
-    """Eavesdropper → strategy, of those whose error has no closed form: nothing can be designed by it."""
+    """Eavesdropper → strategy, for those whose error has no closed form, which cannot be designed for."""
 
     @property
     def cost(self) -> float:
-        """J(μ_d) / J(1), by which factor secrecy raises the legitimate error: 1 for a lossless link, nan for a bad one."""
+        """J(μ_d) / J(1), the factor by which secrecy raises the legitimate error: 1 for a lossless link, nan for a bad one."""
         return 1.0 if self.plain_trace == 0.0 else self.trace / self.plain_trace
 
     @property
@@ -137,7 +137,7 @@ class Design:
         return f"left out: {who}: no closed form of its error is known; what holds against a genie holds against all"
 
     def as_dict(self) -> dict[str, Any]:
-        """The JSON of `evedrop design`; inf is null, and `minimum` and `left_out` are there only if there are any."""
+        """The JSON of `evedrop design`; inf is null, and `minimum` and `left_out` are present only if they have values."""
         legitimate: dict[str, Any] = {"bound": _finite(self.bound), "trace": _finite(self.trace)}
         if self.minimum is not None:
             legitimate["minimum"] = self.minimum
@@ -157,9 +157,9 @@ def design(
     slots: int,
     max_trace: float | None = None,
 ) -> Design:
-    """Everything to choose μ_d by. `slots` is the run's length, `max_trace` is Ω.
+    """Compute everything that the choice of μ_d depends on. `slots` is the run's length, `max_trace` is Ω.
 
-    Raises UsageError if Ω cannot be kept by any μ_d.
+    Raises UsageError if no μ_d can keep Ω.
 
     Source: docs/mathematics.md, design.
     """
@@ -201,7 +201,7 @@ def design(
 def adversary_bound(process: Process, adversary: Adversary) -> float:
     """Infimum of the μ_d at which an eavesdropper's error is bounded; inf if there is none.
 
-    Whoever may be misled is bounded at μ_d = 1 at most, where nothing misleads.
+    The error of an eavesdropper that may be misled is bounded at most at μ_d = 1, where nothing misleads.
 
     Source: docs/mathematics.md, design.
     """
@@ -214,7 +214,7 @@ def adversary_bound(process: Process, adversary: Adversary) -> float:
 def perfect_secrecy(process: Process, mu: float, adversary: Adversary) -> Interval | None:
     """(lo, hi] of the μ_d with J bounded and J_e unbounded; None if there are none.
 
-    hi = 1 itself does not belong to it where only innovations, of which there are none at μ_d = 1, unbound the error.
+    hi = 1 itself is excluded where only innovations, which do not occur at μ_d = 1, make the error unbounded.
 
     Source: Theorem V.9, Corollaries V.3 and V.4.
     """
@@ -261,7 +261,7 @@ def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple
 def least_state_probability(process: Process, mu: float, max_trace: float) -> float:
     """μ_d_min, the root of J = Ω: the error stays below Ω, in the limit, for every larger μ_d. Ω is `max_trace`.
 
-    The stability bound for a lossless link. Raises UsageError if not even μ_d = 1 keeps Ω.
+    It is the stability bound for a lossless link. Raises UsageError if not even μ_d = 1 keeps Ω.
 
     Source: docs/mathematics.md, design; Lemma VI.1 (J falls).
     """
@@ -341,7 +341,7 @@ def _advantage(ours: float, theirs: float) -> float:
 
 
 def _between(low: float, high: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Points of (low, high], dense towards low, where there may be a pole."""
+    """Points of (low, high], dense near low, where there may be a pole."""
     steps = np.concatenate([np.geomspace(_NEAREST, 0.02, 60), np.linspace(0.02, 1.0, 99)[1:]])
     points: np.ndarray[tuple[int], np.dtype[np.float64]] = low + steps * (high - low)
     return points

@@ -1,7 +1,7 @@
-"""The Markov chain of the legitimate estimator: how long ago, and by which events, it fell out of sync.
+"""The Markov chain of the legitimate estimator: how long ago it fell out of sync, and the events since.
 
-In sync (Δ = 0) its estimate is the state. A drop takes it to Δ = 1; from there every drop or innovation adds one step,
-and the next state packet brings it back. A word is the order of drops and innovations since.
+In sync (Δ = 0) its estimate is the state. A drop leads to Δ = 1; from there every drop or innovation adds one step,
+and the next state packet leads back. A word is the order of drops and innovations since.
 
 Source: the paper's appendix, Proposition (limiting distribution); docs/mathematics.md, Markov chain.
 """
@@ -14,7 +14,7 @@ from evedrop.model.process import Floats
 
 
 def in_sync_probability(mu: float, mu_d: float) -> float:
-    """π_0 = μμ_d / (1 − μ(1−μ_d)): the fraction of time without error. 1 for μ = 1, whatever μ_d.
+    """π_0 = μμ_d / (1 − μ(1−μ_d)): the fraction of time without error. 1 for μ = 1, whatever μ_d is.
 
     Source: Proposition (limiting distribution), first part.
     """

@@ -1,4 +1,4 @@
-"""How long float64 can follow a process: until rounding of the state drowns the innovation hidden in it."""
+"""How long float64 can follow a process: until rounding of the state exceeds the innovation hidden in it."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
 
 UNIT_ROUNDOFF = 2.0**-53
 TOLERANCE = 0.01
-_NO_NOISE = 1e-12  # of the largest eigenvalue of a singular Q: what rounding explains
-_EACH = 2**22  # numbers in the covariances of the slots that are looked at each; beyond them, halves are searched
+_NO_NOISE = 1e-12  # relative to the largest eigenvalue of a singular Q: eigenvalues below it are rounding
+_EACH = 2**22  # numbers in the covariances of slots that are checked one by one; later slots are bisected
 _AT_LEAST = 1024
 
 
 def horizon(process: Process, slots: int) -> int | None:
-    """Largest k in float64's reach, if it is below slots−1; None if the whole run is.
+    """Largest k within float64's reach, if it is below slots−1; None if the whole run is within it.
 
-    The last k such that up to it 2⁻⁵³ √λ_max(Σ_k) ≤ 0.01 √λ_min(Q). Among the first slots, thousands of them, each is looked
-    at; after these Σ_k is taken to grow from one slot to the next, once it has outgrown its beginning.
+    The last k such that up to it 2⁻⁵³ √λ_max(Σ_k) ≤ 0.01 √λ_min(Q). Each of the first thousands of slots is checked; after
+    them Σ_k is assumed to grow from slot to slot, because it has outgrown its beginning.
 
     Source: docs/mathematics.md, horizon.
     """
@@ -33,7 +33,7 @@ def horizon(process: Process, slots: int) -> int | None:
     sigma = process.initial_covariance[None]
     for first in range(0, count, ahead):
         sigma = states.next(min(ahead, count - first))
-        # The trace bounds the largest eigenvalue, so almost always nothing needs to be decomposed.
+        # The trace bounds the largest eigenvalue, so a decomposition is hardly ever needed.
         with np.errstate(over="ignore"):
             doubtful = np.flatnonzero(~(np.trace(sigma, axis1=1, axis2=2) <= limit))
         for k in doubtful.tolist():
@@ -50,15 +50,15 @@ def _beyond(sigma: Floats, limit: float) -> bool:
 
 
 def _last_within(process: Process, sigma: Floats, k: int, last: int, limit: float) -> int:
-    """The last slot up to `last` that is within the limit, searched from slot k on, whose covariance is `sigma`."""
-    # A^m and W_m = Σ_{l<m} A^l Q A^lᵀ for m = 1, 2, 4, …: m slots further, Σ is A^m Σ A^mᵀ + W_m.
+    """The last slot up to `last` within the limit, searched from slot k on, whose covariance is `sigma`."""
+    # A^m and W_m = Σ_{l<m} A^l Q A^lᵀ for m = 1, 2, 4, …: m slots later, Σ is A^m Σ A^mᵀ + W_m.
     steps = [(1, process.A, process.Q)]
     with np.errstate(over="ignore", invalid="ignore"):
         while 2 * steps[-1][0] <= last - k:
             m, power, W = steps[-1]
             steps.append((2 * m, power @ power, power @ W @ power.T + W))
         for m, power, W in reversed(steps):
-            # Twice, for the steps need not be a binary number of what is left.
+            # Twice, because the remainder need not be a sum of distinct steps.
             for _ in range(2):
                 further = power @ sigma @ power.T + W
                 if k + m <= last and not _beyond(further, limit):

@@ -1,7 +1,7 @@
-"""What an innovation packet tells of w_{k−1} to whoever knows its type but not the noise that hides it.
+"""The information about w_{k−1} in an innovation packet, for a receiver that knows its type but not the noise that hides it.
 
 z_k = w_{k−1} + χ_k with w ~ N(0, Q) and χ_k ~ N(0, A Σ_{k−1} Aᵀ), so given z_k the mean of w_{k−1} is QΣ_k⁻¹ z_k and its
-covariance Q − QΣ_k⁻¹Q. One triangularisation has it all, without a difference and without Σ_k:
+covariance Q − QΣ_k⁻¹Q. One triangularisation gives everything, without a difference and without Σ_k:
 
     [A L_{k−1}  Q^½]   [L_k          0       ]
     [0          Q^½] = [QΣ_k⁻¹ L_k   M_k^½   ] U,   U orthogonal, L_k L_kᵀ = Σ_k, M_k = Q − QΣ_k⁻¹Q.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -21,8 +22,9 @@ from evedrop.model.numeric.factored import Factor
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
 
 
+@final
 class Leak:
-    """A slot k ≥ 1. Final; every number of it depends on the process alone."""
+    """The leak of a slot k ≥ 1; its numbers depend only on the process."""
 
     def __init__(self, carried: Rows, noise: Rows) -> None:
         n = len(noise)
@@ -34,7 +36,7 @@ class Leak:
         self._remaining = [row[n:] for row in joint[n:]]
 
     def white(self, z: Floats) -> Floats:
-        """L_k⁻¹ z, (n, R): white where z ~ N(0, Σ_k), as a packet of either type is by itself."""
+        """L_k⁻¹ z, (n, R): white where z ~ N(0, Σ_k), which is the distribution of packets of both types."""
         y = np.empty_like(z)
         for i, row in enumerate(self._state):
             rest = z[i]
@@ -71,10 +73,11 @@ class Leak:
         return [row[i] * row[i] for i, row in enumerate(self._state)]
 
 
+@final
 class RemainingCovariances:
-    """M_k for k = 1, 2, … in this order, for the theory: fast, and true to rounding of Q, but of no platform's bits. Final.
+    """M_k for k = 1, 2, … in this order, for the theory: fast, and accurate to the rounding of Q, but bits depend on the machine.
 
-    By M_k = A (Σ_{k−1}⁻¹ + AᵀQ⁻¹A)⁻¹ Aᵀ and Σ_k⁻¹ = Q⁻¹ − Q⁻¹M_kQ⁻¹, which hold up where Σ_k can no longer be inverted.
+    From M_k = A (Σ_{k−1}⁻¹ + AᵀQ⁻¹A)⁻¹ Aᵀ and Σ_k⁻¹ = Q⁻¹ − Q⁻¹M_kQ⁻¹, which work even where Σ_k cannot be inverted.
     """
 
     def __init__(self, process: Process) -> None:
@@ -84,14 +87,14 @@ class RemainingCovariances:
         self._information = np.linalg.inv(process.initial_covariance)
 
     def next(self) -> Floats:
-        """The next slot's, (n, n)."""
+        """M_k of the next slot, (n, n)."""
         M: Floats = self._A @ np.linalg.inv(self._information + self._carried) @ self._A.T
         self._information = self._precision - self._precision @ M @ self._precision
         return M
 
 
 def remaining_limit(process: Process) -> Floats:
-    """Limit of M_k, (n, n): Q, less what is leaked for ever of the directions in which the process is stable.
+    """Limit of M_k, (n, n): Q minus the permanent leak in the directions in which the process is stable.
 
     With rows W of Aᵀ's stable invariant subspace, Wᵀx is a stable process by itself and the rest of Σ_k⁻¹ vanishes.
 
@@ -108,8 +111,9 @@ def remaining_limit(process: Process) -> Floats:
     return limit
 
 
+@final
 class Leaks:
-    """The leak of every slot k ≥ 1. Final; reading slots in order costs each once."""
+    """The leak of every slot k ≥ 1; reading slots in order computes each once."""
 
     def __init__(self, process: Process) -> None:
         self._states = StateFactors(process)
@@ -118,7 +122,7 @@ class Leaks:
         self._leak: Leak
 
     def at(self, k: int) -> Leak:
-        """Of slot k."""
+        """The leak of slot k."""
         if k != self._k:
             self._k, self._leak = k, Leak(self._states.carried(k), self._noise)
         return self._leak

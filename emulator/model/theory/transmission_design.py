@@ -1,4 +1,4 @@
-"""When to send, if the sensor knew both receivers' holding times: the optimal policy, by value iteration.
+"""When to send, if the sensor knew the holding times of both receivers: the optimal policy, by value iteration.
 
 Source: Leong, Quevedo, Dolz, Dey (2019); docs/mathematics.md, schedules by holding time.
 """
@@ -17,7 +17,7 @@ _TOLERANCE = 1e-10
 
 @dataclass(frozen=True)
 class Policy:
-    """What is best to do, by how many slots ago user (row) and eavesdropper (column) last had the state, cut at the end."""
+    """The optimal decision by the holding times of user (row) and eavesdropper (column), which are cut off at the end."""
 
     send: NDArray[np.bool_]
     """(states, states)."""
@@ -25,7 +25,7 @@ class Policy:
     """Discounted cost to go, (states, states)."""
 
     def threshold(self, eavesdropper: int) -> int:
-        """The least holding time of the user at which to send, for one of the eavesdropper's; `states` if there is none."""
+        """The least holding time of the user at which to send, for one of the eavesdropper; `states` if there is none."""
         column = self.send[:, eavesdropper]
         return int(np.argmax(column)) if column.any() else len(column)
 
@@ -33,8 +33,8 @@ class Policy:
 def best_policy(process: Process, mu: float, mu_e: float, weight: float, states: int, discount: float = 0.95) -> Policy:
     """Minimise Σ discount^k (weight tr P_k − (1−weight) tr Pᵉ_k) over whether to send, with holding times below `states`.
 
-    A holding time i has P = Σ_{j<i} A^j Q A^jᵀ; the last one stands for all beyond, which keeps costs of an unstable
-    process finite. For each holding time of the eavesdropper the best policy is a threshold on the user's.
+    A holding time i has P = Σ_{j<i} A^j Q A^jᵀ; the last one stands for all longer ones, which keeps the costs of an unstable
+    process finite. For each holding time of the eavesdropper the optimal policy is a threshold on the user's.
 
     Source: docs/mathematics.md, schedules by holding time.
     """
