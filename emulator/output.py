@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar, final
 
 T = TypeVar("T")
 
@@ -30,8 +30,9 @@ def named_output() -> Iterator[None]:
             yield
 
 
+@final
 class _Named:
-    """A stream whose errors have a file name. Final."""
+    """A stream whose errors have a file name."""
 
     def __init__(self, stream: TextIO, name: str) -> None:
         self._stream = stream

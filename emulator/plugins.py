@@ -16,7 +16,7 @@ from hashlib import sha256
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.model.registry import is_own
@@ -80,8 +80,9 @@ def _installed(top: str) -> ModuleSpec | None:
     return None
 
 
+@final
 class _Folder(str):
-    """A folder on the path that `look_in` has put there. Final."""
+    """A folder on the path that `look_in` has put there."""
 
     __slots__ = ()
 

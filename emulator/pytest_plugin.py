@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import pytest
 
@@ -32,16 +32,18 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
     return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
 
 
+@final
 class ScenarioFile(pytest.File):
-    """A scenario file. Final."""
+    """A scenario file."""
 
     def collect(self) -> Iterator[pytest.Item]:
         """Its one test."""
         yield ScenarioItem.from_parent(self, name=self.path.stem)
 
 
+@final
 class ScenarioItem(pytest.Item):
-    """A scenario as a test. Final."""
+    """A scenario as a test."""
 
     def runtest(self) -> None:
         """Run it. Raises ScenarioFailed if it does not pass."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import blake2b
+from typing import final
 
 import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
@@ -41,7 +42,7 @@ def stream_key(root: bytes, name: str) -> bytes:
 class Stream:
     """A stream over a range of trials (step 1), `per_trial` words for each in every slot.
 
-    Final. AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots. The
+    AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots. The
     blocks are kept between calls; only their slot numbers change.
     """
 
@@ -96,10 +97,11 @@ class Batch:
         return range(self.first_trial, self.first_trial + self.trials)
 
 
+@final
 class BlockReader:
     """Draws a stream ahead, a block of slots at a time, and converts a block in one call.
 
-    Final. Holds one block: reading slots in order costs each number once; any other order is correct, only slower.
+    Holds one block: reading slots in order costs each number once; any other order is correct, only slower.
     """
 
     def __init__(self, key: bytes, batch: Batch, per_trial: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from base64 import b64decode
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -30,8 +30,9 @@ def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> Repl
     return session.kept(key, brief.flow.window + 1 + period, back=period)
 
 
+@final
 class Decided:
-    """What the controller decides, as it comes in every period slots. Final."""
+    """What the controller decides, as it comes in every period slots."""
 
     def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
@@ -48,8 +49,9 @@ class Decided:
         return self._now
 
 
+@final
 class Actuator:
-    """The plant at the sensor: what moves its state, and the inputs that it waits for after every slot. Final."""
+    """The plant at the sensor: what moves its state, and the inputs that it waits for after every slot."""
 
     def __init__(self, brief: Brief, session: Session) -> None:
         plant, loop = Plant.of(brief.part["plant"]), brief.part["controller"]
@@ -97,8 +99,9 @@ class Actuator:
         return steered
 
 
+@final
 class Consultation:
-    """The loop's end at the legitimate estimator: it says its estimate, and may be told the inputs. Final."""
+    """The loop's end at the legitimate estimator: it says its estimate, and may be told the inputs."""
 
     def __init__(self, brief: Brief, session: Session, receiver: Receiver) -> None:
         loop: Mapping[str, Any] = brief.part["controller"]

@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import final
 
 import numpy as np
 
@@ -86,8 +87,9 @@ def follow(
         session.wait_for("end")
 
 
+@final
 class ReceiverReplies:
-    """What a receiver says to others than the observer: acknowledgements, and its estimate to a controller. Final."""
+    """What a receiver says to others than the observer: acknowledgements, and its estimate to a controller."""
 
     def __init__(self, brief: Brief, session: Session, acknowledges: bool, consultation: Consultation | None) -> None:
         self._trials = brief.trials

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
+from typing import final
 
 from evedrop.errors import RunError
 from evedrop.live.network.mailbox import Mailbox
@@ -27,8 +28,9 @@ _PROGRESS_BYTES = 16 * 2**20  # of one follower: far more than are ever under wa
 _LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
 
 
+@final
 class Window:
-    """How far the sensor may go: `window` slots beyond the slowest of those who report progress. Final.
+    """How far the sensor may go: `window` slots beyond the slowest of those who report progress.
 
     sent: what it sent, which is forgotten as they go on.
     """
@@ -76,8 +78,9 @@ class Window:
         self._sent.forget(done)
 
 
+@final
 class Barriers:
-    """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
+    """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to."""
 
     def __init__(
         self, brief: Brief, session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
@@ -113,8 +116,9 @@ class Barriers:
             self._barriers.add(command.integer("until"))
 
 
+@final
 class Acknowledgements:
-    """What comes back of each slot before the next is sent, and the watch over whether it is attacked. Final."""
+    """What comes back of each slot before the next is sent, and the watch over whether it is attacked."""
 
     def __init__(self, brief: Brief, session: Session, encoder: Encoder) -> None:
         self._encoder, self._trials = encoder, brief.trials

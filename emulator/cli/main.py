@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.cli import commands
 from evedrop.cli import process as roles
@@ -73,8 +73,9 @@ def _check_names(options: argparse.Namespace) -> None:
             )
 
 
+@final
 class _Commands:
-    """The commands as they are added. Final."""
+    """The commands as they are added."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self._group = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")

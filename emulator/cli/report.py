@@ -9,7 +9,7 @@ from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TextIO, cast
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast, final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -59,6 +59,7 @@ def _unfailing(stream: TextIO | None) -> TextIO:
     return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
 
 
+@final
 class ProgressLine:
     """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
 

@@ -6,6 +6,7 @@ Source: docs/results.md, summary.json.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,9 @@ from evedrop.model.slot.transit import Transit
 from evedrop.scenario.timeline import Away
 
 
+@final
 class IntermittentReceiver:
-    """Follows the slots from 0 on. Final."""
+    """Follows the slots from 0 on."""
 
     def __init__(self, receiver: Receiver, window: int, outages: Sequence[Away]) -> None:
         self._receiver, self._window = receiver, window

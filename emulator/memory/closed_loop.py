@@ -6,7 +6,7 @@ Source: docs/mathematics.md, closed loop.
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -52,8 +52,9 @@ class Source(NamedTuple):
     batch: Batch
 
 
+@final
 class Loop:
-    """The states of a batch and what moves them, slot by slot: plant and controller, or their process alone. Final.
+    """The states of a batch and what moves them, slot by slot: plant and controller, or their process alone.
 
     digests: is given the controller's, block by its first slot → (R, 32); times: what decisions take.
     """

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -212,8 +212,9 @@ def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
     return take
 
 
+@final
 class Merger:
-    """Adds up results in trial order. Final."""
+    """Adds up results in trial order."""
 
     def __init__(self, scenario: Scenario, mode: Mode) -> None:
         self._scenario = scenario

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,7 @@ class Chunk:
     """Of a sensor that filters: squared errors against the true state, of `sensor` and of receivers, (c, R)."""
 
 
+@final
 class Simulation:
     """The trials of a range, all slots, of which the first `recorded` in full. Final; `chunks` may be read once."""
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
-from typing import Any
+from typing import Any, final
 
 from evedrop.environment import own_environment
 from evedrop.errors import EvedropError, RunError, UsageError
@@ -61,8 +61,9 @@ def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) 
             worker.end()
 
 
+@final
 class _Worker:
-    """A worker process and this end of its pipe. Final."""
+    """A worker process and this end of its pipe."""
 
     def __init__(self) -> None:
         self.pipe, theirs = Pipe()

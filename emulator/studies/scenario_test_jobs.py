@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import final
 
 from evedrop.errors import Interrupted
 from evedrop.live.network.launcher_watch import when_launcher_is_gone
@@ -27,7 +28,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
         with stop_on_signals() as stop:
             for scenario in scenarios:
                 if stop.is_set():
-                    raise Interrupted("interrupted; what was measured is in the results folders")
+                    raise Interrupted("interrupted; the results so far are in the results folders")
                 yield carry_out(scenario, manner)
         return
     crew = _Crew(replace(manner, workers=1))
@@ -37,14 +38,15 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
             for one in waiting:
                 while not wait([one], _LOOK_SECONDS).done:
                     if stop.is_set():
-                        raise Interrupted("interrupted; what was measured is in the results folders")
+                        raise Interrupted("interrupted; the results so far are in the results folders")
                 yield one.result()
         finally:
             crew.end(waiting)
 
 
+@final
 class _Crew:
-    """The processes under way. Final."""
+    """The processes under way."""
 
     def __init__(self, manner: Manner) -> None:
         self._manner = manner

@@ -273,5 +273,5 @@ def test_the_control_file_is_nobody_elses(tmp_path: Path) -> None:
     assert read_control(tmp_path) == control
     for text in ("", "[]", "{}", '{"run": 1}', json.dumps({**json.loads(path.read_text()), "user": 3})):
         path.write_text(text)
-        with pytest.raises(UsageError, match="is not one"):
+        with pytest.raises(UsageError, match="is not a control file"):
             read_control(tmp_path)

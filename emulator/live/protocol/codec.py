@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from reprlib import Repr
-from typing import Any
+from typing import Any, final
 
 import msgpack
 import numpy as np
@@ -31,8 +31,9 @@ def pack(fields: Mapping[str, Any]) -> bytes:
     return message
 
 
+@final
 class Reader:
-    """Reads one message's fields with their types, sizes and ranges checked. Final."""
+    """Reads one message's fields with their types, sizes and ranges checked."""
 
     def __init__(self, key: str, payload: bytes, fields: Mapping[Any, Any] | None = None, parts: int = _PARTS) -> None:
         """parts: how many lists and maps a large message may have."""
