@@ -329,7 +329,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     monkeypatch.setattr(sweep, "new_folder", fail)
     done = evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", "--trials", "2", "--slots", "5", "--out", "x")
     assert (done.status, done.out) == (3, "")
-    assert done.err == "evedrop: [Errno 24] Too many open files; free what the system lacks and try again\n"
+    assert done.err == "evedrop: [Errno 24] Too many open files; free system resources and try again\n"
 
 
 @pytest.mark.parametrize("reader", ["/dev/full", "gone"])
