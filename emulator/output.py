@@ -1,4 +1,4 @@
-"""What a command writes to its terminal, which may be gone, or be a pipe that nobody reads any more."""
+"""The output of a command, whose terminal may be gone, or may be a pipe without a reader."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def say(text: str) -> None:
 
 @contextlib.contextmanager
 def named_output() -> Iterator[None]:
-    """Have errors of standard output say that they are: no other may be taken for one."""
+    """Mark errors of standard output with its name, so that other errors are not taken for them."""
     if sys.stdout is None:
         yield
     else:
@@ -32,7 +32,7 @@ def named_output() -> Iterator[None]:
 
 @final
 class _Named:
-    """A stream whose errors have a file name."""
+    """A stream whose errors carry a file name."""
 
     def __init__(self, stream: TextIO, name: str) -> None:
         self._stream = stream
@@ -56,7 +56,7 @@ class _Named:
 
 
 def finish() -> None:
-    """Write what is left for standard output; nobody need take it, for something else has gone wrong."""
+    """Flush standard output; ignores errors, because another error is being reported."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -65,6 +65,6 @@ def finish() -> None:
 
 
 def silence() -> None:
-    """Have nothing more written to standard output, not even at the interpreter's end."""
+    """Discard further standard output, including the flush when the interpreter exits."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,7 +1,7 @@
-"""Who meets whom in a comparison: of one scenario, a scenario for every scheme, and one more for each attack on it.
+"""The matches of a comparison: from one scenario, a scenario for every scheme, and one for each attack on the scheme.
 
-An adversary is a strategy, under that name, or one that also meddles with acknowledgements and reads as the best reader
-of the scheme does.
+An adversary is either a strategy, by its name, or an attack on the acknowledgements combined with the best strategy against
+the scheme.
 
 Source: docs/compare.md.
 """
@@ -31,20 +31,20 @@ _BEST_READER = {
     "innovation": "bayesian",
     "twin-track": "tracker",
 }
-_ANY_READER = "naive"  # of every other scheme: whatever is sent is the state, or cannot be told from it
+_ANY_READER = "naive"  # for every other scheme: its packets are states, or cannot be told from states
 
 _MEANT_FOR = {
-    "bayesian": ("innovation", "weighs states against innovations, and there are none: it is naive here"),
+    "bayesian": ("innovation", "weighs states against innovations, and there are none: it is the same as naive here"),
     "genie": ("innovation", "uses what innovations leak, and there are none"),
-    "likelihood": ("innovation", "tests states against innovations, and there are none: it is naive here"),
-    "reference": ("acknowledged", "follows references, and there are none: it is naive here"),
+    "likelihood": ("innovation", "tests states against innovations, and there are none: it is the same as naive here"),
+    "reference": ("acknowledged", "follows references, and there are none: it is the same as naive here"),
     "selective": (
         "encrypted-schedule",
-        "heeds a header that says what is encrypted, and there is none: it is naive here",
+        "reads a header that says which packets are encrypted, and there is none: it is the same as naive here",
     ),
-    "tracker": ("twin-track", "goes half-way between two tracks, and there is one"),
+    "tracker": ("twin-track", "takes the mean of two tracks, and there is only one"),
 }
-_CHANCES = {"use_state": 0.8, "use_innovation": 0.2}  # of a suspicious one that the scenario says nothing of
+_CHANCES = {"use_state": 0.8, "use_innovation": 0.2}  # of the suspicious strategy, if the scenario does not use it
 _WAY_BACK = {"link": {"quality": 1.0}}
 
 Tables = dict[str, Any]
@@ -52,53 +52,53 @@ Tables = dict[str, Any]
 
 @dataclass(frozen=True)
 class Match:
-    """An adversary against a scheme: who it is in the scenario of its group, or why there is nothing to play."""
+    """An adversary against a scheme: its strategy in the scenario of its group, or the reason why it is not defined."""
 
     scheme: str
     adversary: str
     strategy: str | None = None
-    """How it reads; None if it is not defined."""
+    """Its strategy; None if the match is not defined."""
     attack: str = "none"
     not_defined: str | None = None
 
     @property
     def receiver(self) -> str:
-        """Its name in the scenario: that of its strategy, so that it meets the same losses whatever else it does."""
+        """Its name in the scenario: that of its strategy, so that it has the same losses under any attack."""
         return str(self.strategy)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Matches that one simulation plays: a scheme, under one attack or none."""
+    """The matches of one simulation: one scheme, under one attack or none."""
 
     scenario: Scenario
     matches: tuple[Match, ...]
 
     @property
     def scheme(self) -> str:
-        """Of all its matches."""
+        """The scheme of all its matches."""
         return self.scenario.encoding.scheme
 
     @property
     def name(self) -> str:
-        """Of its scenario's file."""
+        """Name of its scenario's file."""
         attacker = next((match.adversary for match in self.matches if match.attack != "none"), None)
         return self.scheme if attacker is None else f"{self.scheme}-{attacker}"
 
 
 @dataclass(frozen=True)
 class Matchups:
-    """Everything a comparison plays, and what it cannot."""
+    """All matches of a comparison, and those that are not defined."""
 
     schemes: tuple[str, ...]
     adversaries: tuple[str, ...]
     groups: tuple[Group, ...]
-    """By scheme; of each scheme the one without an attack first."""
+    """In order of schemes; for each scheme, the group without an attack comes first."""
     undefined: tuple[Match, ...]
 
 
 def adversaries_of() -> tuple[str, ...]:
-    """All that can be named."""
+    """The names of all adversaries."""
     return (*STRATEGIES, *ATTACKERS)
 
 
@@ -108,9 +108,9 @@ def matchups_of(
     adversaries: Sequence[str] | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Matchups:
-    """Of schemes and adversaries by name, all of them unless said; parameters: SCHEME.PARAMETER → value.
+    """The matches of schemes and adversaries, by name; by default all of them. parameters: SCHEME.PARAMETER → value.
 
-    Raises UsageError with every name that is none, ScenarioError where a scheme cannot be on this process and these links.
+    Raises UsageError with every unknown name, ScenarioError if a scheme cannot be used with this process and these links.
     """
     chosen = _chosen(schemes, adversaries, parameters or {})
     groups: list[Group] = []
@@ -148,7 +148,7 @@ def _chosen(
         scheme, _, name = key.partition(".")
         if scheme not in SCHEMES or name not in SCHEMES[scheme].parameters:
             parts = [f"{one}.{entry}" for one in SCHEMES for entry in SCHEMES[one].parameters]
-            found.append(f"{key} is no parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
+            found.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
     if found:
         raise UsageError("\n  ".join(["nothing was compared:", *found]))
     return chosen[0], chosen[1]
@@ -156,7 +156,7 @@ def _chosen(
 
 def _strange(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:
     return [
-        f"{name or 'nothing'} is no {what}; expected {listed(known)}{near(name, known)}"
+        f"{name or 'nothing'} is not {'an' if what == 'adversary' else 'a'} {what}; expected {listed(known)}{near(name, known)}"
         for name in names
         if name not in known
     ]
@@ -165,7 +165,7 @@ def _strange(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]
 def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
     attack = ATTACKERS.get(adversary, "none")
     if attack != "none" and not SCHEMES[scheme].needs_acknowledgements:
-        return Match(scheme, adversary, not_defined="there are no acknowledgements to meddle with")
+        return Match(scheme, adversary, not_defined="there are no acknowledgements to attack")
     strategy = adversary if attack == "none" else _BEST_READER.get(scheme, _ANY_READER)
     where, why = _MEANT_FOR.get(strategy, (scheme, ""))
     if scheme != where:
@@ -174,12 +174,12 @@ def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
     parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}
     lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
     if lacking:
-        return Match(scheme, adversary, not_defined=f"is told the {listed(lacking)}, and there is none")
+        return Match(scheme, adversary, not_defined=f"knows the {listed(lacking)}, and there is none")
     return Match(scheme, adversary, strategy, attack)
 
 
 def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) -> Tables:
-    """The scenario's own parameters as far as the scheme has them, else the examples of docs/scenario.md."""
+    """The scheme's parameters: given ones, else the scenario's own, else the examples of docs/scenario.md."""
     own = scenario.encoding.parameters
     given = {name: parameters.get(f"{scheme}.{name}") for name in SCHEMES[scheme].parameters}
     examples = SCHEMES[scheme].parameters
@@ -205,7 +205,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
         "expect": [],
         "record_trials": 1,
     }
-    tables[LEGITIMATE]["link"].pop("correlation", None)  # to an eavesdropper, who may not be there
+    tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
     way_back = tables.pop("acknowledgements", _WAY_BACK)
     if SCHEMES[scheme].needs_acknowledgements:
         way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer")}
@@ -232,7 +232,7 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
         made.setdefault("link", link)
     made |= {name: value for name, value in _CHANCES.items() if name in kind.parameters and name not in made}
     if "reads_as" in kind.parameters:
-        # As each scheme is read best, whatever the scenario's own scheme is: what it says would mean nothing for most.
+        # The best strategy against this scheme: the scenario's own choice is for the scenario's own scheme.
         made = {name: value for name, value in made.items() if name not in _CHANCES}
         made["reads_as"] = _BEST_READER.get(scheme, _ANY_READER)
     if "learns_at" in kind.parameters:
@@ -241,7 +241,7 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
 
 
 def _alone(table: Tables) -> Tables:
-    """Without a tie to the losses of another eavesdropper, who may not be there."""
+    """Remove a correlation with the losses of another eavesdropper, which may not be in this scenario."""
     link = table.get("link", {})
     if link.get("correlation", {}).get("with", LEGITIMATE) == LEGITIMATE:
         return table

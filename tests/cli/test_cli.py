@@ -344,7 +344,7 @@ def test_an_interrupt_stays_one_whoever_reads(evedrop: Evedrop, reader: str) -> 
         live.process.terminate()
         done = live.end()
     assert done.status == 130
-    assert done.err == "evedrop: interrupted; what was done is in the results folder\n"
+    assert done.err == "evedrop: interrupted; the results so far are in the results folder\n"
 
 
 def test_a_title_is_text(evedrop: Evedrop) -> None:
