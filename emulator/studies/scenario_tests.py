@@ -42,7 +42,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Manner:
-    """How tests are carried out."""
+    """The options for carrying out tests."""
 
     in_memory: bool = False
     trials: int | None = None

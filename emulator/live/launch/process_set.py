@@ -36,7 +36,7 @@ _AFTERTHOUGHT_SECONDS = (
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended."""
+    """The end of a run."""
 
     status: int
     """Its exit status."""

@@ -34,7 +34,7 @@ class Shard:
     """A range of the trials of a run."""
 
     number: int
-    """From 1 on, in the order of trials."""
+    """Number of the shard, from 1 on, in order of trials."""
     scenario: Scenario
     """The run's scenario, with only these trials."""
     folder: Path

@@ -17,7 +17,7 @@ from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROU
 
 @dataclass(frozen=True)
 class Grant:
-    """What one user may do; everything else is denied."""
+    """The rights of one user; everything else is denied."""
 
     process: str
     writes: tuple[str, ...]
@@ -38,7 +38,7 @@ class Grant:
 
 @dataclass(frozen=True)
 class Wiring:
-    """How a controller is connected."""
+    """A controller's connections."""
 
     acts_on: str
     """`estimate` or `truth`."""

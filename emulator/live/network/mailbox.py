@@ -49,7 +49,7 @@ class Mailbox:
             key = self._keys[flooding]
             raise MalformedMessage(
                 key,
-                f"more than {self._most} bytes that nobody has read yet",
+                f"more than {self._most} unread bytes",
                 "no more than the window of the run",
                 last,
                 writer_of(key),

@@ -148,11 +148,11 @@ class Report:
     trace: Floats
     """Sum over all trials of tr P and of its square, (c, 2)."""
     late: NDArray[np.uint16] | None
-    """Packets of earlier slots that arrived within the window, (c, R); None of who has none."""
+    """How many packets of earlier slots arrived within the window, (c, R); None for a receiver without a window."""
     digests: Mapping[int, Digests]
     """Block, by its first slot → digests, (R, 32), of the blocks that ended in these slots."""
     late_used: NDArray[np.uint16] | None = None
-    """Those of `late` that were used, and not discarded, (c, R)."""
+    """How many of the late packets were used, and not discarded, (c, R)."""
 
     @property
     def count(self) -> int:
