@@ -2,12 +2,12 @@
 
     from evedrop import run, montecarlo, compare, design, load_results
 
-Names are loaded when they are used: a peer imports this package too, and needs none of them.
+These names are loaded when they are used: a peer imports this package, too, and needs none of them.
 """
 
 from __future__ import annotations
 
-# Not from typing, whose import would take longer than all else before a command heeds signals; type checkers know the name.
+# Not from typing, whose import would take longer than all else before a command handles signals; type checkers know the name.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any

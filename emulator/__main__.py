@@ -1,8 +1,8 @@
-"""The command `evedrop`, which `python -m evedrop` is too."""
+"""The command `evedrop`, also available as `python -m evedrop`."""
 
 from __future__ import annotations
 
-# What `signal` wraps; see `evedrop.interrupts`.
+# The C module under `signal`; see `evedrop.interrupts`.
 import _signal as signal  # type: ignore[import-not-found]
 import os
 import sys
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 
 
 def program() -> NoReturn:
-    """Run the command line, and end."""
+    """Run the command line, and exit."""
     heed_signals()
 
     from evedrop.cli.main import is_role, main  # noqa: PLC0415 - the handlers come first
 
     status = main()
     if is_role(sys.argv[1:]):
-        # Threads of a process may still be in Zenoh, and an interpreter that ends meanwhile aborts (Python 3.11).
+        # Threads of the process may still be in Zenoh; an interpreter that exits meanwhile aborts (Python 3.11).
         for stream in (sys.stdout, sys.stderr):
             try:
                 stream.flush()
             except (OSError, ValueError, AttributeError):
                 continue
         os._exit(status)
-    for number in heeded():  # the command is over, whatever comes while the interpreter ends
+    for number in heeded():  # the command is over: ignore signals while the interpreter exits
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)
 

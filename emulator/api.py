@@ -1,4 +1,4 @@
-"""The Python calls: `run`, `montecarlo`, `compare`, `design`, `load_results`. They do what the commands of the same name do."""
+"""The Python API: `run`, `montecarlo`, `compare`, `design`, `load_results`, each like the command of the same name."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def run(
     tell: Tell = _silent,
     **changes: Any,
 ) -> Results:
-    """Run a scenario live: sensor, router, estimators and observer as processes of their own.
+    """Run a scenario live, with sensor, router, estimators and observer in separate processes.
 
     scenario: a shipped name, a file, or a checked `Scenario`; out: the results folder, new or empty; view: auto, native,
     web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; changes: entries of the scenario, dotted keys
     with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
 
-    Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError when a
-    process failed, Interrupted on Ctrl-C; after the last two the folder holds what was measured.
+    Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError if a
+    process failed, Interrupted on Ctrl-C; after the last two the folder holds the results so far.
 
     >>> results = run("eavesdroppers", slots=1000, out="my-run")        # doctest: +SKIP
     >>> results.summary["peers"]["smart"]["mean_squared_error"]         # doctest: +SKIP
@@ -98,13 +98,13 @@ def compare(
     tell: Tell = _silent,
     **changes: Any,
 ) -> Comparison:
-    """Every scheme against every adversary, on a scenario's process and links.
+    """Compare every scheme against every adversary, on a scenario's process and links.
 
-    schemes, adversaries: names, all of them unless said; parameters: of schemes that are not the scenario's own, such as
+    schemes, adversaries: names, by default all; parameters: of schemes other than the scenario's own, such as
     `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
 
-    Raises UsageError with every name that is none, ScenarioError with every mistake of the scenario, RunError if a worker
-    fails, Interrupted on Ctrl-C; after the last two the folder holds the schemes that were done.
+    Raises UsageError with every unknown name, ScenarioError with every mistake of the scenario, RunError if a worker
+    fails, Interrupted on Ctrl-C; after the last two the folder holds the completed schemes.
 
     >>> found = compare("acknowledged", schemes=["acknowledged", "innovation"])        # doctest: +SKIP
     >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
@@ -123,9 +123,9 @@ def compare(
 def design(
     scenario: str | Path | Scenario, *, max_trace: float | None = None, changes: Mapping[str, Any] | None = None
 ) -> Design:
-    """What μ_d may be chosen for a scenario's process and links, and what each choice costs and gives.
+    """The admissible μ_d for a scenario's process and links, and the cost and secrecy of each choice.
 
-    max_trace: Ω, for which the least μ_d is sought; changes: entries by dotted key.
+    max_trace: Ω; the least μ_d that keeps the limiting trace below it is computed; changes: entries by dotted key.
 
     Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω or the scheme is not one of states and innovations.
     """
@@ -144,7 +144,7 @@ def design(
         if alike is None:
             raise UsageError(
                 "the design of μ_d is for independent losses that stay the same, without late packets and outages, and "
-                f"the link of {name} has others; give it a quality alone, such as "
+                f"the link of {name} is different; give it only a quality, such as "
                 f"--set '{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}'"
             )
         quality[name] = float(alike.quality[0])
@@ -160,7 +160,7 @@ def design(
 
 
 def _not_for(scheme: str) -> str:
-    """Why nothing is designed for a scheme, and what to do instead."""
+    """The reason why a scheme cannot be designed, and an alternative."""
     designed = [name for name in SCHEMES if SCHEMES[name].sends_states_and_innovations]
     why = f"the design of μ_d is for the scheme {listed(designed)}"
     instead = "give --set 'encoding={scheme = \"innovation\", state_probability = 0.6}' to design that on this process"
@@ -172,7 +172,7 @@ def _not_for(scheme: str) -> str:
             "DIR/scenarios/innovation.toml, which can be designed"
         )
         return f"{why}, and this scenario has {scheme}; {instead}"
-    return f"{why}, and this scenario has {scheme}; {instead}, or see by evedrop compare what {scheme} gives"
+    return f"{why}, and this scenario has {scheme}; {instead}, or measure {scheme} by evedrop compare"
 
 
 def _prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
@@ -184,5 +184,5 @@ def _prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyon
 
 
 def _name(scenario: str | Path | Scenario) -> str | Path:
-    """What a results folder is named after."""
+    """The name from which a results folder's name is made."""
     return "scenario" if isinstance(scenario, Scenario) else scenario

@@ -1,4 +1,4 @@
-"""Which files are scenarios: asked of every TOML file of a folder, so it reads no more than it must and loads nothing.
+"""Finds scenario files. Every TOML file of a folder is examined, so this reads as little as possible and imports little.
 
 Source: docs/testing.md.
 """
@@ -14,15 +14,15 @@ from pathlib import Path
 from evedrop.files import Unreadable, text_of
 
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
-_MOST_BYTES = 2**28  # as of every scenario
-_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last while a run goes on
+_MOST_BYTES = 2**28  # as for every scenario
+_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last one exists while a run goes on
 
 
 def is_scenario(path: Path) -> bool:
-    """Whether a file looks like a scenario of somebody's own: TOML with the tables `process` and `encoding`.
+    """Whether a file looks like a user's scenario: TOML with the tables `process` and `encoding`.
 
-    Not one whose name begins with an underscore, and not the copy that a results folder holds. One that is no TOML but
-    has both headings looks like a scenario, with a mistake to be told.
+    False for a name that begins with an underscore, and for the copy in a results folder. True for a file that is not
+    valid TOML but has both headings: a scenario with a mistake to report.
     """
     if path.suffix != ".toml" or path.name.startswith("_"):
         return False
@@ -42,7 +42,7 @@ def is_scenario(path: Path) -> bool:
 
 
 def scenarios_in(folder: Path) -> Iterator[Path]:
-    """The scenarios in a folder and those below it, in the order of their names; hidden folders are left out."""
+    """The scenarios in a folder and its subfolders, in order of their names; hidden folders are left out."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         yield from (path for name in sorted(files) if is_scenario(path := Path(place) / name))

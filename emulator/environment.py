@@ -1,6 +1,6 @@
-"""The environment of the processes we start: what they need to run, and nothing else that the launcher happens to have.
+"""The environment of started processes: the variables that they need, and no others of the launcher's environment.
 
-A token in the launcher's environment is nobody else's business, least of all an eavesdropper's.
+A token in the launcher's environment must not reach other processes, least of all an eavesdropper.
 """
 
 from __future__ import annotations
@@ -45,23 +45,23 @@ _SHOWING_KINDS = (
 
 
 def own_environment() -> dict[str, str]:
-    """For a process of a run, or a worker: where programs, libraries and temporary files are, and how to speak."""
+    """For a process of a run, or a worker: where programs, libraries and temporary files are, and the language."""
     return {name: value for name, value in os.environ.items() if name in _NEEDED or name.startswith(_NEEDED_KINDS)}
 
 
 _CLIENT = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx), app: (handover: rx))"
-# What a router receives must never wait for a thread that sends what it passes on.
+# A router's receiving must never wait for its sending threads.
 _ROUTER = (
     "(rx: (worker_threads: 1), tx: (worker_threads: 1), net: (handover: tx), acc: (handover: tx), app: (handover: tx))"
 )
 
 
 def lock_step_environment(role: str) -> dict[str, str]:
-    """For a process of a run whose messages come one by one: few threads of Zenoh, for each must be woken for each message."""
+    """For a process whose messages come one by one: few threads of Zenoh, since each message must wake each of them."""
     return {"ZENOH_RUNTIME": _ROUTER if role == "router" else _CLIENT}
 
 
 def viewer_environment() -> Mapping[str, str]:
-    """For a viewer: besides, how to reach the screen and the graphics card."""
+    """For a viewer: also the variables for the screen and the graphics card."""
     shows = {name: value for name, value in os.environ.items() if name in _SHOWING or name.startswith(_SHOWING_KINDS)}
     return {**own_environment(), **shows}

@@ -1,16 +1,16 @@
-"""One exception tree; every message ends with the remedy.
+"""The exceptions of the project, in one tree; every message ends with the remedy.
 
 EvedropError                    exit status
 ├── UsageError                  2   the command line or a file it names cannot be used
 │   ├── ScenarioError           2   the scenario has mistakes: all of them, listed
-│   ├── TraceError              2   a recording cannot be read as one
-│   └── DisturbanceError        2   a table of disturbances cannot be read as one: all that is wrong, listed
+│   ├── TraceError              2   a recording of a link cannot be read
+│   └── DisturbanceError        2   a table of disturbances cannot be read: all mistakes, listed
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
 │   ├── Gap                     3   a slot is missing, doubled or out of order
 │   ├── Refusal                 3   another process could not read a message
-│   ├── Contradiction           3   what a process says does not fit what it, or another one, has said
+│   ├── Contradiction           3   a process contradicts itself, or another process
 │   └── Silence                 3   a process is on the network and does nothing
 └── Interrupted               130   the user ended the run; results so far are written
 """
@@ -18,15 +18,15 @@ EvedropError                    exit status
 from __future__ import annotations
 
 MOST_MISTAKES = 100
-"""Of a scenario, in one message: nobody reads more at a time."""
+"""The most mistakes of a scenario in one message: more would not be read."""
 
 
 LONGEST_LINE = 900
-"""Characters of one mistake of a scenario."""
+"""The most characters of one mistake of a scenario."""
 
 
 class EvedropError(Exception):
-    """Base of every error this project raises on purpose."""
+    """Base class of all errors that this project raises on purpose."""
 
     exit_status = 3
 
@@ -38,7 +38,7 @@ class UsageError(EvedropError):
 
 
 class ScenarioError(UsageError):
-    """A scenario with mistakes: `mistakes` lists every one, a line each, up to `MOST_MISTAKES`."""
+    """A scenario with mistakes: `mistakes` lists them, one line each, up to `MOST_MISTAKES`."""
 
     def __init__(self, source: str, mistakes: list[str]) -> None:
         self.source = source
@@ -50,7 +50,7 @@ class ScenarioError(UsageError):
 
 
 class TraceError(UsageError):
-    """A recording of a link that is none: `entry` says what must change, the `file` or the `column`; `what` says why."""
+    """An unusable recording of a link: `entry` says which entry must change, `file` or `column`; `what` says why."""
 
     def __init__(self, path: str, entry: str, what: str) -> None:
         self.entry = entry
@@ -59,7 +59,7 @@ class TraceError(UsageError):
 
 
 class DisturbanceError(UsageError):
-    """A table of disturbances that is none: `mistakes` lists every one, with its line in the file."""
+    """An unusable table of disturbances: `mistakes` lists all mistakes, with their lines in the file."""
 
     def __init__(self, path: str, mistakes: list[str]) -> None:
         self.mistakes = mistakes
@@ -76,11 +76,11 @@ class RunError(EvedropError):
     """A process failed, or a packet is unaccounted for."""
 
     at_fault: tuple[str, ...] = ()
-    """The processes that the error is about, if it says which."""
+    """The processes at fault, if known."""
 
 
 class MalformedMessage(RunError):
-    """A message that breaks the protocol of docs/protocol.md; `at_fault` names its sender, the only one who may write its key."""
+    """A message that breaks the protocol of docs/protocol.md; `at_fault` names its sender, the only writer of its key."""
 
     def __init__(self, key: str, found: str, expected: str, payload: bytes, sender: str = "") -> None:
         shown = payload[:48].hex(" ") + (" …" if len(payload) > 48 else "")
@@ -105,17 +105,17 @@ class Gap(RunError):
 
 
 class Refusal(RunError):
-    """Another process could not read a message, and has said so before it ended."""
+    """Another process could not read a message, and reported this before it ended."""
 
     def __init__(self, process: str, key: str, sender: str, why: str) -> None:
-        """process: who refused it; key, sender: of the message; why: what the process said."""
+        """process: that refused the message; key, sender: of the message; why: the process's reason."""
         self.at_fault = (sender,)
         about = "" if key in why else f"malformed message on {key}: "
         super().__init__(f"{about}{why} (refused by {process})")
 
 
 class Contradiction(RunError):
-    """What a process says does not fit what it has said before, or what another process says of the same slots."""
+    """A process contradicts its own earlier messages, or another process's messages about the same slots."""
 
     def __init__(self, process: str, what: str, against: str | None = None) -> None:
         """against: the other process; None if the process contradicts itself."""
@@ -139,11 +139,11 @@ class Interrupted(EvedropError):
 
 
 class NoAnswer(Exception):
-    """A class raised an error when it was asked, answered what is no answer, or not at all; the text says which."""
+    """A class raised an error, gave an invalid answer, or did not answer when asked; the text says which."""
 
 
 class NotRegistered(KeyError):
-    """A name that stands for no class. `why` goes on after `is "NAME"`; empty if it is no name of anybody's own."""
+    """A name that no class has. `why` continues a message after `is "NAME"`; empty if it is not the name of a user's class."""
 
     def __init__(self, name: str, why: str = "") -> None:
         super().__init__(name)
@@ -151,4 +151,4 @@ class NotRegistered(KeyError):
         self.why = why
 
     def __str__(self) -> str:
-        return f"{self.name}{self.why or ' is no name of a class; look at docs/your-own.md'}"
+        return f"{self.name}{self.why or ' is not the name of a class; look at docs/your-own.md'}"

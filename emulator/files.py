@@ -1,7 +1,7 @@
-"""Reading files that somebody names: regular files alone, and no more of them than can be of use.
+"""Reads files that users name: only regular files, and only up to a limit.
 
-A pipe or a device may never end, and some megabytes of a compressed file may stand for many gigabytes. Every reader here
-stops as soon as it has read more than its limit, and says which limit that is.
+A pipe or a device may never end, and some megabytes of a compressed file may expand to many gigabytes. Every reader here
+stops as soon as it has read more than its limit, and reports the limit.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ LINE_CHARACTERS = 65_536
 
 
 class Unreadable(ValueError):
-    """A file that cannot be read, or has more in it than can be of use; the message is a phrase to put in brackets."""
+    """A file that cannot be read, or is larger than its limit; the message is a phrase to put in brackets."""
 
 
 @dataclass(frozen=True)
 class Limit:
-    """How much of a table is read at most, after decompression."""
+    """The most of a table to read, after decompression."""
 
     lines: int
     characters: int
 
     @classmethod
     def of_rows(cls, rows: int) -> Limit:
-        """Room for this many rows of numbers, and for comments and empty lines beside them."""
+        """A limit with room for this many rows of numbers, and for comments and empty lines."""
         return cls(2 * rows + 10_000, 16 * 2**20 + 1024 * rows)
 
 
 def is_there(path: Path) -> bool:
-    """Whether there is anything of this name, a link to nothing included; False for a name that nothing can have."""
+    """Whether a path exists, even as a broken link; False for an impossible name."""
     try:
         return os.path.lexists(path)
     except (OSError, ValueError):
@@ -46,7 +46,7 @@ def is_there(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder of this name; False for a name that nothing can have."""
+    """Whether a path is a folder; False for an impossible name."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -54,14 +54,14 @@ def is_folder(path: Path) -> bool:
 
 
 def shown(path: object) -> str:
-    """A path for a message or a table, in which bytes that are not UTF-8 are written in hexadecimal."""
+    """A path for a message or a table; bytes that are not UTF-8 are written in hexadecimal."""
     return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def opened(path: Path) -> BinaryIO:
-    """A regular file, open for reading. Raises Unreadable if there is none, or if it is anything else."""
+    """Open a regular file for reading. Raises Unreadable if it does not exist, or is not a regular file."""
     try:
-        # Opening a pipe that nobody writes to would wait for ever.
+        # Opening a pipe without a writer would wait for ever.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
         raise Unreadable(why_of(error)) from error
@@ -76,7 +76,7 @@ def opened(path: Path) -> BinaryIO:
 
 
 def contents(path: Path, most: int) -> bytes:
-    """All bytes of a regular file. Raises Unreadable, also if it has more than `most` bytes."""
+    """All bytes of a regular file. Raises Unreadable if it cannot be read, or has more than `most` bytes."""
     try:
         with opened(path) as file:
             found = file.read(most + 1)
@@ -98,7 +98,7 @@ def text_of(path: Path, most: int) -> str:
 def lines_of(path: Path, limit: Limit) -> Iterator[str]:
     """The lines of a text file, decompressed if its name ends in .gz, with their line ends.
 
-    Raises Unreadable once a line, or all of them, are more than the limit.
+    Raises Unreadable once a line, or the whole text, exceeds the limit.
     """
     lines = characters = 0
     try:
@@ -120,7 +120,7 @@ def lines_of(path: Path, limit: Limit) -> Iterator[str]:
 
 
 def why_of(error: Exception) -> str:
-    """An error of the file system in some words."""
+    """The reason of a file system error, in a few words."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return next(iter(str(error).splitlines()), type(error).__name__)

@@ -1,12 +1,12 @@
-"""What a signal does to a command, settled before anything that takes time is imported.
+"""Signal handlers for the start of a command, installed before any slow import.
 
-Ctrl-C, SIGTERM and SIGHUP end a command with status 130 at any moment. Until a command has begun something that must be ended
-in order, it ends at once; then `evedrop.signals` takes over.
+Ctrl-C, SIGTERM and SIGHUP end a command with status 130 at any moment. At first the command exits at once; when it has begun
+work that must be ended in order, `evedrop.signals` takes over.
 """
 
 from __future__ import annotations
 
-# What `signal` wraps, for that imports enum and more, which takes about as long as the interpreter needs to start.
+# The C module under `signal`: `signal` imports enum and more, which takes about as long as the interpreter needs to start.
 import _signal as signal  # type: ignore[import-not-found]
 import os
 
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
 INTERRUPTED = 130
-"""The exit status of what was interrupted."""
+"""The exit status of an interrupted command."""
 SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""What interrupts a command."""
+"""The signals that interrupt a command."""
 
 
 def heeded() -> list[int]:
-    """Those that are not ignored: nohup ignores SIGHUP, and a shell SIGINT for a job in the background."""
+    """The signals that are not ignored: nohup ignores SIGHUP, and a shell ignores SIGINT for background jobs."""
     return [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
 
 
 def leave(_number: int, _frame: FrameType | None) -> NoReturn:
-    """End this process at once, since nothing has begun."""
+    """Exit at once: there is nothing to end in order."""
     os._exit(INTERRUPTED)
 
 
 def heed_signals() -> None:
-    """End at once at a signal, until something else is said; also at one that came while the interpreter started."""
+    """Install `leave` as the handler; also handles signals that arrived while the interpreter started."""
     for number in heeded():
         signal.signal(number, leave)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)  # whoever launched us may have blocked them
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)  # the starting process may have blocked them

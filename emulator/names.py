@@ -9,6 +9,6 @@ OBSERVER = "observer"
 OPERATOR = "operator"
 CONTROLLER = "controller"
 ACKNOWLEDGEMENTS = "acknowledgements"
-"""No process: the name of their way back, whose random stream is `link/acknowledgements`."""
+"""Not a process: the name of the link of acknowledgements, whose random stream is `link/acknowledgements`."""
 RELAY = "relay"
 RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)

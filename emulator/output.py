@@ -1,4 +1,4 @@
-"""What a command writes to its terminal, which may be gone, or be a pipe that nobody reads any more."""
+"""The output of a command, whose terminal may be gone, or may be a pipe without a reader."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar, final
 
 T = TypeVar("T")
 
@@ -22,7 +22,7 @@ def say(text: str) -> None:
 
 @contextlib.contextmanager
 def named_output() -> Iterator[None]:
-    """Have errors of standard output say that they are: no other may be taken for one."""
+    """Mark errors of standard output with its name, so that other errors are not taken for them."""
     if sys.stdout is None:
         yield
     else:
@@ -30,8 +30,9 @@ def named_output() -> Iterator[None]:
             yield
 
 
+@final
 class _Named:
-    """A stream whose errors have a file name. Final."""
+    """A stream whose errors carry a file name."""
 
     def __init__(self, stream: TextIO, name: str) -> None:
         self._stream = stream
@@ -55,7 +56,7 @@ class _Named:
 
 
 def finish() -> None:
-    """Write what is left for standard output; nobody need take it, for something else has gone wrong."""
+    """Flush standard output; ignores errors, because another error is being reported."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -64,6 +65,6 @@ def finish() -> None:
 
 
 def silence() -> None:
-    """Have nothing more written to standard output, not even at the interpreter's end."""
+    """Discard further standard output, including the flush when the interpreter exits."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

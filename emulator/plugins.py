@@ -1,6 +1,6 @@
-"""Modules of anybody's own: which ones a scenario or a brief names, and the folder in which they are looked for first.
+"""Users' own modules: those that a scenario or a brief names, and the folder in which they are looked for.
 
-A class in such a module is code that every process of a run imports; nothing is imported but what somebody has named.
+Processes of a run import the code of classes in such modules; only named modules are imported.
 
 Source: docs/your-own.md.
 """
@@ -16,18 +16,18 @@ from hashlib import sha256
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.model.registry import is_own
 
 _TRUSTED = ("scheme", "model")
 _ENTRIES = (*_TRUSTED, "strategy", "reads_as")
-"""Entries, of any table, that name a class."""
+"""Entries of tables that name a class."""
 
 
 def names_in(tables: Any, entries: tuple[str, ...] = _ENTRIES) -> Iterator[str]:
-    """Every name of a class that tables give at these entries, in their order, whatever it stands for."""
+    """Every name of a class in these entries of tables, in order, known or not."""
     if isinstance(tables, Mapping):
         for entry, inner in tables.items():
             if entry in entries and isinstance(inner, str):
@@ -41,17 +41,17 @@ def names_in(tables: Any, entries: tuple[str, ...] = _ENTRIES) -> Iterator[str]:
 
 
 def named_in(tables: Any) -> Iterator[str]:
-    """Every PACKAGE.MODULE:CLASS among them."""
+    """Every name of the form PACKAGE.MODULE:CLASS in tables."""
     return (name for name in names_in(tables) if is_own(name))
 
 
 def trusted_in(tables: Any) -> Iterator[str]:
-    """Those of them that are not eavesdroppers': schemes and links, which hold the secret or see all packets."""
+    """Such names of schemes and links, which hold the secret or see all packets; not those of eavesdroppers."""
     return (name for name in names_in(tables, _TRUSTED) if is_own(name))
 
 
 def sources_of(tables: Any) -> dict[str, str]:
-    """`module NAME` → the SHA-256 of its file, of every module that tables name and that is found. None is imported."""
+    """`module NAME` → the SHA-256 of its file, for every module that tables name and that is found. Imports none."""
     found = {}
     folder = tables.get("modules") if isinstance(tables, Mapping) else None
     for name in named_in(tables):
@@ -63,7 +63,7 @@ def sources_of(tables: Any) -> dict[str, str]:
 
 
 def _file_of(module: str, folder: str | None) -> str | None:
-    """Where the file of a module is that may not be imported here."""
+    """The path of a module's file, found without importing the module."""
     top, *inner = module.split(".")
     spec = _installed(top) or PathFinder.find_spec(top, [folder] if folder is not None else [])
     for name in inner:
@@ -74,22 +74,23 @@ def _file_of(module: str, folder: str | None) -> str | None:
 
 
 def _installed(top: str) -> ModuleSpec | None:
-    """Where a module is found on the path, if it is."""
-    with suppress(ValueError):  # of __main__ and the like
+    """The spec of a module on the path, or None."""
+    with suppress(ValueError):  # raised for __main__ and the like
         return find_spec(top)
     return None
 
 
+@final
 class _Folder(str):
-    """A folder on the path that `look_in` has put there. Final."""
+    """A folder that `look_in` has put on the path."""
 
     __slots__ = ()
 
 
 def look_in(folder: str) -> None:
-    """Have modules looked for in this folder, after all that is installed and before other folders of this kind.
+    """Put a folder on the path, after everything installed and before other folders put there by this function.
 
-    So nothing in it stands in place of a module of ours, of Python's or of a library's.
+    So its modules cannot replace a module of Evedrop, of Python or of a library.
     """
     if folder not in sys.path:
         first = next((i for i, place in enumerate(sys.path) if isinstance(place, _Folder)), len(sys.path))
@@ -98,7 +99,7 @@ def look_in(folder: str) -> None:
 
 
 def elsewhere(folder: str, tables: Any) -> Iterator[str]:
-    """A sentence for every module that tables name, that is in this folder, and that this process has from another place."""
+    """A sentence for every module that tables name, that is in this folder, and that this process finds elsewhere."""
     for name in dict.fromkeys(named_in(tables)):
         top = name.partition(":")[0].partition(".")[0]
         there = PathFinder.find_spec(top, [folder])
@@ -123,14 +124,14 @@ def elsewhere(folder: str, tables: Any) -> Iterator[str]:
 
 
 def _put_there(spec: ModuleSpec) -> bool:
-    """Whether a module is in a folder that `look_in` has put on the path: it is not loaded, and comes after this one."""
+    """Whether a module is in a folder that `look_in` has put on the path: it is not loaded, and a new folder precedes it."""
     return any(
         isinstance(place, _Folder) and _home(spec).startswith(f"{Path(place).resolve()}{os.sep}") for place in sys.path
     )
 
 
 def _home(spec: ModuleSpec) -> str:
-    """Where a module or a package is."""
+    """The place of a module or a package."""
     if spec.origin is not None:
         return str(Path(spec.origin).resolve()) if Path(spec.origin).is_absolute() else spec.origin
     return ", ".join(spec.submodule_search_locations or ())

@@ -1,4 +1,4 @@
-"""Free ports on loopback."""
+"""Finds free ports on loopback."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from evedrop.errors import UsageError
 
 
 def free_port() -> int:
-    """A free TCP port on loopback, below those that the system hands out for outgoing connections."""
+    """A free TCP port on loopback, below the range that the system uses for outgoing connections."""
     for _ in range(200):
         port = 10_000 + secrets.randbelow(22_000)
         with socket.socket() as probe:

@@ -1,6 +1,6 @@
-"""Scenario files as tests of pytest: `pytest scenarios/`, `pytest my.toml`. One file is one test and one run.
+"""A pytest plugin that runs scenario files as tests: `pytest scenarios/`, `pytest my.toml`. One file is one test and one run.
 
-pytest loads this in every project of an environment that has Evedrop in it, so it loads nothing of weight itself.
+pytest loads this plugin in every project of an environment that has Evedrop installed, so it makes no slow imports itself.
 
 Source: docs/testing.md.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import pytest
 
@@ -20,32 +20,39 @@ if TYPE_CHECKING:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The options; docs/testing.md has them."""
+    """Add the options of docs/testing.md."""
     group = parser.getgroup("evedrop", "scenarios of Evedrop")
     group.addoption("--evedrop-in-memory", action="store_true", help="run scenarios in memory instead of live")
-    group.addoption("--evedrop-trials", type=int, metavar="N", help="trials of every scenario; default its own number")
-    group.addoption("--evedrop-out", type=Path, metavar="DIR", help="where results go, a folder each; default runs/")
+    group.addoption("--evedrop-trials", type=int, metavar="N", help="number of trials; default the scenario's")
+    group.addoption(
+        "--evedrop-out",
+        type=Path,
+        metavar="DIR",
+        help="folder for the results, a folder for each scenario; default runs/",
+    )
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """A collector for a file that is a scenario; None for any other."""
+    """A collector for a scenario file; None for any other file."""
     return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
 
 
+@final
 class ScenarioFile(pytest.File):
-    """A scenario file. Final."""
+    """A scenario file."""
 
     def collect(self) -> Iterator[pytest.Item]:
         """Its one test."""
         yield ScenarioItem.from_parent(self, name=self.path.stem)
 
 
+@final
 class ScenarioItem(pytest.Item):
-    """A scenario as a test. Final."""
+    """A scenario as a test."""
 
     def runtest(self) -> None:
-        """Run it. Raises ScenarioFailed if it does not pass."""
-        from evedrop.errors import Interrupted  # noqa: PLC0415 - only where there is a scenario to run
+        """Run the scenario. Raises ScenarioFailed if it does not pass."""
+        from evedrop.errors import Interrupted  # noqa: PLC0415 - needed only to run a scenario
         from evedrop.studies.scenario_tests import Manner, Outcome, carry_out  # noqa: PLC0415 - the same
 
         options = self.config.option
@@ -61,13 +68,13 @@ class ScenarioItem(pytest.Item):
             raise ScenarioFailed(tested)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], *more: Any) -> Any:
-        """The reasons, a line each; a traceback only of what is a mistake of ours."""
+        """The reasons, one line each; a traceback only for a bug of Evedrop."""
         if isinstance(excinfo.value, ScenarioFailed):
             return str(excinfo.value)
         return super().repr_failure(excinfo, *more)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Where it is, and its heading in the report."""
+        """The file, and the test's heading in the report."""
         return self.path, None, f"scenario {self.name}"
 
 

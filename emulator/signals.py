@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP of a command that has begun something: as an event, as an exception, or in any thread."""
+"""Handles Ctrl-C, SIGTERM and SIGHUP in a command that has begun its work: by an event, an exception, or at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _Handler = Callable[[int, FrameType | None], object]
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, SIGTERM and SIGHUP set, while the block runs; outside the main thread signals stay as they are."""
+    """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread."""
     stop = threading.Event()
     with _handled(lambda *_: stop.set()):
         yield stop
@@ -24,7 +24,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def raise_on_signals() -> Iterator[None]:
-    """Have Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt while the block runs, so that what it made is removed."""
+    """Make Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt while the block runs, so that its files are removed."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -35,9 +35,9 @@ def raise_on_signals() -> Iterator[None]:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Have processes that are started while the block runs get signals when they have handlers, and not before.
+    """Delay signals to processes that are started in the block until they have handlers.
 
-    An interpreter that is still starting would end with a traceback; `evedrop.interrupts` lets through what has come meanwhile.
+    An interpreter that is still starting would end with a traceback; `evedrop.interrupts` then unblocks pending signals.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
@@ -51,7 +51,7 @@ def _handled(handler: _Handler) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    # What is ignored from birth stays so: nohup, and the interrupts of a job in the background.
+    # Signals ignored from the start stay ignored: by nohup, and the interrupts of a background job.
     before = {number: signal.signal(number, handler) for number in heeded()}
     try:
         yield
@@ -61,7 +61,7 @@ def _handled(handler: _Handler) -> Iterator[None]:
 
 
 def leave_on_signals() -> None:
-    """From now on have Ctrl-C, SIGTERM and SIGHUP end this process at once, also while its main thread waits outside Python."""
+    """Make Ctrl-C, SIGTERM and SIGHUP end this process at once, even while its main thread waits outside Python."""
     ours, theirs = os.pipe()
     os.set_blocking(theirs, False)
     signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)

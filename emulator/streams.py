@@ -1,9 +1,9 @@
-"""Every random number of a run: named streams, addressed by (slot, trial).
+"""All random numbers of a run: named streams, addressed by (slot, trial).
 
 One primitive serves all: AES-256 in counter mode. The key of a stream is BLAKE2b(root, name), its counter
-slot · 2⁶⁴ + trial · (16-byte blocks per trial). Any number can be drawn without drawing what comes before it, and nothing
-that is added, removed, lost or late moves anybody else's numbers. The conversions to uniforms and normals are this
-project's own, so that no release of a library changes them.
+slot · 2⁶⁴ + trial · (16-byte blocks per trial). Any number can be drawn without drawing the numbers before it, and adding,
+removing, losing or delaying anything does not change the numbers of other streams. The conversions to uniforms and normals
+are this project's own, so that no release of a library changes them.
 
 Source: docs/mathematics.md, random numbers.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import blake2b
+from typing import final
 
 import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
@@ -41,7 +42,7 @@ def stream_key(root: bytes, name: str) -> bytes:
 class Stream:
     """A stream over a range of trials (step 1), `per_trial` words for each in every slot.
 
-    Final. AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots. The
+    AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots. The
     blocks are kept between calls; only their slot numbers change.
     """
 
@@ -54,7 +55,7 @@ class Stream:
         self._keystream = bytearray()
 
     def words(self, slots: range) -> Words:
-        """Raw 64-bit words, (slots, trials, per_trial), for a range of step 1; overwritten by the next call."""
+        """Raw 64-bit words, (slots, trials, per_trial), for a range of step 1; the next call overwrites them."""
         if len(slots) > len(self._counters):
             self._counters = np.empty((len(slots), *self._counters.shape[1:]), dtype=">u8")
             first, last = self._trials.start * self._blocks, self._trials.stop * self._blocks
@@ -96,10 +97,11 @@ class Batch:
         return range(self.first_trial, self.first_trial + self.trials)
 
 
+@final
 class BlockReader:
     """Draws a stream ahead, a block of slots at a time, and converts a block in one call.
 
-    Final. Holds one block: reading slots in order costs each number once; any other order is correct, only slower.
+    Holds one block: reading slots in order costs each number once; any other order is correct, only slower.
     """
 
     def __init__(self, key: bytes, batch: Batch, per_trial: int) -> None:
@@ -123,7 +125,7 @@ class BlockReader:
         return self._converted(slots, normals)
 
     def _converted(self, slots: range, convert: Callable[[Words], Floats]) -> Floats:
-        """A block at a time, so that what comes in between stays in the cache, and the allocator keeps its pages."""
+        """Convert a block at a time, so that intermediate arrays stay in the cache, and the allocator keeps its pages."""
         if len(slots) <= self._length:
             return convert(self._words(slots))
         numbers = np.empty((len(slots), self._per_trial, self._batch.trials))

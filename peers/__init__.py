@@ -1,1 +1,1 @@
-"""The programs of a run, one process each. They take one argument: their brief."""
+"""The programs of a run's peers, one process each. They take one argument: their brief."""

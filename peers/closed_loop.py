@@ -1,10 +1,10 @@
-"""The loop's ends at sensor and legitimate estimator: what they tell the controller, and what they are told by it."""
+"""The closed loop at sensor and legitimate estimator: their messages to the controller, and the inputs they get from it."""
 
 from __future__ import annotations
 
 from base64 import b64decode
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -21,17 +21,18 @@ from evedrop.model.receiver import Belief, Flags, Receiver
 
 
 def disturbances_in(text: str, slots: int) -> Floats:
-    """The disturbances of a brief, (slots, q)."""
+    """Decode the disturbances of a brief, (slots, q)."""
     return np.frombuffer(b64decode(text), "<f8").reshape(slots, -1)
 
 
 def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> ReplayBuffer:
-    """An outlet of what is said in decision slots: what is said in one may be needed until the next."""
+    """A replay buffer for messages of decision slots: each may be needed until the next decision slot."""
     return session.kept(key, brief.flow.window + 1 + period, back=period)
 
 
+@final
 class Decided:
-    """What the controller decides, as it comes in every period slots. Final."""
+    """Receives the controller's decisions, one in every `period` slots."""
 
     def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
@@ -41,20 +42,21 @@ class Decided:
         self._now: tuple[Floats, Flags]
 
     def of(self, k: int) -> tuple[Floats, Flags]:
-        """The inputs (m, R) of slot k, and where their decision failed, (R,); slots come in order."""
+        """The inputs (m, R) of slot k, and where the decision failed, (R,); call it for slots in order."""
         if k % self._period == 0:
             message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
             self._now = read_decided(message, k, self._shape)
         return self._now
 
 
+@final
 class Actuator:
-    """The plant at the sensor: what moves its state, and the inputs that it waits for after every slot. Final."""
+    """The plant at the sensor: moves the state, and waits for the inputs after every slot."""
 
     def __init__(self, brief: Brief, session: Session) -> None:
         plant, loop = Plant.of(brief.part["plant"]), brief.part["controller"]
         self.inputs = 0 if loop is None else plant.inputs
-        """How many are decided."""
+        """How many inputs the controller decides."""
         self._drive = Drive(plant, disturbances_in(brief.part["plant"]["disturbances"], brief.slots))
         key = brief.stream_keys.get("measurement", b"")
         measures = plant.output_matrix is not None
@@ -70,22 +72,22 @@ class Actuator:
             )
 
     def pushed(self, k: int) -> Floats:
-        """What moves the state into slot k, as `Trajectory.advance` takes it."""
+        """The term that inputs and disturbances add to the state of slot k, as `Trajectory.advance` takes it."""
         return self._drive.pushed(k)
 
     def transmitted(self, k: int, x: Floats, trajectory: Trajectory) -> tuple[Floats, Floats]:
-        """What is transmitted as the state x (n, R) of slot k, and what its innovation is measured against, (n, R)."""
+        """The state to transmit for the state x (n, R) of slot k, and the prediction that its innovation refers to, (n, R)."""
         if self._local is None:
             return x, trajectory.predicted
         return self._local.take(k, x, self.pushed(k)), self._local.predicted
 
     @property
     def measures(self) -> bool:
-        """Whether the sensor filters what it measures."""
+        """Whether the sensor filters its measurements."""
         return self._local is not None
 
     def wait(self, k: int, x: Floats) -> tuple[Floats, Flags] | None:
-        """The inputs of slot k, whose state is x (n, R), and where their decision failed; None without a controller."""
+        """Wait for the inputs of slot k, whose state is x (n, R), and where the decision failed; None without a controller."""
         if self._decided is None:
             return None
         decides = k % self._period == 0
@@ -97,8 +99,9 @@ class Actuator:
         return steered
 
 
+@final
 class Consultation:
-    """The loop's end at the legitimate estimator: it says its estimate, and may be told the inputs. Final."""
+    """The closed loop at the legitimate estimator: sends its estimate, and may receive the inputs."""
 
     def __init__(self, brief: Brief, session: Session, receiver: Receiver) -> None:
         loop: Mapping[str, Any] = brief.part["controller"]
@@ -114,12 +117,12 @@ class Consultation:
             self._told = receiver, Decided(session, self._period, shape, brief.flow.longest_outage)
 
     def before(self, k: int) -> None:
-        """Learn the inputs that led into slot k."""
+        """Receive the inputs that led into slot k, if the estimator knows the inputs."""
         if k > 0 and self._told is not None:
             receiver, inputs = self._told
             receiver.learn(k - 1, inputs.of(k - 1)[0])
 
     def after(self, k: int, belief: Belief) -> None:
-        """Say what is believed after slot k."""
+        """Send the estimate of slot k, if the controller decides in it."""
         if self._put is not None and k % self._period == 0:
             self._put(k, known("x_hat", k, belief.x_hat))

@@ -1,4 +1,4 @@
-"""The controller: from the legitimate estimate of a slot to the inputs that the plant is given from then on."""
+"""The controller: computes the plant's inputs from the legitimate estimate, or the true state, of a slot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def steer(brief: Brief) -> None:
     with Session(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
         inbox, put = session.inbox(key), kept_decisive(session, session.keys.input, brief, assignment.period)
-        # Slots are joined without its reports, so all that is kept is sent again.
+        # The observer joins slots without the controller's reports, so all kept reports are sent again.
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
         due = GapDetector(key, brief.flow.longest_outage)

@@ -1,4 +1,4 @@
-"""An eavesdropper: hears the same packets over its own link, and reads them by its strategy."""
+"""An eavesdropper: receives the same packets over its own link, and reads them by its strategy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every receiver does: take a delivery per slot, step, report."""
+"""The work of every receiver: take one delivery in each slot, update the estimate, report."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import final
 
 import numpy as np
 
@@ -29,10 +30,10 @@ def follow(
     acknowledges: bool = False,
     consult: Callable[[Session], Consultation] | None = None,
 ) -> None:
-    """Run a receiver over all slots of its brief, but for those in which it is away.
+    """Run a receiver over all slots of its brief, except those in which it is away.
 
-    It may acknowledge what it receives, and be consulted by a controller.
-    What it has had already is acknowledged once more and else ignored.
+    It may acknowledge packets, and send its estimate to a controller. Deliveries that it already had are acknowledged
+    again, and otherwise ignored.
     """
     name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part["window"]
     outages = {start: (stop, keeps) for start, stop, keeps in brief.part["outages"]}
@@ -59,7 +60,7 @@ def follow(
                     due.missed(k, found)
                     continue
                 if k in outages:
-                    # Before the report that the conductor waits for: it may end this process at once.
+                    # Before the report that the conductor waits for, which may then end this process at once.
                     _save(brief, follower.belief)
                     put_telemetry(k, leaving(k, follower.belief))
                 reporter.flush(k)
@@ -86,8 +87,9 @@ def follow(
         session.wait_for("end")
 
 
+@final
 class ReceiverReplies:
-    """What a receiver says to others than the observer: acknowledgements, and its estimate to a controller. Final."""
+    """A receiver's messages to processes other than the observer: acknowledgements, and its estimate to a controller."""
 
     def __init__(self, brief: Brief, session: Session, acknowledges: bool, consultation: Consultation | None) -> None:
         self._trials = brief.trials
@@ -95,24 +97,24 @@ class ReceiverReplies:
         self._consultation = consultation
 
     def had(self, k: int, delivery: Reader) -> None:
-        """A delivery of slot k has come once more: the first acknowledgement may have been lost."""
+        """Handle a delivery of slot k that has arrived again: the first acknowledgement may have been lost."""
         if self._acknowledge is not None:
             self._acknowledge(_acknowledged(delivery, k, self._trials))
 
     def before(self, k: int, arrival: Arrival) -> None:
-        """Slot k's delivery is here."""
+        """Handle slot k's delivery before the receiver takes it."""
         if self._acknowledge is not None:
             self._acknowledge(acknowledgement(k, arrival.heard.gamma))
         if self._consultation is not None:
             self._consultation.before(k)
 
     def after(self, k: int, belief: Belief) -> None:
-        """Slot k's delivery has been dealt with."""
+        """Handle slot k's belief after the receiver has taken the delivery."""
         if self._consultation is not None:
             self._consultation.after(k, belief)
 
     def over(self, deliveries: Inbox, key: str) -> None:
-        """All slots are done: acknowledge whatever still comes, on a thread of its own that ends with the session."""
+        """After the last slot, acknowledge deliveries that still arrive, on a thread of its own that ends with the session."""
         if self._acknowledge is not None:
             threading.Thread(target=self._go_on, args=(deliveries, key), name="acknowledges", daemon=True).start()
 
@@ -124,12 +126,12 @@ class ReceiverReplies:
 
 
 def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
-    """The acknowledgement of a delivery, whose γ is where a delivery has its own."""
+    """The acknowledgement of a delivery: both messages have γ in the same field."""
     return acknowledgement(k, read_acknowledgement(delivery, k, trials))
 
 
 def _save(brief: Brief, belief: Belief) -> None:
-    """Put a belief where this process will find it if it is started again; nobody does who has not named a place."""
+    """Save a belief for this process if it is restarted; does nothing if the brief names no state file."""
     if "state_file" not in brief.part:
         return
     path = Path(brief.part["state_file"])
@@ -138,7 +140,7 @@ def _save(brief: Brief, belief: Belief) -> None:
 
 
 def _remember(brief: Brief, follower: Follower, outages: dict[int, tuple[int, bool]]) -> None:
-    """Take up what this process knew when it was ended, if it keeps its state over this outage."""
+    """Restore the belief that this process had when it was ended, if it keeps its state over this outage."""
     start, keeps = next((start, keeps) for start, (stop, keeps) in outages.items() if stop == brief.first)
     if not keeps:
         return

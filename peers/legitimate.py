@@ -1,4 +1,4 @@
-"""The legitimate estimator: holds the secret, and reads every packet that reaches it."""
+"""The legitimate estimator: shares the secret, and can read every packet that reaches it."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""The sensor: simulates the process, fills a packet per slot by the scheme, and never runs ahead of its listeners."""
+"""The sensor: simulates the process, sends one packet in each slot by the scheme, and stays within the window."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Collection
+from typing import final
 
 from evedrop.errors import RunError
 from evedrop.live.network.mailbox import Mailbox
@@ -23,14 +24,15 @@ from evedrop.model.schemes.scheme import Encoder, Packet, Scheme
 from evedrop.names import OBSERVER, SENSOR
 from evedrop.peers.closed_loop import Actuator
 
-_PROGRESS_BYTES = 16 * 2**20  # of one follower: far more than are ever under way
-_LOOK_SECONDS = 0.05  # how soon a wish to hold is noticed
+_PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
+_LOOK_SECONDS = 0.05  # how soon a request to hold is noticed
 
 
+@final
 class Window:
-    """How far the sensor may go: `window` slots beyond the slowest of those who report progress. Final.
+    """The sensor's flow control: it may be `window` slots ahead of the slowest process that reports progress.
 
-    sent: what it sent, which is forgotten as they go on.
+    sent: the sensor's sent messages, which are forgotten as these processes progress.
     """
 
     def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: ReplayBuffer) -> None:
@@ -45,11 +47,11 @@ class Window:
 
     @property
     def followers(self) -> tuple[str, ...]:
-        """Everybody who reports progress."""
+        """The processes that report progress."""
         return tuple(self._done)
 
     def wait(self, k: int) -> None:
-        """Return when slot k may be sent."""
+        """Wait until slot k may be sent."""
         while k >= self._limit:
             with self._place.waiting(
                 *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
@@ -60,14 +62,14 @@ class Window:
             self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:
-        """All slots below k are done by everybody; who is absent from now on is not waited for."""
+        """All processes have done all slots below k; do not wait for the absent ones from now on."""
         self._done = {name: max(done, k) for name, done in self._done.items()}
         self._absent = absent
         self._measure()
 
     @property
     def _followed(self) -> list[str]:
-        """Everybody who is waited for."""
+        """The processes that the sensor waits for."""
         return [name for name in self._done if name not in self._absent]
 
     def _measure(self) -> None:
@@ -76,8 +78,9 @@ class Window:
         self._sent.forget(done)
 
 
+@final
 class Barriers:
-    """Where the sensor stops between two slots until it is told to go on: as briefed, and whenever it is told to. Final."""
+    """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command."""
 
     def __init__(
         self, brief: Brief, session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
@@ -97,10 +100,10 @@ class Barriers:
         return k in self._barriers
 
     def wait_at(self, k: int) -> None:
-        """Report all slots below k, and wait until the conductor says go."""
+        """Report all slots below k, and wait for the conductor's `go`."""
         self.reporter.flush(k)
         self._telemetry(k, held(k))
-        # It may be told more than once, and of a hold before this one.
+        # The command may arrive more than once, and may belong to an earlier barrier.
         with self._session.place.waiting(self._session.keys.control(SENSOR)):
             while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
                 pass
@@ -113,8 +116,9 @@ class Barriers:
             self._barriers.add(command.integer("until"))
 
 
+@final
 class Acknowledgements:
-    """What comes back of each slot before the next is sent, and the watch over whether it is attacked. Final."""
+    """Waits for the acknowledgements of each slot before the next is sent, and watches for attacks on them."""
 
     def __init__(self, brief: Brief, session: Session, encoder: Encoder) -> None:
         self._encoder, self._trials = encoder, brief.trials
@@ -125,7 +129,7 @@ class Acknowledgements:
         self._watch = CusumBatch(Chart(**chart), brief.trials) if chart is not None else None
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
-        """Take the acknowledgements of slot k; where that raises an alarm, (R,), if they are watched."""
+        """Wait for the acknowledgements of slot k; returns where they raise an alarm, (R,), or None if they are not watched."""
         message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
         acknowledged = read_acknowledgement(message, k, self._trials)
         self._encoder.acknowledged(k, acknowledged)
@@ -154,7 +158,7 @@ def sense(brief: Brief) -> None:
         for k in range(brief.slots):
             session.place.slot = k
             window.wait(k)
-            # In real time a hold may be asked for at any moment before the slot is due; of one slot there is one at most.
+            # With a pace, a hold may be requested at any moment before the slot is due; each slot has at most one barrier.
             while not (wanted := barriers.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:
                 time.sleep(min(left, _LOOK_SECONDS))
             if wanted:
@@ -171,7 +175,7 @@ def sense(brief: Brief) -> None:
             if packet.z.shape != x.shape:
                 found, name = packet.z.shape, brief.part["scheme"]["scheme"]
                 raise RunError(
-                    f"slot {k}: encode of the scheme {name} gave z of shape {found}; expected {x.shape}; mend the class"
+                    f"slot {k}: encode of the scheme {name} gave z of shape {found}; expected {x.shape}; correct the class"
                 )
             beside = PacketExtras(packet.header, packet.sent, x if k in betrayed else None)
             send(k, uplink(k, packet.z, **beside.given))

@@ -1,1 +1,1 @@
-"""The command line: what there is to type, what it prints, and how errors end."""
+"""The command line: its commands, their output, and the handling of errors."""

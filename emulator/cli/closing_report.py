@@ -1,4 +1,4 @@
-"""The closing report of a results folder: printed when a run ends, and again whenever somebody asks for it."""
+"""The closing report of a results folder: printed when a run ends, and again on request."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def print_results(folder: Path, as_json: bool = False) -> None:
 
 
 def print_ending(folder: Path, status: int, how: str) -> None:
-    """Print what `evedrop run` prints at its end: the closing report, and why the run failed. Nobody has to read it.
+    """Print the output of `evedrop run` at its end: the closing report, and the reason of a failure; never fails itself.
 
     status: the exit status of the run; how: why it failed.
     """
@@ -46,13 +46,13 @@ def print_ending(folder: Path, status: int, how: str) -> None:
 
 
 def replay_command(folder: Path) -> str | None:
-    """The command that runs the scenario of a results folder live, one trial of it; None if it cannot be run live."""
+    """The command that runs one trial of a results folder's scenario live; None if it cannot be run live."""
     try:
         scenario = load(folder)
-    except UsageError:  # float64 cannot follow the states of so many slots
+    except UsageError:  # float64 cannot represent the states of that many slots
         return None
     recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
     recorded += " --set shards=1" if scenario.shards > 1 else ""
-    # A quantile over trials can be expected of many alone.
+    # A quantile over trials can be expected only of many trials.
     expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
     return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"

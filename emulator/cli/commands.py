@@ -1,6 +1,6 @@
-"""What each command does: reads its options, calls the module that does the work, prints what came out.
+"""The commands: each reads its options, calls the module that does the work, and prints the result.
 
-Every import of weight waits for the command that needs it, so that `evedrop --help` and a peer start quickly.
+Slow imports are made only by the command that needs them, so that `evedrop --help` and a peer start quickly.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
-    """A line for each shipped scenario, also for those that need an extra which is not there."""
+    """Print a line for each shipped scenario, even if it needs an extra that is not installed."""
     import tomllib
 
     from evedrop.loading import shipped
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
             try:
                 ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
             except (RunError, Interrupted):
-                with contextlib.suppress(OSError):  # who reads our output may have got the same Ctrl-C
+                with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
                     _print_results(line.moved or folder, options.json)
                 raise
         _print_results(ended.folder, options.json)
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
-    """The scenario of a command, with its changes; warnings are printed."""
+    """Load the scenario of a command, with its changes; prints warnings."""
     from evedrop.expected.estimates import warnings_of
     from evedrop.loading import load
 
@@ -102,7 +102,7 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
 
 
 def _print_results(folder: Path, as_json: bool) -> None:
-    """Print the closing report of a run, if there are results."""
+    """Print the closing report of a run, if it has results."""
     from evedrop.cli.closing_report import print_results
 
     with contextlib.suppress(UsageError):
@@ -110,7 +110,7 @@ def _print_results(folder: Path, as_json: bool) -> None:
 
 
 def _keep_open(viewer: Viewer) -> None:
-    """From a terminal the view stays until Ctrl-C or until it is closed; from a pipe it ends with the command."""
+    """Keep the view open until it is closed or Ctrl-C, if started from a terminal; otherwise end it with the command."""
     if sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
         where = f" at {viewer.address}" if viewer.address else ""
         print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
@@ -222,7 +222,7 @@ def _names(listed: str | None) -> list[str] | None:
 
 
 def design(options: argparse.Namespace) -> int:
-    """Say which μ_d may be chosen, and what each costs and gives."""
+    """Print the admissible μ_d, and the cost and secrecy of each choice."""
     from evedrop.api import design as design_of
     from evedrop.cli.report import print_design
 
@@ -270,13 +270,13 @@ def view(options: argparse.Namespace) -> int:
         recording = options.run / "recording.rrd"
         if results is not None or not recording.is_file():
             from evedrop.view.replay import replay
-        if results is not None:  # that of a run that goes on is not ours to write, and that of a killed one has no end
+        if results is not None:  # a run in progress, or a killed one, has no complete recording
             recording = replay(options.run, Path(temporary) / "recording.rrd")
         elif not recording.is_file():
             recording = replay(options.run)
         if options.picture is None:
             viewer = open_run(options.run, options.view, stand, recording)
-            where = f" at {viewer.address}, to whoever has this address" if viewer.address else ""
+            where = f" at {viewer.address}, to anybody who has this address" if viewer.address else ""
             print(f"the run is shown{where}; Ctrl-C ends it", flush=True)
             if viewer.warning is not None:
                 print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
@@ -303,7 +303,7 @@ def diff(options: argparse.Namespace) -> int:
 
 
 def test(options: argparse.Namespace) -> int:
-    """Run scenarios as tests; the worst exit status of theirs."""
+    """Run scenarios as tests; returns the worst of their exit statuses."""
     from evedrop.studies.junit import write_junit
     from evedrop.studies.scenario_test_jobs import results
     from evedrop.studies.scenario_tests import Finding, Manner, scenarios_of
@@ -370,7 +370,7 @@ def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
 
 
 def selftest(_: argparse.Namespace) -> int:
-    """Compare this machine with every other."""
+    """Check that this machine computes the golden digests."""
     from evedrop.cli.selftest import GOLDEN, selftest
 
     check = selftest()
@@ -380,12 +380,12 @@ def selftest(_: argparse.Namespace) -> int:
         print(f"{name:<16}{digest}  {'golden' if GOLDEN.get(name) == digest else 'NOT the golden digest'}")
     if not check.passed:
         raise RunError("this machine does not compute the golden digests; please report the lines above")
-    print("passed: this machine computes what every machine must")
+    print("passed: this machine computes the golden digests")
     return 0
 
 
 def fit_link(options: argparse.Namespace) -> int:
-    """Find the model of a recorded link."""
+    """Fit loss and delay models to a recorded link."""
     from evedrop.fitting.fit import fit, lines
 
     found = fit(options.trace, options.column, options.delay_column)

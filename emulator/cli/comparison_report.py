@@ -1,4 +1,4 @@
-"""What people see of a comparison in the terminal: what each scheme costs and keeps, then every pair."""
+"""The terminal output of a comparison: the cost and secrecy of each scheme, then every pair."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ WORDS = {
     SecrecyKept.UNDECIDED: "too few",
     SecrecyKept.BROKEN: "broken",
 }
-"""And in a word each."""
+"""Each verdict in a word."""
 
 
 def print_comparison(found: Comparison, folder: str) -> None:
-    """Everything, on standard output."""
+    """Print a comparison on standard output."""
     console = terminal()
     trials = f"{found.trials:,} trials" if found.trials > 1 else "1 trial"
     console.print(f"{found.title} · {found.slots:,} slots · {trials}")
@@ -91,24 +91,24 @@ def _table(first: str, numbers: tuple[str, ...]) -> Table:
 
 
 def simulated(of: SimulatedError) -> str:
-    """The mean over trials with its standard error, or where that is no measure the median."""
+    """The mean over trials with its standard error, or the median if the variance is infinite."""
     if of.infinite_variance:
         return f"{of.typical:.3g} med"
     return f"{of.mean:.3g}" if of.standard_error is None else f"{of.mean:.3g} ± {of.standard_error:.1g}"
 
 
 def theory(of: SimulatedError) -> str:
-    """Over the same slots; ≥ before what is only a bound."""
+    """The mean that theory expects over the same slots; with ≥ if it is only a bound."""
     return "–" if of.theory is None else f"{'≥ ' if of.theory.bound else ''}{of.theory.mean:.3g}"
 
 
 def verdict(cell: Cell) -> str:
-    """Its mark and word."""
+    """The mark and the word of a cell's verdict."""
     return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
 
 
 def _undefined(found: Comparison) -> Iterator[str]:
-    """A line for each adversary and reason, with the schemes that it is the reason for."""
+    """A line for each adversary and reason that a pair is not defined, with its schemes."""
     cells = [cell.match for one in found.schemes.values() for cell in one.cells.values()]
     why = sorted((one.adversary, one.not_defined, one.scheme) for one in cells if one.not_defined is not None)
     for (adversary, reason), some in groupby(why, lambda one: one[:2]):
@@ -117,20 +117,20 @@ def _undefined(found: Comparison) -> Iterator[str]:
 
 def _remarks(found: Comparison) -> Iterator[str]:
     yield (
-        "sent: the share of slots with a packet; bits: of its payload + header; secret: bits that a slot uses, at most, and "
-        "a trial once"
+        "sent: the share of slots with a packet; bits: of its payload + header; secret: the most bits that a slot uses; once: "
+        "bits that a trial uses once"
     )
     measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
     if any(one is not None and one.infinite_variance for one in measured):
         yield (
-            "med: the variance over trials is infinite, so the mean is no measure; the median trial, which lies far below "
-            "the expectation of theory"
+            "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
+            "below the expectation of theory"
         )
     if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
-        yield "≥: no closed form is known; what nobody without the secret can fall below in expectation"
+        yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
     if found.dominant:
         more = "each of them dominates" if len(found.dominant) > 1 else "dominates"
         yield (
-            f"{', '.join(found.dominant)}: {more}: none of the schemes costs the legitimate estimator less in the long run, "
-            "and with none is the closest adversary further off"
+            f"{', '.join(found.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
+            "and with no other scheme is the closest adversary's error larger"
         )

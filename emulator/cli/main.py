@@ -1,4 +1,4 @@
-"""The command line: what there is to type, and how errors end. What a command does is in commands.py."""
+"""The command line: its commands and options, and the handling of errors. commands.py carries the commands out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.cli import commands
 from evedrop.cli import process as roles
@@ -24,12 +24,12 @@ _SET_HELP = "change an entry of the scenario by its dotted key; the value is rea
 
 
 def is_role(arguments: Sequence[str]) -> bool:
-    """Whether these begin with the name of a process of a run."""
+    """Whether the arguments begin with the role of a process."""
     return bool(arguments) and arguments[0] in _ROLES
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; its exit status."""
+    """Run the command line; returns its exit status."""
     options = _parser().parse_args(arguments)
     command: Command = options.command
     try:
@@ -52,14 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError) and error.filename == OUTPUT:
             return 0
         if error.filename is None:
-            say(f"{error}; free what the system lacks and try again")
+            say(f"{error}; free system resources and try again")
             return RunError.exit_status
-        say(f"{error.filename}: {error.strerror}; free some room, or look at its rights")
+        say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
         return UsageError.exit_status
 
 
 def _check_names(options: argparse.Namespace) -> None:
-    """Raise UsageError for names of files that no result and no message could repeat."""
+    """Raise UsageError for file names that results and messages cannot show."""
     try:
         here = str(Path.cwd())
     except OSError:
@@ -73,18 +73,19 @@ def _check_names(options: argparse.Namespace) -> None:
             )
 
 
+@final
 class _Commands:
-    """The commands as they are added. Final."""
+    """Adds commands to a parser."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self._group = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     def group(self, name: str, does: str) -> _Commands:
-        """Commands of one kind, under a name of their own."""
+        """Add a group of commands under a common name."""
         return _Commands(self._group.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}."))
 
     def add(self, name: str, command: Command, does: str, *options: Callable[[argparse.ArgumentParser], None]) -> None:
-        """A command, what it does in some words, and its options."""
+        """Add a command; does: its description, in a few words; options: add its options."""
         one = self._group.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}.")
         one.set_defaults(command=command)
         for option in options:
@@ -98,27 +99,32 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     top = _Commands(parser)
     add = top.add
-    add("list", commands.list_scenarios, "the shipped scenarios, a line each")
+    add("list", commands.list_scenarios, "the shipped scenarios, one line each")
     add("new", commands.new, "write a commented scenario to start from", _argument("file", "FILE"))
     add("demo", commands.demo, "the shipped scenario `vehicle`, live, in real time, with the view", *_LIVE)
     add("run", commands.run, "a live run: processes, network, view, results", _scenario, *_LIVE)
     add("montecarlo", commands.montecarlo, "the same trials in memory (default 1000)", _scenario, *_MEMORY)
-    add("link", operate.link, "change, cut or heal a link of a run that goes on", _going_on, _changed_link)
-    add("pause", operate.pause, "hold a run that goes on between two slots", _going_on)
-    add("resume", operate.resume, "let a run that is held go on", _going_on)
-    add("step", operate.step, "let some slots of a run pass, and hold it again", _going_on, _slots)
-    add("status", operate.status, "how a run that goes on is doing", _going_on, _as_json)
+    add("link", operate.link, "change, cut or heal a link of a run in progress", _going_on, _changed_link)
+    add("pause", operate.pause, "hold a run in progress between two slots", _going_on)
+    add("resume", operate.resume, "let a held run go on", _going_on)
+    add("step", operate.step, "let a run go on for some slots, and hold it again", _going_on, _slots)
+    add("status", operate.status, "the status of a run in progress", _going_on, _as_json)
     add("sweep", commands.sweep, "Monte Carlo over a grid of values of any entries", _scenario, _over, *_MEMORY)
     add("compare", commands.compare, "every scheme against every adversary", _scenario, _entries, _output, _compares)
     add("design", commands.design, "admissible μ_d, secrecy, optimum, per eavesdropper", _scenario, _set, _designs)
-    add("figures", commands.figures, "the paper's figures and number table, ours beside the paper's", _figures)
+    add(
+        "figures",
+        commands.figures,
+        "the paper's figures and number table, with our values next to the paper's",
+        _figures,
+    )
     add("view", commands.view, "open a finished run", _argument("run", "RUN"), finished_view, _served)
-    add("diff", commands.diff, "first slot, trial and peer that differ, with both values", _two_runs)
-    add("test", commands.test, "scenarios as tests: a line each, a report for CI", _places, _tests)
+    add("diff", commands.diff, "the first slot, trial and peer at which two runs differ, with both values", _two_runs)
+    add("test", commands.test, "scenarios as tests: one line each, a report for CI", _places, _tests)
     add("check", commands.check, "validate scenarios, or classes of your own", _scenarios, _set, _classes)
-    links = top.group("links", "what can be found out about links")
+    links = top.group("links", "commands about links")
     links.add(
-        "fit", commands.fit_link, "the loss model, and delays, of a recorded link", _argument("trace", "TRACE"), _fits
+        "fit", commands.fit_link, "the loss model and delays of a recorded link", _argument("trace", "TRACE"), _fits
     )
     add("selftest", commands.selftest, "versions, processor, golden digest computed here")
     add("brief", roles.brief, "write the briefs, to start the processes by hand", _scenario, _entries, _briefs)
@@ -151,7 +157,7 @@ def _scenarios(parser: argparse.ArgumentParser) -> None:
 
 def _classes(parser: argparse.ArgumentParser) -> None:
     for kind, what in (
-        ("scheme", "a scheme, or the one that an eavesdropper is checked beside"),
+        ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
         ("eavesdropper", "an eavesdropper"),
         ("link", "a loss model"),
         ("delay", "a delay model"),
@@ -162,7 +168,7 @@ def _classes(parser: argparse.ArgumentParser) -> None:
 
 def _places(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "places", nargs="+", metavar="PATH", help="a scenario, or a folder that has some; or a shipped name"
+        "places", nargs="+", metavar="PATH", help="a scenario, a folder that contains scenarios, or a shipped name"
     )
 
 
@@ -170,12 +176,14 @@ def _tests(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
     parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
     parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where results go, a folder each; default runs/")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many at a time; default 1")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results, with a folder for each scenario; default runs/"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many to run at the same time; default 1")
 
 
 def _going_on(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run that goes on")
+    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run in progress")
 
 
 def _changed_link(parser: argparse.ArgumentParser) -> None:
@@ -184,16 +192,16 @@ def _changed_link(parser: argparse.ArgumentParser) -> None:
         "changes",
         nargs="+",
         metavar="KEY=VALUE",
-        help="an entry of the link, such as quality=0.2, dotted for those of a table; or the word cut or heal",
+        help="an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
     )
 
 
 def _slots(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("slots", type=int, metavar="N", help="how many slots")
+    parser.add_argument("slots", type=int, metavar="N", help="number of slots")
 
 
 def _as_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _two_runs(parser: argparse.ArgumentParser) -> None:
@@ -214,8 +222,8 @@ def _entries(parser: argparse.ArgumentParser) -> None:
         ("record-trials", "how many trials are recorded in full"),
     ):
         parser.add_argument(f"--{name}", type=int, metavar="N", help=what)
-    parser.add_argument("--pace", type=float, metavar="SECONDS", help="seconds a slot; 0 = as fast as it goes")
-    parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that does not derive from the seed")
+    parser.add_argument("--pace", type=float, metavar="SECONDS", help="seconds per slot; 0 = as fast as possible")
+    parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that is not derived from the seed")
 
 
 def _observed(parser: argparse.ArgumentParser) -> None:
@@ -224,34 +232,38 @@ def _observed(parser: argparse.ArgumentParser) -> None:
 
 def _output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
-    parser.add_argument("--json", action="store_true", help="the summary alone on standard output")
+    parser.add_argument("--json", action="store_true", help="print only the summary, as JSON, on standard output")
 
 
 def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
-    parser.add_argument("--listen", metavar="ENDPOINT", help="the router's endpoint: tcp or tls, /127.0.0.1:PORT")
-    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's, of a scenario with two")
+    parser.add_argument(
+        "--listen", metavar="ENDPOINT", help="the router's endpoint: tcp/127.0.0.1:PORT or tls/127.0.0.1:PORT"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
 
 
 def finished_view(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
-        "--picture", type=Path, metavar="FILE.png", help="draw it into a file instead; needs no screen"
+        "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
     )
-    instead.add_argument("--table", action="store_true", help="print its table and verdict again instead")
-    parser.add_argument("--slot", type=int, metavar="K", help="the moment to draw; default the last")
+    instead.add_argument("--table", action="store_true", help="print the run's table and verdict instead")
+    parser.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the last")
 
 
 def _served(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--serve", metavar="HOST:PORT", help="show it to browsers, at this address and port (and the next one)"
+        "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
     )
 
 
 def _memory(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--workers", type=int, metavar="N", help="worker processes; the results do not depend on them")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="let a Dask cluster do the work, tcp://HOST:PORT")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of worker processes; does not affect the results"
+    )
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="use a Dask cluster, tcp://HOST:PORT")
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument(
         "--covariance-only",
@@ -265,7 +277,7 @@ def _memory(parser: argparse.ArgumentParser) -> None:
         dest="mode",
         action="store_const",
         const="error-coordinates",
-        help="simulate the errors themselves: any horizon, no digest",
+        help="simulate the errors themselves: any number of slots, no digest",
     )
     parser.set_defaults(mode="exact")
 
@@ -293,54 +305,66 @@ def _compares(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="SCHEME.PARAMETER=VALUE",
-        help="a parameter of a scheme that is not the scenario's own; repeatable",
+        help="a parameter of a scheme other than the scenario's own; repeatable",
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="worker processes; the results do not depend on them")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of worker processes; does not affect the results"
+    )
 
 
 def _designs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--max-trace", type=float, metavar="Ω", help="least μ_d whose limiting trace stays below Ω")
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument(
+        "--max-trace", type=float, metavar="Ω", help="find the least μ_d whose limiting trace stays below Ω"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _figures(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", type=Path, default=Path("figures"), metavar="DIR")
-    parser.add_argument("--full", action="store_true", help="the paper's 1000 trials of a day; minutes, not seconds")
+    parser.add_argument(
+        "--full", action="store_true", help="simulate the paper's 1000 trials of a day; takes minutes, not seconds"
+    )
 
 
 def _fits(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--column", metavar="C", help="the column of outcomes, in a file of several")
+    parser.add_argument("--column", metavar="C", help="the column of outcomes, if the file has several columns")
     parser.add_argument(
-        "--delay-column", metavar="C", help="the column of delays in slots; default delay, if there is one"
+        "--delay-column",
+        metavar="C",
+        help="the column of delays in slots; default the column named delay, if there is one",
     )
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _briefs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the briefs go")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the briefs")
     parser.add_argument(
         "--results",
         type=Path,
         default=Path("results"),
         metavar="DIR",
-        help="the observer's folder, on its host; relative to where it is started",
+        help="the observer's results folder, on its host; relative to its working directory",
     )
     parser.add_argument(
         "--listen",
         default="tcp/127.0.0.1:17447",
         metavar="ENDPOINT",
-        help="where the router listens, such as tls/router.lan:7447",
-    )
-    parser.add_argument("--connect", metavar="ENDPOINT", help="what the others connect to; default as --listen says")
-    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, of a scenario with two")
-    parser.add_argument(
-        "--relay-connect", metavar="ENDPOINT", help="what those at it connect to; default as --relay says"
+        help="the endpoint where the router listens, such as tls/router.lan:7447",
     )
     parser.add_argument(
-        "--wait", type=int, default=600, metavar="SECONDS", help="how long everybody waits for the others; default 600"
+        "--connect", metavar="ENDPOINT", help="the endpoint that the others connect to; default that of --listen"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, if the scenario has two")
+    parser.add_argument(
+        "--relay-connect",
+        metavar="ENDPOINT",
+        help="the endpoint that its processes connect to; default that of --relay",
     )
     parser.add_argument(
-        "--insecure", action="store_true", help="listen in clear although others than this machine can get at it"
+        "--wait", type=int, default=600, metavar="SECONDS", help="how long processes wait for each other; default 600"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
     )
 
 

@@ -1,6 +1,6 @@
-"""One process of a run, by its brief: writing the briefs, being a process, asking whether it is there.
+"""The commands about single processes of a run: write briefs, run one process, and ask whether it is present.
 
-Every import of weight waits for the command that needs it, so that a peer starts quickly.
+Slow imports are made only by the command that needs them, so that a peer starts quickly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from evedrop.live.protocol.brief import Brief
 
 
-_MOST_TOLD = 5  # mistakes of a scenario in a brief, which nobody wrote by hand
+_MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by hand
 
 
 def brief(options: argparse.Namespace) -> int:
@@ -38,11 +38,11 @@ def brief(options: argparse.Namespace) -> int:
 
 
 def process(options: argparse.Namespace) -> int:
-    """Be one process of a run."""
+    """Run one process of a run."""
     from evedrop.live.protocol.brief import read_brief
     from evedrop.plugins import look_in
 
-    os.umask(0o077)  # whatever it writes is of the run, and nobody else's business
+    os.umask(0o077)  # only this user may read its files
     from evedrop.signals import leave_on_signals
 
     if options.role != "observer":  # which ends in order
@@ -59,7 +59,7 @@ def process(options: argparse.Namespace) -> int:
 
 
 def _play(brief: Brief, serve: str | None) -> int:
-    """Be the process of a brief, an observer with a view for browsers if `serve` says where; the exit status."""
+    """Run the process of a brief; returns its exit status. serve: where an observer shows the run to browsers."""
     from evedrop.errors import NotRegistered
     from evedrop.live.protocol.brief_use import expect_usable
 
@@ -86,12 +86,12 @@ def _play(brief: Brief, serve: str | None) -> int:
             with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
                 return _observe(brief, serve)
         case _:
-            raise BriefError(f"no role {brief.role}; give one of those that `evedrop --help` lists")
+            raise BriefError(f"unknown role {brief.role}; give one that `evedrop --help` lists")
     try:
         expect_usable(brief)
         play(brief)
     except NotRegistered as error:
-        raise BriefError(f"it names {error.name}{error.why or ', which is no class here'}") from error
+        raise BriefError(f"it names {error.name}{error.why or ', which is not a class here'}") from error
     return 0
 
 
@@ -109,14 +109,14 @@ def _observe(brief: Brief, serve: str | None) -> int:
 
 
 def _report(folder: Path, status: int, how: str) -> None:
-    """Print how a run ended that was started by hand."""
+    """Print the end of a run that was started by hand."""
     from evedrop.cli.closing_report import print_ending
 
     print_ending(folder, status, how)
 
 
 def health(options: argparse.Namespace) -> int:
-    """Say whether a process is there."""
+    """Print whether a process is on the network."""
     from evedrop.live.network.health import is_there
     from evedrop.live.protocol.brief import read_brief
 

@@ -1,4 +1,4 @@
-"""What people see of a run in the terminal: a progress line, and a closing table with a sentence on secrecy."""
+"""The terminal output of a run: a progress line, and a closing table with a sentence on secrecy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TextIO, cast
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast, final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 News = Mapping[str, Any]
 
-_DIGEST_WIDTH = 100  # columns of a terminal that has room for digests
+_DIGEST_WIDTH = 100  # the least width of a terminal, in columns, to show digests
 
 
 class _Unfailing:
-    """A stream that forgets what cannot be written to it: the terminal may be closed while the run is ended in order."""
+    """A stream that ignores errors of writing: the terminal may be closed while the run is ended in order."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -59,15 +59,16 @@ def _unfailing(stream: TextIO | None) -> TextIO:
     return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
 
 
+@final
 class ProgressLine:
-    """Shows the observer's or the simulation's news on standard error. Final; a context manager."""
+    """Shows the observer's or the simulation's news on standard error; a context manager."""
 
     def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
         self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
         self.moved: Path | None = None
-        """Where the results folder is, if it was renamed."""
+        """The results folder, if it was renamed."""
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -92,11 +93,13 @@ class ProgressLine:
         self._progress.stop()
 
     def tell(self, news: News) -> None:
-        """Take one piece of news."""
+        """Show one item of news."""
         kind = news["event"]
         if kind == "view" and not self._quiet:
             if news["address"]:
-                self.console.print(f"live view, for whoever has this address: {news['address']}", soft_wrap=True)
+                self.console.print(
+                    f"live view, open to anybody who has this address: {news['address']}", soft_wrap=True
+                )
             if news.get("warning"):
                 self.console.print(f"warning: {news['warning']}", soft_wrap=True)
         elif kind == "started":
@@ -131,7 +134,7 @@ def outage_line(outage: News) -> str:
 
 
 def closing_table(summary: News, width: int) -> Table:
-    """Per receiver: what it received, its error, what it believed of it, and, where there is room, its digest."""
+    """The table of the receivers: their received packets, actual and believed errors, and, if there is room, digests."""
     trials = f"{summary['trials']:,} trials" if summary["trials"] > 1 else "1 trial"
     rate = f"{summary['slots_per_second']:,.0f} slots/s"
     if summary["mode"] != "live":
@@ -164,7 +167,7 @@ def closing_table(summary: News, width: int) -> Table:
 
 
 def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
-    """The closing report on standard output; replay: the command that shows one trial live, to complete."""
+    """Print the closing report on standard output; replay: the beginning of the command that shows one trial live."""
     console = terminal()
     if summary["ended"] != "complete":
         console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
@@ -179,7 +182,7 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
         if peer["infinite_variance"] and peer["error_quantiles"] and summary["trials"] > 1:
             low, middle, high = (f"{float(value):.3g}" for value in peer["error_quantiles"].values())
             console.print(
-                f"{name}: its error has infinite variance, so the mean over trials is no measure; "
+                f"{name}: its error has infinite variance, so the mean over trials says nothing; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
     for line in household_lines(summary["household"]):
@@ -200,18 +203,18 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
 
 
 def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
-    """Which links let other shares through than their models say."""
+    """A line for each link whose delivered fraction differs from its model's."""
     for name, link in links.items():
         if link.get("within_interval") is False:
             low, high = link["interval"]
             yield (
-                f"the link of {name} let {link['rate']:.5g} of its packets through; its model says {link['expected_rate']:.5g}, "
-                f"outside the interval that this run allows, {low:.5g} to {high:.5g}"
+                f"the link of {name} let {link['rate']:.5g} of its packets through; its model predicts "
+                f"{link['expected_rate']:.5g}, and for this run an interval of {low:.5g} to {high:.5g}"
             )
 
 
 def household_lines(house: Mapping[str, Any] | None) -> list[str]:
-    """What a house buys and sells, what secrecy and losses cost it, and who can tell when somebody is at it; or nothing."""
+    """The lines about a house: energy bought and sold, the cost of secrecy and losses, and what activity receivers detect."""
     if house is None:
         return []
     seen = house["knowing_truth"]
@@ -223,18 +226,18 @@ def household_lines(house: Mapping[str, Any] | None) -> list[str]:
     if None not in shares:
         net, total, summed = (f"{100 * share:.2g} %" for share in shares)
         lines.append(
-            f"grid power differs from that one's by {net} in net energy, {total} in total, {summed} summed slot by slot"
+            f"grid power differs from that controller's by {net} in net energy, {total} in total, {summed} summed slot by slot"
         )
     areas = {name: one["activity_area"] for name, one in house["receivers"].items()}
     if None not in areas.values():
         told = ", ".join(f"{name} {area:.3f}" for name, area in areas.items())
         windows = f"{house['active_windows']} active windows of {house['windows']}"
-        lines.append(f"who can tell the {windows} (1 is certainty, 0.5 a coin): {told}")
+        lines.append(f"detection of the {windows} (1 is certainty, 0.5 is guessing): {told}")
     return lines
 
 
 def _loop_line(controller: News) -> str:
-    """What became of a closed loop."""
+    """The line about a closed loop."""
     errors = ", ".join(
         f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller["mean_squared_errors"].items()
     )
@@ -250,7 +253,7 @@ def _loop_line(controller: News) -> str:
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
-    """A row a point and peer."""
+    """Print the table of a sweep: one row for each point and peer."""
     shown = Table(box=SIMPLE_HEAD)
     columns = [*keys, "peer", "mean error", "expected tr P", "believed tr P", "relative secrecy"]
     for column in columns:
@@ -272,7 +275,7 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
 
 
 def print_design(design: Design) -> None:
-    """Bounds, intervals, optima and the price of secrecy, for people."""
+    """Print a design as text: bounds, intervals, optima and the price of secrecy."""
     console = terminal()
     console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
     if design.remark is not None:
@@ -320,13 +323,13 @@ def print_design(design: Design) -> None:
 
 
 def _half_open(interval: tuple[float, float], bound: float) -> str:
-    """Of perfect secrecy: at its upper end the error is still unbounded, unless it is bounded just there, where all is state."""
+    """The interval of perfect secrecy; closed at its upper end, unless that is 1 and the error is bounded there."""
     low, high = interval
     return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
 
 
 def _figure(value: float | str | None, how: str = ".4g") -> str:
-    """A figure of the summary, where infinity is a string, and null means that there is none."""
+    """A figure of the summary as text; in the summary infinity is a string, and null means that there is no figure."""
     return "–" if value is None else format(float(value), how)
 
 
@@ -336,12 +339,12 @@ def _number(value: float) -> str:
 
 class _Console(Console):
     def on_broken_pipe(self) -> None:
-        """Whoever reads our output may leave; that is no failure of ours, and cli.py knows what to do."""
+        """Re-raise: a closed pipe is not a failure of the program, and main.py handles it."""
         raise  # noqa: PLE0704 - rich calls this where it has caught the error
 
 
 def terminal() -> Console:
-    """Standard output; wide where it is no terminal."""
+    """Standard output; wide if it is not a terminal."""
     return _Console(
         highlight=False,
         markup=False,

@@ -1,4 +1,4 @@
-"""Does this machine compute what every machine must: versions, processor, and a golden digest computed here."""
+"""The self-test: versions, processor, and whether this machine computes the golden digests."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SCENARIO = {
 
 @dataclass(frozen=True)
 class Check:
-    """What the machine is, and whether its digests are the golden ones."""
+    """A description of the machine, and the digests that it computed."""
 
     machine: Mapping[str, str]
     digests: Mapping[str, str]

@@ -1,6 +1,6 @@
-"""The commands for a run that goes on: each asks its observer, prints the answer, and ends.
+"""The commands for a run that goes on: each asks the run's observer, prints the answer, and ends.
 
-Every import of weight waits for the command that needs it.
+Slow imports are made only by the command that needs them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from evedrop.live.network.control_file import Control
     from evedrop.live.network.operator import Answer, Request
 
-_PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has started again
+_PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has restarted
 _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
 
@@ -34,19 +34,19 @@ def pause(options: argparse.Namespace) -> int:
 
 
 def resume(options: argparse.Namespace) -> int:
-    """Let it go on."""
+    """Let the run go on."""
     return _ask(options.run, "resume", "resume")
 
 
 def step(options: argparse.Namespace) -> int:
-    """Let some slots pass."""
+    """Let the run go on for some slots."""
     if not 1 <= options.slots <= 100_000_000:
         raise UsageError(f"step {options.slots}: expected 1 or more slots, and 100000000 at most")
     return _ask(options.run, "step", f"step {options.slots}", _STEP_PATIENCE, slots=options.slots)
 
 
 def status(options: argparse.Namespace) -> int:
-    """Say how the run is doing."""
+    """Print the run's status."""
     from evedrop.live.network.control_file import read_controls
     from evedrop.live.network.operator import Request
 
@@ -65,13 +65,13 @@ def _ask(run: Path, do: str, what: str, patience: float = _PATIENCE, **fields: A
     from evedrop.live.network.control_file import read_controls
     from evedrop.live.network.operator import Request
 
-    control = read_controls(run)[0]  # of a run in shards any of them says that they are not steered
+    control = read_controls(run)[0]  # in a run in shards, any of them refuses
     print(_answer(run, control, Request(do, **fields), what, patience).said)
     return 0
 
 
 def _answer(run: Path, control: Control, request: Request, what: str, patience: float) -> Answer:
-    """What the observer of a run, or of one of its shards, answers. Raises UsageError if there is none, or it refuses."""
+    """The answer of a run's, or a shard's, observer. Raises UsageError if it does not answer, or refuses."""
     import zenoh
 
     from evedrop.live.network.control_file import no_run
@@ -89,12 +89,12 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
         found = ask(control, request, patience)
     except zenoh.ZError as error:
         raise no_run(
-            run, f"nobody answers at {control.router}, or not yet again: a router that was lost is started again"
+            run, f"no router answers at {control.router}; if the router was lost, it is being restarted"
         ) from error
     if found is None and time.monotonic() - began >= patience:
         raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
     if found is None:
-        raise no_run(run, "it ended before it answered, or its router did, which is started again")
+        raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
     if found.refused:
         count = "1 mistake" if len(found.refused) == 1 else f"{len(found.refused)} mistakes"
         raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in found.refused)]))
@@ -102,7 +102,7 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
 
 
 def _event(name: str, words: list[str]) -> dict[str, Any]:
-    """What a scenario would say of the change, but when."""
+    """The change as an event of a scenario, without its time."""
     if words in (["cut"], ["heal"]):
         return {words[0]: name}
     changes: dict[str, Any] = {}
@@ -115,7 +115,7 @@ def _event(name: str, words: list[str]) -> dict[str, Any]:
 
 
 def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
-    """Put a value at a dotted key, of tables that are made on the way."""
+    """Put a value at a dotted key; makes the tables in between."""
     from evedrop.loading import value_of
 
     *tables, last = dotted.split(".")
@@ -123,17 +123,17 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     for table in tables:
         inner = inner.setdefault(table, {})
         if not isinstance(inner, dict):
-            raise UsageError(f"link {name} {dotted}={text}: {table} has a value already; give it once")
+            raise UsageError(f"link {name} {dotted}={text}: {table} already has a value; give it once")
     value = value_of(text)
     try:
         json.dumps(value)
-    except TypeError:  # a date is no value that a link could have, and no message either
+    except TypeError:  # a date cannot be in a message, and no entry of a link is a date
         value = text
     inner[last] = value
 
 
 def _of_all(statuses: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """How the shards of a run are doing as one: the slowest one's, who is there in all of them, and all packets."""
+    """The status of a run from those of its shards: the slowest one's, processes present in all shards, and all packets."""
     found = dict(min(statuses, key=lambda status: int(status["slot"])))
     found["processes"] = {name: all(one["processes"][name] for one in statuses) for name in found["processes"]}
     for name in found["links"]:
@@ -144,7 +144,7 @@ def _of_all(statuses: list[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
-    """How a run is doing, for people."""
+    """The status of a run as lines of text."""
     state = found["state"] if found["state"] == "running" else f"{found['state']} before slot {found['slot']}"
     missing = [name for name, there in found["processes"].items() if not there]
     there = [name for name, there in found["processes"].items() if there]

@@ -1,1 +1,1 @@
-"""The same trials without a network: simulation, Monte Carlo, and its workers."""
+"""The trials of a live run without a network: simulation, Monte Carlo, and its workers."""

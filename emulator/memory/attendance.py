@@ -1,4 +1,4 @@
-"""A receiver with its link in memory: what the router, the receiver's processes and its stand-in do of a live run.
+"""A receiver with its link in memory: the work of a live run's router, receiver process and stand-in.
 
 Source: docs/results.md, summary.json.
 """
@@ -6,6 +6,7 @@ Source: docs/results.md, summary.json.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,9 @@ from evedrop.model.slot.transit import Transit
 from evedrop.scenario.timeline import Away
 
 
+@final
 class IntermittentReceiver:
-    """Follows the slots from 0 on. Final."""
+    """A receiver that follows the slots from 0 on, and may be away in some of them."""
 
     def __init__(self, receiver: Receiver, window: int, outages: Sequence[Away]) -> None:
         self._receiver, self._window = receiver, window
@@ -31,13 +33,13 @@ class IntermittentReceiver:
 
     @property
     def late(self) -> NDArray[np.uint16]:
-        """Packets of earlier slots that the last slot brought, (R,)."""
-        # Whoever is away takes nothing; the follower still has those of the last slot it was there in.
+        """How many packets of earlier slots arrived in the last slot, (R,)."""
+        # An absent receiver takes none; the follower still has the counts of the last slot in which it was present.
         return self._follower.late if self._away is None else np.zeros_like(self._follower.late)
 
     @property
     def late_used(self) -> NDArray[np.uint16]:
-        """Those of them that were used, (R,)."""
+        """How many of the late packets were used, (R,)."""
         return self._follower.late_used if self._away is None else np.zeros_like(self._follower.late_used)
 
     def take(

@@ -1,4 +1,4 @@
-"""The closed loop in memory: what the sensor's plant, the controller and who is told the inputs do of a live run.
+"""The closed loop in memory: the work of a live run's plant, controller and input-aware estimator.
 
 Source: docs/mathematics.md, closed loop.
 """
@@ -6,7 +6,7 @@ Source: docs/mathematics.md, closed loop.
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -27,24 +27,24 @@ from evedrop.streams import Batch
 
 
 def informed(scenario: Scenario, estimator: Receiver) -> Receiver:
-    """The legitimate estimator of a scenario, told the inputs if it is to be."""
+    """The legitimate estimator of a scenario, input-aware if the scenario says so."""
     if scenario.driven is None or not scenario.legitimate.knows_input:
         return estimator
     return InputAwareEstimator(estimator, scenario.driven, scenario.window(LEGITIMATE))
 
 
 class Made(NamedTuple):
-    """A slot's states, (n, R) each."""
+    """The states of a slot, (n, R) each."""
 
     true: Floats
     x: Floats
-    """What is transmitted as the state: the true one, or what the sensor's filter makes of it."""
+    """The transmitted state: the true one, or the estimate of the sensor's filter."""
     predicted: Floats
-    """A times that of the slot before."""
+    """The prediction of x from the slot before."""
 
 
 class Source(NamedTuple):
-    """What the states of a batch are drawn from."""
+    """The keys and the initial state from which the states of a batch are drawn."""
 
     keys: StreamKeys
     initial: Floats | None
@@ -52,10 +52,11 @@ class Source(NamedTuple):
     batch: Batch
 
 
+@final
 class Loop:
-    """The states of a batch and what moves them, slot by slot: plant and controller, or their process alone. Final.
+    """Computes the states of a batch slot by slot, with plant and controller, or of the process alone.
 
-    digests: is given the controller's, block by its first slot → (R, 32); times: what decisions take.
+    digests: filled with the controller's digests, block by its first slot → (R, 32); times: filled with decision times.
     """
 
     def __init__(
@@ -78,23 +79,23 @@ class Loop:
             self._u: Floats = np.zeros((plant.inputs, batch.trials))
 
     def begin(self, count: int) -> None:
-        """Take so many slots."""
+        """Begin a chunk of `count` slots."""
         if self._table is not None:
             u = np.empty((count, *self._u.shape))
             self._rows = InputSlots(u, np.empty((count, self._trials), np.bool_))
 
     @property
     def inputs(self) -> InputSlots | None:
-        """Those of the slots that were begun with; None without a controller."""
+        """The inputs of the current chunk; None without a controller."""
         return None if self._table is None else self._rows
 
     @property
     def filters(self) -> bool:
-        """Whether the sensor filters what it measures."""
+        """Whether the sensor filters its measurements."""
         return self._local is not None
 
     def advance(self, k: int) -> Made:
-        """The states of slot k; slots come in order."""
+        """Compute the states of slot k; call it for slots in order."""
         if self._drive is None:
             true = self._trajectory.advance()
             return Made(true, true, self._trajectory.predicted)
@@ -105,7 +106,7 @@ class Loop:
         return Made(true, self._local.take(k, true, pushed), self._local.predicted)
 
     def act(self, k: int, row: int, x: Floats, x_hat: Floats) -> None:
-        """Decide the inputs of slot k, which is one of those begun with, from the state and its estimate, (n, R)."""
+        """Decide the inputs of slot k of the current chunk from the state or its estimate, (n, R) each."""
         if self._table is None or self._drive is None:
             return
         if k % self._table.period == 0:

@@ -1,6 +1,6 @@
-"""Classes that are not built in, watched while they work: what breaks in a later slot is told with class, slot and trials.
+"""Checks the results of classes that are not built in: an error in any slot is reported with class, slot and trials.
 
-A dry run asks them about the first slots alone (`evedrop.scenario.dry_run`); a live run looks at each of their messages.
+A dry run calls them for the first slots only (`evedrop.scenario.dry_run`); a live run checks each of their messages.
 
 Source: docs/your-own.md, mistakes.
 """
@@ -33,7 +33,7 @@ from evedrop.streams import Batch
 
 @final
 class Guard:
-    """Looks at what the classes of a scenario give back that are not built in; of any other scenario it does nothing."""
+    """Checks the results of a scenario's classes that are not built in; does nothing for a scenario without such classes."""
 
     def __init__(self, scenario: Scenario, scheme: Scheme, batch: Batch) -> None:
         self.active = foreign(scenario.model_dump(exclude_unset=True))
@@ -52,13 +52,13 @@ class Guard:
 
     @contextlib.contextmanager
     def asking(self, receiver: str, slots: range) -> Iterator[None]:
-        """Make an error in the block one that names the class, the slots and the trials; receiver: whose class it is."""
+        """Turn an error in the block into one that names the receiver's class, the slots and the trials."""
         with self._named(self._classes[receiver], slots):
             yield
 
     @contextlib.contextmanager
     def asking_link(self, receiver: str, slots: range) -> Iterator[None]:
-        """The same of the models of a receiver's link."""
+        """Like `asking`, for the models of a receiver's link."""
         models = f" ({', '.join(self._links[receiver])})" if self._links[receiver] else ""
         with self._named(f"{receiver}'s link{models}", slots):
             yield
@@ -77,29 +77,29 @@ class Guard:
             raise self._failed(what, slots, place_of(error)) from error
 
     def packet(self, k: int, packet: Any) -> None:
-        """Raise RunError unless this is a packet as the scheme must make them."""
+        """Raise RunError unless this is a valid packet of the scheme."""
         if self._own_scheme:
             self._look(LEGITIMATE, k, lambda: expect_packet(k, packet, self._scheme, self._problem))
 
     def belief(self, receiver: str, k: int, belief: Any) -> None:
-        """Raise RunError unless this is a belief as a receiver must have them."""
+        """Raise RunError unless this is a valid belief of a receiver."""
         if receiver in self._watched:
             self._look(receiver, k, lambda: expect_belief(f"slot {k}: Belief", belief, self._problem))
 
     def shared(self, k: int, nu: Any, chi: Any | None = None) -> None:
-        """Raise RunError unless these are ν_k and χ_k as the scheme must share them."""
+        """Raise RunError unless these are valid ν_k and χ_k of the scheme."""
         if self._own_scheme:
             self._look(LEGITIMATE, k, lambda: self._expect_shared(k, nu, chi))
 
     def acted(self, receiver: str, k: int, action: Any) -> None:
-        """Raise RunError unless this is what a receiver must say of a slot's γ."""
+        """Raise RunError unless this is a receiver's valid answer to a slot's γ."""
         if receiver in self._watched:
             self._look(
                 receiver, k, lambda: expect_array(f"slot {k}: act()", action, np.uint8, (self._batch.trials,), _EACH)
             )
 
     def fates(self, receiver: str, slots: range, fates: Fates) -> None:
-        """Raise RunError unless these are fates of the packets of some slots on a receiver's link."""
+        """Raise RunError unless these are valid fates of the packets of some slots on a receiver's link."""
         if not self._links[receiver]:
             return
         shape = (len(slots), self._batch.trials)
@@ -133,7 +133,7 @@ _EACH = "one for each of the R trials"
 
 
 def _models_of(course: LinkSchedule) -> Iterator[str]:
-    """The names of the models of a link, at first and after changes, that are not built in."""
+    """The names of a link's models that are not built in, at first and after changes."""
     for settings in (course.settings, *(change.settings or {} for change in course.changes)):
         yield from _names_in(settings)
 

@@ -1,4 +1,4 @@
-"""Monte Carlo: the trials of a live run in memory, the same bits without a network.
+"""Monte Carlo: simulates the trials of a live run in memory, to the same bits, without a network.
 
 Trials run in fixed blocks of 500 and are merged in trial order: the results are the same for any number of workers.
 """
@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -46,13 +46,13 @@ News = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Plan:
-    """How to simulate: what, and where."""
+    """How to simulate: the mode, and the workers."""
 
     mode: Mode = Mode.EXACT
     workers: int | None = None
-    """None: as many as pay on this machine."""
+    """None: chosen for this machine and the amount of work."""
     scheduler: str | None = None
-    """Address of a Dask scheduler, which then does the work."""
+    """Address of a Dask scheduler whose cluster then does the work."""
 
     def workers_for(self, scenario: Scenario) -> int:
         """The number of workers. Raises UsageError if it is not positive."""
@@ -65,10 +65,10 @@ class Plan:
 
 
 def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], plan: Plan = Plan()) -> int:
-    """Run all trials of a scenario into a results folder; the exit status. `tell` gets progress as it is made.
+    """Run all trials of a scenario into a results folder; returns the exit status. `tell` gets progress as it is made.
 
     Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
-    what is done in the folder.
+    the results so far in the folder.
     """
     check_mode(scenario, plan.mode)
     workers = plan.workers_for(scenario)
@@ -100,20 +100,20 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
                     writer.settle(merger.at, summary)
             if not merger.trials:
                 shutil.rmtree(held.now)
-                raise failure or Interrupted("interrupted before anything was done; nothing was kept")
+                raise failure or Interrupted("interrupted before any trials were done; nothing was kept")
             write_summary(held.now, summary)
             if held.now != folder:
                 tell({"event": "moved", "folder": str(held.now)})
     if failure is not None:
         raise failure
     if not merger.complete:
-        raise Interrupted("interrupted; what was done is in the results folder")
+        raise Interrupted("interrupted; the results so far are in the results folder")
     return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0
 
 
 @contextlib.contextmanager
 def disk_errors(folder: Path) -> Iterator[None]:
-    """Make a full disk, or whatever else keeps results from being written, an error that says so: RunError."""
+    """Turn a full disk, or any other OSError when writing results, into a RunError."""
     try:
         yield
     except OSError as error:
@@ -123,38 +123,38 @@ def disk_errors(folder: Path) -> Iterator[None]:
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
-    """Raise UsageError where a mode cannot follow the scenario: who reads packets, numbers that leave double precision."""
+    """Raise UsageError if a mode cannot simulate the scenario: a receiver reads packets, or numbers leave double precision."""
     if mode is Mode.EXACT:
         return
     if mode is Mode.ERROR_COORDINATES and scenario.plant is not None:
         raise UsageError(
-            f"--mode {mode.value} follows errors, not states, and the plant's inputs and disturbances depend on these; give "
-            "--mode exact, or covariance-only for what network and estimators believe of it"
+            f"--mode {mode.value} follows errors, not states, and the plant's inputs and disturbances depend on states; give "
+            "--mode exact, or covariance-only for the covariances alone"
         )
     _check_scheme(scenario, mode)
     for name in scenario.receivers:
         if scenario.timeline.outages[name] or scenario.window(name):
             raise UsageError(
-                f"{name} makes use of late packets or goes away, which the mode {mode.value} cannot follow; "
-                "leave --mode out, or take its window and its outages out of the scenario"
+                f"{name} uses late packets or goes away, which the mode {mode.value} cannot follow; "
+                "leave --mode out, or remove its window and its outages from the scenario"
             )
     for name, table in scenario.eavesdroppers.items():
         if not STRATEGIES[table.strategy].follows_gamma(table.parameters):
             raise UsageError(
-                f"--mode {mode.value} follows events, not packets, and what {name} does (strategy {table.strategy}) "
-                f"depends on more; give --mode exact, or take {name} out of the scenario"
+                f"--mode {mode.value} follows events, not packets, and the actions of {name} (strategy {table.strategy}) "
+                f"depend on more; give --mode exact, or remove {name} from the scenario"
             )
     for name, expected in expected_traces_of(scenario).items():
         beyond = np.flatnonzero(np.isinf(expected))
         if beyond.size:
             raise UsageError(
                 f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
-                f"give --slots {beyond[0]} or fewer, or take {name} out of the scenario"
+                f"give --slots {beyond[0]} or fewer, or remove {name} from the scenario"
             )
 
 
 def _check_scheme(scenario: Scenario, mode: Mode) -> None:
-    """Raise UsageError for schemes, and who takes their packets for states, whose events alone do not tell what happens."""
+    """Raise UsageError if events alone do not determine the errors of a scheme, or of a receiver that reads its packets."""
     name = scenario.encoding.scheme
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     reasons = {
@@ -171,15 +171,15 @@ def _check_scheme(scenario: Scenario, mode: Mode) -> None:
         follows = STRATEGIES[table.strategy].follows_gamma(table.parameters)
         if follows and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
             raise UsageError(
-                f"--mode {mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) uses what "
-                f"the scheme {name} has made of the state; give --mode exact, or take {receiver} out of the scenario"
+                f"--mode {mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) reads the "
+                f"packets of the scheme {name}; give --mode exact, or remove {receiver} from the scenario"
             )
 
 
 def results_of(
     tasks: list[Task], workers: int, client: Any, tell: Callable[[int], None], stopped: Callable[[], bool]
 ) -> Generator[BatchResult]:
-    """What the tasks came to, in their order: done on the cluster of a client, else by workers here."""
+    """Carry out the tasks on the cluster of a client, or by workers here; yields the results in task order."""
     if client is not None:
         yield from on_cluster(tasks, client, tell, stopped)
     elif workers == 1 or len(tasks) == 1:
@@ -189,7 +189,7 @@ def results_of(
 
 
 def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
-    """Progress in trial-slots, with their rate, a few times a second."""
+    """A function that takes counts of trial-slots and reports progress and rate a few times a second."""
     started = told = time.monotonic()
     done = 0
 
@@ -212,8 +212,9 @@ def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
     return take
 
 
+@final
 class Merger:
-    """Adds up results in trial order. Final."""
+    """Merges results in trial order."""
 
     def __init__(self, scenario: Scenario, mode: Mode) -> None:
         self._scenario = scenario
@@ -229,7 +230,7 @@ class Merger:
 
     @property
     def at(self) -> str:
-        """How far it came."""
+        """How far it has come, in words."""
         return f"{self.trials} of {self._scenario.trials} trials"
 
     @property
@@ -240,7 +241,7 @@ class Merger:
 
     @np.errstate(over="ignore")
     def add(self, result: BatchResult, writer: ResultsWriter | None = None) -> None:
-        """Take the next batch; its digests and recorded trials are written if there is somewhere to."""
+        """Add the next batch; writes its digests and recorded trials if there is a writer."""
         for block in result.blocks:
             self.trials += block.trials
             self._totals.append(block.totals)
@@ -270,7 +271,7 @@ class Merger:
 
     @np.errstate(over="ignore")
     def write(self, writer: ResultsWriter) -> None:
-        """Write the rows of all slots that some trial came to, in place of those that were written before."""
+        """Write the rows of all slots that any trial reached, replacing the rows written before."""
         writer.restart_slots()
         expected = expected_traces_of(self._scenario)
         for name in self._scenario.receivers:
@@ -282,12 +283,12 @@ class Merger:
 
     @property
     def totals(self) -> Totals:
-        """Of all that was added."""
+        """The totals of all added batches."""
         return Totals.merged(self._totals)
 
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> dict[str, Any]:
-        """The summary of all that was added; mode and events are told here."""
+        """The summary of all added batches; fills in mode and events."""
         totals = self.totals
         whole = self._whole and self.complete
         digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}

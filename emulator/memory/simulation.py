@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +44,11 @@ from evedrop.score.slots import ReceiverSlots, Slots
 from evedrop.score.sums import squared_errors
 from evedrop.streams import Batch
 
-_CHUNK_NUMBERS = 64  # slots of a chunk times states: with 2000 trials side by side, a megabyte an array
+_CHUNK_NUMBERS = 64  # slots of a chunk times states: with 2000 trials side by side, a megabyte for each array
 
 
 class Mode(StrEnum):
-    """What is simulated."""
+    """The quantities to simulate."""
 
     EXACT = "exact"
     ERROR_COORDINATES = "error-coordinates"
@@ -59,35 +60,36 @@ class ReceiverChunk:
     """One receiver over c slots of R trials."""
 
     error: Floats
-    """By the mode, (c, R)."""
+    """The error of the mode, (c, R)."""
     trace: Floats
     """Believed tr P, (c, R)."""
     action: Codes
     """(c, R)."""
     fates: Fates
-    """Of the packets sent in these slots, (c, R)."""
+    """Fates of the packets sent in these slots, (c, R)."""
     late: NDArray[np.uint16] | None = None
-    """Packets of earlier slots that arrived, and that were used, (2, c, R); None of who can use none."""
+    """Counts of late packets that arrived, and that were used, (2, c, R); None if the receiver cannot use late packets."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some slots, measured; its arrays are overwritten when the next one is made."""
+    """The measurements of some slots; the arrays are overwritten when the next chunk is made."""
 
     first: int
     receivers: Mapping[str, ReceiverChunk]
     recorded: Slots | None
     """The recorded trials in full; exact mode only."""
     alarms: Flags | None = None
-    """Where the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch."""
+    """Where the sensor raised an alarm that its acknowledgements are attacked, (c, R); None if it does not watch them."""
     acted: Acted | None = None
-    """Of a closed loop, in exact mode."""
+    """The closed loop's actions, in exact mode."""
     true_errors: Mapping[str, Floats] | None = None
-    """Of a sensor that filters: squared errors against the true state, of `sensor` and of receivers, (c, R)."""
+    """If the sensor filters: squared errors against the true state, of `sensor` and of receivers, (c, R)."""
 
 
+@final
 class Simulation:
-    """The trials of a range, all slots, of which the first `recorded` in full. Final; `chunks` may be read once."""
+    """Simulates all slots of a range of trials, the first `recorded` of them in full; `chunks` can be read only once."""
 
     def __init__(self, scenario: Scenario, trials: range, recorded: int = 0, mode: Mode = Mode.EXACT) -> None:
         self._scenario = scenario
@@ -113,7 +115,7 @@ class Simulation:
             for name, table in scenario.eavesdroppers.items()
         }
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.digested}
-        """Receiver, or controller → block number → digests, (R, 32); filled by the exact mode alone."""
+        """Receiver, or controller → block number → digests, (R, 32); filled in exact mode only."""
         self.solve_times = SolveTimes()
 
     def _eavesdropper(self, name: str) -> Receiver:
@@ -123,7 +125,7 @@ class Simulation:
         return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:
-        """All slots, some tens or hundreds at a time."""
+        """Simulate all slots, some tens or hundreds at a time."""
         slots = self._batch.slots
         names = self._scenario.receivers
         courses = {name: self._scenario.course(name) for name in names}
@@ -133,7 +135,7 @@ class Simulation:
             Mode.ERROR_COORDINATES: self._error_coordinates,
             Mode.COVARIANCE_ONLY: self._covariances,
         }[self._mode]()
-        # The same for any number of trials, so that sums over slots are formed in the same order.
+        # The same length for any number of trials, so that sums over slots are formed in the same order.
         length = max(1, min(slots, _CHUNK_NUMBERS // self._process.n))
         bounds = sorted({slots, *(start for name in names for start in block_starts(slots, self._scenario.cuts(name)))})
         for block, end in pairwise(bounds):
@@ -243,7 +245,7 @@ class Simulation:
     def _error_coordinates(self) -> Callable[[range, Mapping[str, Fates]], Chunk]:
         n, trials = self._process.n, self._batch.trials
         noise = ProcessNoise(self._process, self._keys.process, self._batch, self._initial)
-        # A state that nobody takes an innovation for is never needed, however large it grows.
+        # The state, which may grow beyond precision, is needed only if a receiver may take an innovation for a state.
         misleads = bool(self._misled())
         trajectory = Trajectory(self._process, self._keys.process, self._batch, self._initial) if misleads else None
         errors = {name: np.zeros((n, trials)) for name in self._receivers}
@@ -277,7 +279,7 @@ class Simulation:
         f = misled_covariances(self._process, self._batch.slots if misled else 0)
         trials, count = self._batch.trials, len(self._receivers)
         priors = {name: receiver.prior().P for name, receiver in self._receivers.items()}
-        # All receivers' beliefs side by side along the axis of trials: half of the time is what a call of numpy costs.
+        # All receivers' beliefs side by side along the axis of trials: half of the time is the overhead of numpy calls.
         places = {name: slice(i * trials, (i + 1) * trials) for i, name in enumerate(self._receivers)}
         believed = np.concatenate(list(priors.values()), axis=2)
         actual = {name: priors[name] for name in misled}
@@ -306,7 +308,7 @@ class Simulation:
         return play
 
     def _packet(self, encoder: Encoder, k: int, x: Floats, predicted: Floats) -> Packet:
-        """The packet of slot k."""
+        """Make the packet of slot k."""
         with self._guard.asking(LEGITIMATE, range(k, k + 1)):
             packet = encoder.encode(k, x, predicted)
         self._guard.packet(k, packet)
@@ -359,7 +361,7 @@ class Simulation:
     def _acts(
         self, k: int, row: int, measured: Mapping[str, ReceiverChunk], delivered: Mapping[str, Flags]
     ) -> Iterator[tuple[str, Codes, ReceiverChunk]]:
-        """Every receiver's action in slot k, which is one row of delivered (c, R)."""
+        """Every receiver's action in slot k, from one row of `delivered` (c, R)."""
         for name, one in measured.items():
             action = self._act(name, self._receivers[name], k, delivered[name][row])
             one.action[row] = action

@@ -1,7 +1,7 @@
-"""Batches of trials as tasks: what a worker is told, what it does, what it gives back.
+"""Batches of trials as tasks for workers, their execution, and their results.
 
-Sums are kept for fixed blocks of 500 trials, however many a worker simulates side by side, so results do not depend on
-how the work was spread.
+Sums are kept for fixed blocks of 500 trials, however many trials a worker simulates side by side, so results do not depend
+on the distribution of the work.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from evedrop.score.sums import SlotSums, slot_sums
 from evedrop.score.totals import Totals
 
 BLOCK_TRIALS = 500
-_SIDE_BY_SIDE = 4  # blocks: what a call of numpy costs is spread over more trials, and the state still fits the cache
+_SIDE_BY_SIDE = 4  # blocks: spreads the overhead of numpy calls over more trials, and the state still fits the cache
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Task:
     """Some consecutive blocks of trials of a scenario."""
 
     scenario: dict[str, Any]
-    """As `Scenario.model_dump` gives it."""
+    """The scenario, from `Scenario.model_dump`."""
     mode: Mode
     start: int
     stop: int
@@ -41,7 +41,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TrialBlock:
-    """What one block of trials came to: everything by receiver."""
+    """The results of one block of trials, by receiver."""
 
     start: int
     trials: int
@@ -53,7 +53,7 @@ class TrialBlock:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """What a task came to."""
+    """The results of a task."""
 
     start: int
     blocks: list[TrialBlock]
@@ -64,7 +64,7 @@ class BatchResult:
 
 
 def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
-    """The work, in trial order, in parts as equal as they can be and as many for each worker, so that all end together."""
+    """Split the trials, in order, into parts of nearly equal size, the same number for each worker."""
     blocks = -(-scenario.trials // BLOCK_TRIALS)
     rounds = -(-blocks // (workers * _SIDE_BY_SIDE))
     count = min(blocks, rounds * workers)
@@ -75,7 +75,7 @@ def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
 
 
 def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:
-    """Simulate a task. `tell` gets the trial-slots done since it was last called; it ends early once `stopped`."""
+    """Simulate a task. `tell` gets the trial-slots done since its last call; the simulation ends early once `stopped`."""
     scenario = Scenario.model_validate(task.scenario)
     names, slots = scenario.receivers, scenario.slots
     trials = range(task.start, task.stop)
@@ -97,7 +97,7 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
         tell(len(trials) * _count(chunk))
         if stopped():
             break
-    # All trials of the task were side by side, so that one decision was of all of them.
+    # All trials of the task were simulated side by side, so each decision was for all of them.
     result.blocks[0].totals.solve_times.merge(simulation.solve_times)
     for block in result.blocks:
         rows = slice(block.start - task.start, block.start - task.start + block.trials)
@@ -122,7 +122,7 @@ def _empty_block(scenario: Scenario, task: Task, start: int) -> TrialBlock:
 
 @np.errstate(over="ignore")
 def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None:
-    """Take a chunk. The square of a naive receiver's error may leave double precision; then it is inf, as it should."""
+    """Add a chunk. The square of a naive receiver's error may leave double precision; then it is inf, as it should be."""
     for name, measured in chunk.receivers.items():
         for block, part in _parts(result.blocks, result.start, measured):
             if measured.error is measured.trace:
@@ -144,7 +144,7 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
 
 
 def _add_plant(result: BatchResult, chunk: Chunk) -> None:
-    """Take what a chunk says of alarms, and of a plant's controller and filter."""
+    """Add a chunk's alarms, and the measurements of a plant's controller and filter."""
     for block in result.blocks:
         totals = block.totals
         rows = slice(block.start - result.start, block.start - result.start + block.trials)
@@ -157,7 +157,7 @@ def _add_plant(result: BatchResult, chunk: Chunk) -> None:
 
 
 def _parts(blocks: list[TrialBlock], start: int, measured: ReceiverChunk) -> Iterator[tuple[TrialBlock, ReceiverChunk]]:
-    """What was measured, block by block."""
+    """Split the measurements into those of each block."""
     for block in blocks:
         rows = slice(block.start - start, block.start - start + block.trials)
         yield (

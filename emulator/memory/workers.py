@@ -1,6 +1,6 @@
-"""Carries tasks out: here, in worker processes on this machine, or on a Dask cluster. Results come in task order.
+"""Carries out tasks: in this process, in worker processes on this machine, or on a Dask cluster. Results come in task order.
 
-A worker process has a pipe of its own and shares no lock with anybody, so that killing one cannot hang the others.
+A worker process has a pipe of its own and shares no lock with other processes, so that killing one cannot hang the others.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
-from typing import Any
+from typing import Any, final
 
 from evedrop.environment import own_environment
 from evedrop.errors import EvedropError, RunError, UsageError
@@ -24,7 +24,7 @@ from evedrop.model.registry import place_of
 from evedrop.scenario.dry_run import foreign
 
 _LOOK_SECONDS = 0.1
-_LAST_SECONDS = 10.0  # after a stop, for the chunk of slots that is under way
+_LAST_SECONDS = 10.0  # after a stop, for the current chunk of slots
 _REACH_SECONDS = 5.0
 
 Tell = Callable[[int], None]
@@ -32,7 +32,7 @@ Stopped = Callable[[], bool]
 
 
 def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
-    """One after the other, here."""
+    """Carry out the tasks in this process, one after the other."""
     for task in tasks:
         if stopped():
             return
@@ -41,7 +41,7 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
         except EvedropError:
             raise
         except Exception as error:
-            # An error of ours shows where it comes from; one of somebody's class says what that is.
+            # A bug of this program keeps its traceback; an error in a class of the user's own names the class.
             if isinstance(error, OSError) or not foreign(task.scenario):
                 raise
             raise RunError(
@@ -52,7 +52,7 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
 
 
 def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
-    """By worker processes of our own. Raises RunError if one dies."""
+    """Carry out the tasks in worker processes. Raises RunError if one dies."""
     crew = [_Worker() for _ in range(workers)]
     try:
         yield from _in_order(_results(tasks, crew, tell, stopped))
@@ -61,17 +61,18 @@ def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) 
             worker.end()
 
 
+@final
 class _Worker:
-    """A worker process and this end of its pipe. Final."""
+    """A worker process, and this process's end of its pipe."""
 
     def __init__(self) -> None:
         self.pipe, theirs = Pipe()
         self.number: int | None = None
-        """Of the task under way."""
-        # A session of its own, so that a Ctrl-C in the terminal does not reach it. And not multiprocessing's own kind of
-        # process, which would run the caller's script a second time.
+        """Number of the current task."""
+        # A session of its own, so that a Ctrl-C in the terminal does not reach it. And not a multiprocessing.Process, which
+        # would run the caller's script a second time.
         command = f"from evedrop.memory.workers import work; work({theirs.fileno()})"
-        # Until it can answer to it, our own stop waits: the mask is inherited.
+        # Signals are blocked until the worker can handle them: it inherits the mask.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
         try:
             self.process = subprocess.Popen(
@@ -90,11 +91,11 @@ class _Worker:
 
     def give(self, number: int, task: Task) -> None:
         self.number = number
-        with contextlib.suppress(OSError):  # it died; the next look at its pipe says so
+        with contextlib.suppress(OSError):  # the worker died; the next read of its pipe reports it
             self.pipe.send(task)
 
     def stop(self) -> None:
-        """Ask for what is done of the task under way."""
+        """Ask for the results so far of the current task."""
         self.process.terminate()
 
     def end(self) -> None:
@@ -104,7 +105,7 @@ class _Worker:
 
 
 def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stopped) -> Iterator[tuple[int, BatchResult]]:
-    """The results as they come, with their numbers; after a stop, what is done of the tasks under way."""
+    """The results as they come, with their numbers; after a stop, the partial results of the current tasks."""
     waiting = iter(enumerate(tasks))
     for worker, (number, task) in zip(crew, waiting, strict=False):
         worker.give(number, task)
@@ -117,7 +118,7 @@ def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stoppe
         if deadline is not None and time.monotonic() > deadline:
             return
         for pipe in connection.wait(list(busy), _LOOK_SECONDS):
-            worker = busy[pipe]  # type: ignore[index]  # of the kinds of things to wait for, these are pipes
+            worker = busy[pipe]  # type: ignore[index]  # `wait` takes other kinds of objects, but these are pipes
             news = _received(worker)
             if isinstance(news, int):
                 tell(news)
@@ -144,7 +145,7 @@ def _received(worker: _Worker) -> int | str | BatchResult:
 
 
 def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResult]:
-    """Results in the order of their numbers; what lies beyond one that never came is left out."""
+    """Results in the order of their numbers; those after a missing one are left out."""
     held: dict[int, BatchResult] = {}
     due = 0
     for number, result in results:
@@ -155,10 +156,13 @@ def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResul
 
 
 def work(descriptor: int) -> None:
-    """A worker's life: tasks from its pipe until it is ended, or whoever started it is gone."""
+    """Run a worker: carry out tasks from its pipe until it is ended, or the starting process is gone."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    for number in (signal.SIGINT, signal.SIGHUP):  # these reach whoever started us too, who says when to stop
+    for number in (
+        signal.SIGINT,
+        signal.SIGHUP,
+    ):  # these reach the starting process, too, which tells the workers to stop
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     with contextlib.suppress(EOFError, OSError), Connection(descriptor) as pipe:
@@ -186,7 +190,7 @@ def connected(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         yield None
         return
-    import asyncio  # noqa: PLC0415 - a tenth of what a worker imports, and none needs it
+    import asyncio  # noqa: PLC0415 - a tenth of a worker's import time, and no worker needs it
 
     try:
         from distributed import Client  # noqa: PLC0415 - an optional extra
@@ -194,7 +198,7 @@ def connected(scheduler: str | None) -> Iterator[Any]:
     except ImportError as error:
         raise UsageError("--scheduler needs Dask: pip install 'evedrop[cluster]'") from error
 
-    async def reach() -> None:  # a client that finds nobody may hang, and prints what nobody wants to read
+    async def reach() -> None:  # a client without a scheduler may hang, and prints useless messages
         reached = connect(scheduler, timeout=_REACH_SECONDS)  # type: ignore[no-untyped-call]
         comm = await asyncio.wait_for(reached, _REACH_SECONDS)
         await comm.close()
@@ -212,9 +216,9 @@ def connected(scheduler: str | None) -> Iterator[Any]:
 
 
 def on_cluster(tasks: list[Task], client: Any, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
-    """By the workers of a Dask cluster, which must have this version of evedrop installed.
+    """Carry out the tasks by the workers of a Dask cluster, which must have this version of evedrop installed.
 
-    Raises RunError if one fails or the cluster is gone. After a stop, what is under way there is given up.
+    Raises RunError if a worker fails or the cluster is gone. After a stop, the current tasks are cancelled.
     """
     futures = [client.submit(_on_worker, task, pure=False) for task in tasks]
     try:
@@ -237,7 +241,7 @@ def _result(future: Any) -> BatchResult:
     except Exception as error:
         raise RunError(
             f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "
-            "every worker needs this version of evedrop installed, and its log says more"
+            "install this version of evedrop on every worker, and look at the worker's log"
         ) from error
     return result
 

@@ -1,7 +1,7 @@
-"""Every scheme against every adversary, on one process and its links: what each keeps secret, and what it needs for it.
+"""Compares every scheme against every adversary, on one process and its links: the secrecy of each scheme, and its cost.
 
-Each scheme is a Monte Carlo study of its own, and one more for every attack on acknowledgements; all of them have the same
-trials, and an adversary meets the same losses in each.
+Each scheme is a Monte Carlo study of its own, with another for every attack on acknowledgements; all of them have the same
+trials, and an adversary has the same losses in each.
 
 Source: docs/compare.md.
 """
@@ -42,8 +42,11 @@ from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.signals import stop_on_signals
 from evedrop.studies.matchups import Group, Match, Matchups
 
-_WRITE_SECONDS, _WRITE_SHARE = 3.0, 50.0  # from one compare.json to the next, and as a multiple of what one takes
-_ALIKE = 1e-6  # share by which two errors of theory may differ and be called equal: rounding, and no more
+_WRITE_SECONDS, _WRITE_SHARE = (
+    3.0,
+    50.0,
+)  # from one compare.json to the next, and as a multiple of the time to write one
+_ALIKE = 1e-6  # relative difference of two errors of theory that count as equal: allows for rounding only
 
 
 @dataclass(frozen=True)
@@ -51,23 +54,23 @@ class Theory:
     """The trace of a receiver's expected error covariance."""
 
     mean: float
-    """Over the slots of the run."""
+    """Mean over the slots of the run."""
     last: float
     """In the last slot of the run."""
     limit: float | None
-    """For ever; inf if it is unbounded; None where a bound is known for the run alone."""
+    """In the long run; inf if it is unbounded; None if a bound is known only for the run."""
     bound: bool
-    """Whether all this is only what its error cannot fall below."""
+    """Whether these are only lower bounds of its error."""
 
 
 @dataclass(frozen=True)
 class SimulatedError:
-    """A receiver's squared error in simulation, over all slots; theory beside it."""
+    """A receiver's squared error in simulation, over all slots, with the theory for it."""
 
     mean: float
-    """Over trials."""
+    """Mean over trials."""
     standard_error: float | None
-    """Of the mean; None of one trial, and where the variance is infinite, so that it would mean nothing."""
+    """Standard error of the mean; None for one trial, and if the variance is infinite, so that it would mean nothing."""
     quantiles: Mapping[str, float]
     """Level → quantile over trials of a trial's mean error."""
     infinite_variance: bool
@@ -75,7 +78,7 @@ class SimulatedError:
 
     @property
     def typical(self) -> float:
-        """The figure to compare by: the mean over trials, or where that is no measure the median."""
+        """The figure to compare by: the mean over trials, or the median if the variance is infinite."""
         return self.quantiles["0.5"] if self.infinite_variance else self.mean
 
 
@@ -85,18 +88,18 @@ class Cell:
 
     match: Match
     legitimate: SimulatedError | None = None
-    """The user, meanwhile: an attack may concern it too."""
+    """The legitimate estimator in the same simulation: an attack may affect it, too."""
     eavesdropper: SimulatedError | None = None
     secrecy: Secrecy | None = None
 
     @property
     def betrayed(self) -> bool:
-        """Whether it is told a true state by somebody, against which no scheme can do anything."""
+        """Whether the adversary learns a true state, against which no scheme can protect."""
         return self.match.strategy == "replay-informed"
 
     @property
     def ratio(self) -> float | None:
-        """Eavesdropper's over legitimate error; medians where either mean is no measure. None of a pair not defined."""
+        """Eavesdropper's over legitimate error; of medians if either variance is infinite. None if the pair is not defined."""
         if self.legitimate is None or self.eavesdropper is None:
             return None
         one, two = self.legitimate, self.eavesdropper
@@ -106,7 +109,7 @@ class Cell:
 
     @property
     def verdict(self) -> SecrecyKept | None:
-        """What the run shows; that an error is unbounded, or that two are equal, is for theory to say as well."""
+        """The verdict of the run; theory also decides whether an error is unbounded, and whether two are equal."""
         secrecy, other, user = self.secrecy, self.eavesdropper, self.legitimate
         if secrecy is None or other is None or user is None:
             return None
@@ -121,7 +124,7 @@ class Cell:
         return SecrecyKept.BROKEN if denied else SecrecyKept.UNDECIDED
 
     def as_dict(self) -> dict[str, Any]:
-        """As in compare.json."""
+        """The cell in the form of compare.json."""
         verdict = self.verdict
         if verdict is None or self.secrecy is None or self.legitimate is None or self.eavesdropper is None:
             return {"not_defined": self.match.not_defined}
@@ -138,52 +141,52 @@ class Cell:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a scheme costs."""
+    """The cost of a scheme."""
 
     acknowledgements: bool
     payload_bits: int
-    """Of a packet, as on the wire: float64 numbers."""
+    """Bits of a packet's payload on the wire: float64 numbers."""
     header_bits: int
-    """The same: int64 numbers."""
+    """Bits of a packet's header on the wire: int64 numbers."""
     sent_fraction: float
-    """Of slots, as measured without an attack."""
+    """Fraction of slots with a packet, measured without an attack."""
     secret_bits_per_slot: int
-    """Of the streams that both sides draw, at most."""
+    """The most bits in a slot from the streams that both sides draw."""
     initial_secret_bits: int
-    """A trial's, once."""
+    """Bits that a trial uses once."""
 
     @property
     def packet_bits(self) -> int:
-        """Payload and header."""
+        """Bits of payload and header."""
         return self.payload_bits + self.header_bits
 
 
 @dataclass(frozen=True)
 class SchemeResult:
-    """One scheme against everybody."""
+    """One scheme against all adversaries."""
 
     name: str
     parameters: Mapping[str, Any]
     needs: Needs
     legitimate: SimulatedError
-    """The user, with nobody meddling."""
+    """The legitimate estimator without an attack."""
     cells: Mapping[str, Cell]
-    """By adversary, all of them."""
+    """Adversary → its cell, for all adversaries."""
 
     @property
     def closest(self) -> Cell | None:
-        """The adversary with the least error, whom nobody has betrayed anything; None if none was played."""
+        """The adversary with the least error, except those that learn a true state; None if there is none."""
         played = [cell for cell in self.cells.values() if cell.eavesdropper is not None and not cell.betrayed]
         return min(played, key=lambda cell: _error(cell.eavesdropper), default=None)
 
     @property
     def kept(self) -> float:
-        """The least error of such an adversary, which is what the scheme keeps; theory, where it is known."""
+        """The error of the closest adversary, by theory if it is known."""
         return math.nan if self.closest is None else _error(self.closest.eavesdropper)
 
     @property
     def price(self) -> float:
-        """The largest error of the user, whoever meddles: of theory for ever, where it is known."""
+        """The largest error of the legitimate estimator under any attack: the limit of theory, if it is known."""
         users = [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
         return max(_lasting(one) for one in users)
 
@@ -194,7 +197,7 @@ def _limit(of: SimulatedError) -> float:
 
 
 def _error(of: SimulatedError | None) -> float:
-    assert of is not None  # noqa: S101 - asked by the caller
+    assert of is not None  # noqa: S101 - the caller has checked it
     return of.typical if of.theory is None or of.theory.bound else of.theory.mean
 
 
@@ -205,7 +208,7 @@ def _lasting(of: SimulatedError) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `evedrop compare` finds; `table` is a row a pair, for pandas or polars."""
+    """The result of `evedrop compare`; `table` has a row for each pair, for pandas or polars."""
 
     title: str
     slots: int
@@ -217,7 +220,7 @@ class Comparison:
 
     @property
     def dominant(self) -> tuple[str, ...]:
-        """Schemes that no other outdoes: none costs the user less, and with none is the best adversary further off."""
+        """Schemes that no other beats: none has a smaller legitimate error, or a larger error of the closest adversary."""
         known = [one for one in self.schemes.values() if not math.isnan(one.kept)]
         return tuple(
             one.name
@@ -228,11 +231,11 @@ class Comparison:
         )
 
     def cell(self, scheme: str, adversary: str) -> Cell:
-        """One pair."""
+        """The cell of one pair."""
         return self.schemes[scheme].cells[adversary]
 
     def as_dict(self) -> dict[str, Any]:
-        """As in compare.json, but for infinite numbers."""
+        """The comparison in the form of compare.json, except for infinite numbers."""
         return {
             "scenario": self.title,
             "slots": self.slots,
@@ -285,10 +288,10 @@ def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
 
 
 def compare_all(matchups: Matchups, folder: Path, tell: Callable[[News], None], plan: Plan) -> Comparison:
-    """Play all matches, into a results folder: compare.json, compare.png and .pdf, and the scenarios that were played.
+    """Simulate all matches into a results folder: compare.json, compare.png and .pdf, and the simulated scenarios.
 
-    Raises UsageError for an unusable folder or plan; Interrupted on Ctrl-C and RunError if a worker fails, with the schemes
-    that were done in the folder.
+    Raises UsageError for an unusable folder or plan; Interrupted on Ctrl-C and RunError if a worker fails, with the completed
+    schemes in the folder.
     """
     groups = matchups.groups
     workers = max(plan.workers_for(group.scenario) for group in groups)
@@ -337,7 +340,7 @@ def _merged(group: Group, plan: Plan, results: Iterator[BatchResult]) -> Merger:
 
 
 def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> Comparison:
-    """Of the schemes all of whose matches were played."""
+    """The comparison of the schemes whose matches are all done."""
     some = matchups.groups[0].scenario
     wanted = [group.scheme for group in matchups.groups]
     done = [group.scheme for group, _ in played]
@@ -397,7 +400,7 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
 
 
 def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory | None:
-    """What theory knows of a receiver: its error, or what nobody of its kind can do better than."""
+    """The theory of a receiver: its error, or a lower bound for receivers of its kind; None if neither is known."""
     known = expected if expected.known else expected.bound
     if known is not None:
         traces = known.traces(scenario.slots)
@@ -424,7 +427,7 @@ def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger
 
 
 def _write_found(folder: Path, found: Comparison) -> None:
-    """Write compare.json of the schemes so far, if there is one, whole at any moment."""
+    """Write compare.json with the schemes so far, if there are any; replaces the file atomically."""
     if found.schemes:
         unfinished = folder / "compare.json.new"
         write_private(unfinished, found.as_json() + "\n")

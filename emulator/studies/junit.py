@@ -1,4 +1,4 @@
-"""The results of tests as JUnit XML, which every CI server reads.
+"""Writes the results of tests as JUnit XML, which every CI server reads.
 
 Source: docs/testing.md.
 """
@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 from evedrop.errors import UsageError
 from evedrop.studies.scenario_tests import Finding, Outcome
 
-_NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # no XML can hold it, escaped or not
+_NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # not allowed in XML, escaped or not
 
 
 def write_junit(path: Path, tested: Sequence[Finding], started: float) -> None:
@@ -27,7 +27,7 @@ def write_junit(path: Path, tested: Sequence[Finding], started: float) -> None:
 
 
 def junit_of(tested: Sequence[Finding], started: float) -> bytes:
-    """The report: one test suite, a test case a scenario. An expectation that failed is a failure, all else an error."""
+    """The report: one test suite, with a test case for each scenario. A failed expectation is a failure, all else an error."""
     failures = sum(one.outcome is Outcome.FAILED for one in tested)
     errors = sum(one.outcome in {Outcome.MISTAKES, Outcome.BROKEN} for one in tested)
     counts = {

@@ -1,7 +1,7 @@
-"""Who meets whom in a comparison: of one scenario, a scenario for every scheme, and one more for each attack on it.
+"""The matches of a comparison: from one scenario, a scenario for every scheme, and one for each attack on the scheme.
 
-An adversary is a strategy, under that name, or one that also meddles with acknowledgements and reads as the best reader
-of the scheme does.
+An adversary is either a strategy, by its name, or an attack on the acknowledgements combined with the best strategy against
+the scheme.
 
 Source: docs/compare.md.
 """
@@ -34,36 +34,36 @@ Tables = dict[str, Any]
 
 @dataclass(frozen=True)
 class Match:
-    """An adversary against a scheme: who it is in the scenario of its group, or why there is nothing to play."""
+    """An adversary against a scheme: its strategy in the scenario of its group, or the reason why it is not defined."""
 
     scheme: str
     adversary: str
     strategy: str | None = None
-    """How it reads; None if it is not defined."""
+    """Its strategy; None if the match is not defined."""
     attack: str = "none"
     not_defined: str | None = None
 
     @property
     def receiver(self) -> str:
-        """Its name in the scenario: that of its strategy, so that it meets the same losses whatever else it does."""
+        """Its name in the scenario: that of its strategy, so that it has the same losses under any attack."""
         return receiver_name(str(self.strategy))
 
 
 @dataclass(frozen=True)
 class Group:
-    """Matches that one simulation plays: a scheme, under one attack or none."""
+    """The matches of one simulation: one scheme, under one attack or none."""
 
     scenario: Scenario
     matches: tuple[Match, ...]
 
     @property
     def scheme(self) -> str:
-        """Of all its matches."""
+        """The scheme of all its matches."""
         return self.scenario.encoding.scheme
 
     @property
     def name(self) -> str:
-        """Of its scenario's file."""
+        """Name of its scenario's file."""
         attacker = next((match.adversary for match in self.matches if match.attack != "none"), None)
         scheme = self.scheme.replace(":", ".")
         return scheme if attacker is None else f"{scheme}-{attacker}"
@@ -71,12 +71,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Matchups:
-    """Everything a comparison plays, and what it cannot."""
+    """All matches of a comparison, and those that are not defined."""
 
     schemes: tuple[str, ...]
     adversaries: tuple[str, ...]
     groups: tuple[Group, ...]
-    """By scheme; of each scheme the one without an attack first."""
+    """In order of schemes; for each scheme, the group without an attack comes first."""
     undefined: tuple[Match, ...]
 
 
@@ -86,7 +86,7 @@ def receiver_name(strategy: str) -> str:
 
 
 def adversaries_of() -> tuple[str, ...]:
-    """All that can be named."""
+    """The names of all adversaries."""
     return (*STRATEGIES, *ATTACKERS)
 
 
@@ -96,9 +96,9 @@ def matchups_of(
     adversaries: Sequence[str] | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Matchups:
-    """Of schemes and adversaries by name, all of them unless said; parameters: SCHEME.PARAMETER → value.
+    """The matches of schemes and adversaries, by name; by default all of them. parameters: SCHEME.PARAMETER → value.
 
-    Raises UsageError with every name that is none, ScenarioError where a scheme cannot be on this process and these links.
+    Raises UsageError with every unknown name, ScenarioError if a scheme cannot be used with this process and these links.
     """
     chosen = _chosen(schemes, adversaries, parameters or {})
     groups: list[Group] = []
@@ -143,7 +143,7 @@ def _chosen(
         scheme, _, name = key.rpartition(".")
         if scheme not in chosen[0] or name not in getattr(SCHEMES.get(scheme), "parameters", ()):
             parts = [f"{one}.{entry}" for one in chosen[0] if one in SCHEMES for entry in SCHEMES[one].parameters]
-            found.append(f"{key} is no parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
+            found.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
     if found:
         raise UsageError("\n  ".join(["nothing was compared:", *found]))
     return chosen[0], chosen[1]
@@ -159,14 +159,14 @@ def _strange(what: str, names: Iterable[str], known: Sequence[str], registry: Re
             _ = registry[name]
         except NotRegistered as error:
             why = error.why or f"; expected {listed(known)}{near(name, known)}"
-            found.append(f"{name or 'nothing'} is not the name of a class for a {what}{why}")
+            found.append(f"{name or 'nothing'} is not {'an' if what == 'adversary' else 'a'} {what}{why}")
     return found
 
 
 def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
     attack = ATTACKERS.get(adversary, "none")
     if attack != "none" and not SCHEMES[scheme].needs_acknowledgements:
-        return Match(scheme, adversary, not_defined="there are no acknowledgements to meddle with")
+        return Match(scheme, adversary, not_defined="there are no acknowledgements to attack")
     strategy = adversary if attack == "none" else SCHEMES[scheme].best_reader
     where, why = STRATEGIES[strategy].only_against or (scheme, "")
     if scheme != where:
@@ -175,12 +175,12 @@ def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
     parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}
     lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
     if lacking:
-        return Match(scheme, adversary, not_defined=f"is told the {listed(lacking)}, and there is none")
+        return Match(scheme, adversary, not_defined=f"knows the {listed(lacking)}, and there is none")
     return Match(scheme, adversary, strategy, attack)
 
 
 def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) -> Tables:
-    """The scenario's own parameters as far as the scheme has them, else the examples of docs/scenario.md."""
+    """The scheme's parameters: given ones, else the scenario's own, else the examples of docs/scenario.md."""
     own = scenario.encoding.parameters
     given = {name: parameters.get(f"{scheme}.{name}") for name in SCHEMES[scheme].parameters}
     examples = SCHEMES[scheme].parameters
@@ -206,7 +206,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
         "expect": [],
         "record_trials": 1,
     }
-    tables[LEGITIMATE]["link"].pop("correlation", None)  # to an eavesdropper, who may not be there
+    tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
     way_back = tables.pop("acknowledgements", _WAY_BACK)
     if SCHEMES[scheme].needs_acknowledgements:
         way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer")}
@@ -232,7 +232,7 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
     else:
         made.setdefault("link", link)
     if "reads_as" in kind.parameters:
-        # As each scheme is read best, whatever the scenario's own scheme is: what it says would mean nothing for most.
+        # The best strategy against this scheme: the scenario's own choice is for the scenario's own scheme.
         made = {
             name: value
             for name, value in made.items()
@@ -245,7 +245,7 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
 
 
 def _alone(table: Tables) -> Tables:
-    """Without a tie to the losses of another eavesdropper, who may not be there."""
+    """Remove a correlation with the losses of another eavesdropper, which may not be in this scenario."""
     link = table.get("link", {})
     if link.get("correlation", {}).get("with", LEGITIMATE) == LEGITIMATE:
         return table

@@ -1,4 +1,4 @@
-"""Scenarios as tests, several at a time: each in a process of its own, which ends with whoever started it."""
+"""Scenarios as tests, several at a time: each in a process of its own, which ends with the starting process."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import final
 
 from evedrop.errors import Interrupted
 from evedrop.live.network.launcher_watch import when_launcher_is_gone
@@ -22,12 +23,12 @@ _WORK = "from evedrop.studies.scenario_test_jobs import work; work()"
 
 
 def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Finding]:
-    """What became of each scenario, in their order. Raises Interrupted on Ctrl-C; no process is left then."""
+    """Carry out the scenarios as tests; yields the results in order. Raises Interrupted on Ctrl-C; then no process is left."""
     if jobs == 1:
         with stop_on_signals() as stop:
             for scenario in scenarios:
                 if stop.is_set():
-                    raise Interrupted("interrupted; what was measured is in the results folders")
+                    raise Interrupted("interrupted; the results so far are in the results folders")
                 yield carry_out(scenario, manner)
         return
     crew = _Crew(replace(manner, workers=1))
@@ -37,14 +38,15 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
             for one in waiting:
                 while not wait([one], _LOOK_SECONDS).done:
                     if stop.is_set():
-                        raise Interrupted("interrupted; what was measured is in the results folders")
+                        raise Interrupted("interrupted; the results so far are in the results folders")
                 yield one.result()
         finally:
             crew.end(waiting)
 
 
+@final
 class _Crew:
-    """The processes under way. Final."""
+    """The running processes."""
 
     def __init__(self, manner: Manner) -> None:
         self._manner = manner
@@ -52,11 +54,11 @@ class _Crew:
         self._over = False
 
     def carry_out(self, scenario: str) -> Finding:
-        """One scenario, by a process that a Ctrl-C in the terminal does not reach: we pass it on."""
+        """Carry out one scenario in a process that a Ctrl-C in the terminal does not reach: this process passes it on."""
         task = json.dumps([scenario, asdict(self._manner)], default=str)
         process = subprocess.Popen(
             [sys.executable, "-P", "-c", _WORK, task],
-            stdin=subprocess.PIPE,  # closed when we are gone
+            stdin=subprocess.PIPE,  # closes when this process is gone
             stdout=subprocess.PIPE,
             text=True,
             start_new_session=True,
@@ -65,7 +67,7 @@ class _Crew:
             self._running.add(process)
             if self._over:
                 process.terminate()
-            assert process.stdout is not None  # noqa: S101 - it was asked for
+            assert process.stdout is not None  # noqa: S101 - it was started with a pipe
             said = process.stdout.read()
             status = process.wait()
             self._running.discard(process)
@@ -78,7 +80,7 @@ class _Crew:
         )
 
     def end(self, waiting: Sequence[Future[Finding]]) -> None:
-        """Start no more, and have those under way end."""
+        """Start no further processes, and end the running ones."""
         for one in waiting:
             one.cancel()
         self._over = True
@@ -87,7 +89,7 @@ class _Crew:
 
 
 def work() -> None:
-    """The life of one process: carry out what the argument says, and tell on standard output what became of it."""
+    """Run one process: carry out the scenario in its argument, and write the result to standard output."""
     when_launcher_is_gone(lambda: os.kill(os.getpid(), signal.SIGTERM))
     scenario, manner = json.loads(sys.argv[1])
     out = None if manner["out"] is None else Path(manner["out"])

@@ -1,4 +1,4 @@
-"""A scenario carried out as a test, for the pytest plugin and `evedrop test` alike.
+"""Carries out a scenario as a test, for both the pytest plugin and `evedrop test`.
 
 Source: docs/testing.md.
 """
@@ -24,11 +24,11 @@ from evedrop.score.expectations_held import format_expectation
 
 
 class Outcome(Enum):
-    """What became of a test; its value is the exit status."""
+    """The outcome of a test; its value is the exit status."""
 
     PASSED = 0
     FAILED = 1
-    """An expectation was not held, or the run could not tell."""
+    """An expectation did not hold, or the run could not decide it."""
     MISTAKES = 2
     """The scenario has mistakes, or nothing could be started."""
     BROKEN = 3
@@ -36,45 +36,45 @@ class Outcome(Enum):
 
     @property
     def word(self) -> str:
-        """As it is printed."""
+        """The outcome as a printed word."""
         return self.name.lower() if self is Outcome.PASSED else self.name
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How tests are carried out."""
+    """The options for carrying out tests."""
 
     in_memory: bool = False
     trials: int | None = None
-    """None: as many as the scenario says."""
+    """None: the scenario's number."""
     out: Path | None = None
-    """The folder of all results folders; None: each is below runs/."""
+    """The folder for all results folders; None: runs/."""
     workers: int | None = None
-    """Of a test in memory; None: as many as pay."""
+    """Worker processes of a test in memory; None: as in `Plan`."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of one scenario."""
+    """The result of one scenario as a test."""
 
     scenario: str
     outcome: Outcome
     seconds: float
     reasons: tuple[str, ...] = ()
-    """Why it did not pass, a line each."""
+    """The reasons why it did not pass, one line each."""
     seed: int | None = None
     folder: Path | None = None
-    """The results."""
+    """The results folder."""
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What there is to say of one that did not pass."""
+        """The lines to print if it did not pass."""
         kept = () if self.folder is None or self.outcome is Outcome.PASSED else (f"results: {self.folder}",)
         return (*self.reasons, *kept)
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
-    """The scenarios that files, folders and shipped names stand for, each once. Raises UsageError if there is none."""
+    """The scenarios in files, folders and shipped names, each once. Raises UsageError if there is none."""
     found: dict[Path, str] = {}
     for place in places:
         paths: Sequence[Path] = [Path(place)]
@@ -91,7 +91,7 @@ def scenarios_of(places: Sequence[str]) -> list[str]:
 
 
 def carry_out(scenario: str, manner: Manner) -> Finding:
-    """Run a scenario, live and without a view or in memory, into a results folder of its own, which is kept.
+    """Run a scenario, live without a view or in memory, into a results folder of its own, which is kept.
 
     Raises Interrupted on Ctrl-C.
     """
@@ -119,7 +119,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 
 
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
-    """Run a scenario into a folder; where the results are."""
+    """Run a scenario into a folder; returns the results folder."""
     if manner.in_memory:
         simulate(scenario, folder, _silent, Plan(workers=manner.workers))
         return folder
@@ -131,7 +131,7 @@ def _silent(news: Mapping[str, Any]) -> None:
 
 
 def _reasons(summary: Mapping[str, Any]) -> Iterator[str]:
-    """A line for each expectation that did not hold, and for each that the run could not tell: a test must tell."""
+    """A line for each expectation that did not hold or could not be decided: a test fails if it cannot decide."""
     for expectation in summary["expectations"]:
         if expectation["held"] is not True:
             replay = expectation.get("replay")

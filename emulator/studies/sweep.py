@@ -1,4 +1,4 @@
-"""Monte Carlo over a grid: any entries of the scenario, every combination of their values, one tidy table."""
+"""Monte Carlo over a grid: every combination of values of any entries of the scenario, in one tidy table."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ Grid = Mapping[str, Sequence[Any]]
 Point = Mapping[str, Any]
 
 _MOST_POINTS = 10_000
-_WRITE_SECONDS = 3.0  # from one table of what is done to the next
-_RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and nothing that makes a list of it
+_WRITE_SECONDS = 3.0  # from one table of the points so far to the next
+_RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and no character of a list or string
 _WHOLE = re.compile(r"[+-]?\d+")
 
 
@@ -50,7 +50,7 @@ def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
         if not equals or not key or not values:
             raise UsageError(f"--over {text}: expected KEY=first:last:step or KEY=a,b,c, such as slots=100,200")
         if key in grid:
-            raise UsageError(f"--over {text}: {key} is there twice; give all its values in one")
+            raise UsageError(f"--over {text}: {key} is given twice; give all its values in one option")
         grid[key] = _range(text, values) if _RANGE.fullmatch(values) else _listed(values)
     if math.prod(len(values) for values in grid.values()) > _MOST_POINTS:
         raise UsageError(f"--over asks for more than {_MOST_POINTS} points; take wider steps")
@@ -58,13 +58,13 @@ def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
 
 
 def _listed(values: str) -> list[Any]:
-    """What stands between commas: TOML values, lists and quoted strings among them; else strings."""
+    """The values between commas: TOML values, including lists and quoted strings, or else strings."""
     whole = value_of(f"[{values}]")
     return whole if isinstance(whole, list) else [value_of(value.strip()) for value in values.split(",")]
 
 
 def _range(text: str, values: str) -> list[Any]:
-    """Whole numbers if all three are; decimal steps give decimal values, 0.3 and not 0.30000000000000004."""
+    """The values of a range: whole numbers if all three are; decimal steps give decimals, 0.3 and not 0.30000000000000004."""
     try:
         first, last, step = (Decimal(value.strip()) for value in values.split(":"))
     except (ValueError, InvalidOperation):
@@ -86,15 +86,15 @@ def sweep_over(
     tell: Callable[[Mapping[str, Any]], None],
     plan: Plan,
 ) -> pa.Table:
-    """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot. The table: a row a point and peer.
+    """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot.
 
-    Raises ScenarioError if any point is no scenario, before anything is run; Interrupted, or RunError if a worker fails,
-    with the points done so far in the folder.
+    Returns the table, with a row for each point and peer. Raises ScenarioError if the scenario of any point has mistakes,
+    before any point is run; Interrupted, or RunError if a worker fails, with the points done so far in the folder.
     """
     scenarios = _checked(source, changes, grid, plan)
     workers = max(plan.workers_for(scenario) for _, scenario in scenarios)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
-    each = workers if len(scenarios) < 4 * workers else 1  # many points need not be cut for the workers
+    each = workers if len(scenarios) < 4 * workers else 1  # if there are many points, do not split them
     tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
     rows: list[dict[str, Any]] = []
     failure: RunError | None = None
@@ -134,7 +134,7 @@ def sweep_over(
 
 
 def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
-    """Write the table of the points so far, whole at any moment."""
+    """Write the table of the points so far; replaces the file atomically."""
     table = pa.Table.from_pylist(rows)
     unfinished = folder / "sweep.parquet.new"
     pq.write_table(table, private_file(unfinished))
@@ -153,7 +153,7 @@ def _draw(folder: Path, table: pa.Table, grid: Grid) -> None:
 
 
 def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:
-    """The summary of a point; None if it was cut short."""
+    """The summary of a point; None if it was interrupted."""
     started = time.monotonic()
     merger = Merger(scenario, plan.mode)
     for result in results:
@@ -162,7 +162,7 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
 
 
 def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: Plan) -> list[tuple[Point, Scenario]]:
-    """Every point's scenario; all mistakes of all points at once."""
+    """Every point with its scenario. Raises ScenarioError with the mistakes of all points."""
     points: list[Point] = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
     found: list[tuple[Point, Scenario]] = []
     mistakes: dict[str, None] = {}
@@ -180,7 +180,7 @@ def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: P
 
 
 def _of_household(house: Mapping[str, Any] | None, name: str) -> dict[str, float | None]:
-    """The figures of a house and of what one receiver can tell of it, if the plant is one."""
+    """The figures of a house, and those of one receiver's detection of activity, if the plant is a house."""
     if house is None:
         return {}
     told = house["receivers"][name]

@@ -329,7 +329,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     monkeypatch.setattr(sweep, "new_folder", fail)
     done = evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", "--trials", "2", "--slots", "5", "--out", "x")
     assert (done.status, done.out) == (3, "")
-    assert done.err == "evedrop: [Errno 24] Too many open files; free what the system lacks and try again\n"
+    assert done.err == "evedrop: [Errno 24] Too many open files; free system resources and try again\n"
 
 
 @pytest.mark.parametrize("reader", ["/dev/full", "gone"])
@@ -344,7 +344,7 @@ def test_an_interrupt_stays_one_whoever_reads(evedrop: Evedrop, reader: str) -> 
         live.process.terminate()
         done = live.end()
     assert done.status == 130
-    assert done.err == "evedrop: interrupted; what was done is in the results folder\n"
+    assert done.err == "evedrop: interrupted; the results so far are in the results folder\n"
 
 
 def test_a_title_is_text(evedrop: Evedrop) -> None:

@@ -26,7 +26,7 @@ _FILE_BYTES = 4096  # of the largest file, where no disk can be filled
 _ROUTERS = ("router", "relay")
 _UNWRITTEN = (
     "results cannot be written",
-    "results of the shards cannot be made one",
+    "results of the shards cannot be merged",
     "cannot be written",
     "cannot be started",
 )

@@ -261,7 +261,7 @@ def test_no_run_is_said(evedrop: Evedrop, tmp_path: Path) -> None:
     Control("r0", "tcp/127.0.0.1:9", "operator", "secret").write(folder)
     done = evedrop("link", str(folder), "smart", "cut")
     assert (done.status, len(done.err.splitlines())) == (2, 1)
-    assert "nobody answers at tcp/127.0.0.1:9" in done.err
+    assert "no router answers at tcp/127.0.0.1:9" in done.err
 
 
 def test_the_control_file_is_nobody_elses(tmp_path: Path) -> None:
@@ -273,5 +273,5 @@ def test_the_control_file_is_nobody_elses(tmp_path: Path) -> None:
     assert read_control(tmp_path) == control
     for text in ("", "[]", "{}", '{"run": 1}', json.dumps({**json.loads(path.read_text()), "user": 3})):
         path.write_text(text)
-        with pytest.raises(UsageError, match="is not one"):
+        with pytest.raises(UsageError, match="is not a control file"):
             read_control(tmp_path)

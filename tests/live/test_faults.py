@@ -115,7 +115,7 @@ def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
     live = evedrop.live("eavesdroppers", "--slots", "40", env=with_rogue(evedrop, "router", lie))
     done = live.end()
     assert done.status == 3
-    assert " contradicts router: of slot 7, trial 0, it says that it received nothing" in done.err
+    assert " contradicts router: in slot 7, trial 0, it says that it received nothing" in done.err
     assert "logs/router.log" in done.err
     assert live.results.summary["slots"] <= 7
 
@@ -142,7 +142,7 @@ def test_an_interrupted_run_leaves_results_and_no_process(evedrop: Evedrop, when
     done = live.end()
     assert time.monotonic() - begun < SECONDS
     assert done.status == 130
-    assert done.err.splitlines() == ["evedrop: interrupted; what was measured is in the results folder"]
+    assert done.err.splitlines() == ["evedrop: interrupted; the results so far are in the results folder"]
     live.nothing_left()
     assert live.results.summary["ended"] == "interrupted"
     slots = tables_whole(live)

@@ -300,7 +300,7 @@ def test_a_run_in_shards_tells_how_it_does_and_is_not_steered(evedrop: Evedrop) 
     for words in (("link", "smart", "cut"), ("pause",), ("resume",), ("step", "3")):
         refused = evedrop(words[0], str(live.folder), *words[1:])
         assert refused.status == 2
-        assert "this run is in shards, which are not steered" in refused.err
+        assert "this run is in shards, which cannot be steered" in refused.err
         assert "--set shards=1" in refused.err
     live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130

@@ -215,7 +215,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
 def test_resuming_a_run_that_goes_on_holds_nothing() -> None:
     """It is answered at once, and is no event."""
     run = Run()
-    assert run.asks("resume", reported=9).answers == [Answer(9, "the run goes on already")]
+    assert run.asks("resume", reported=9).answers == [Answer(9, "the run is not paused")]
     assert (run.conductor.told(), run.events) == ([], [])
 
 
@@ -254,7 +254,7 @@ def test_a_step_within_a_step_is_refused() -> None:
     run.holds(20)
     second = run.asks("step", slots=3)
     assert run.holds(22) == go(22, until=30)
-    assert second.answers[0].refused == ("another step goes on, to slot 29; wait for its end, or pause before",)
+    assert second.answers[0].refused == ("another step is under way, to slot 29; wait for its end, or pause first",)
     assert run.holds(30) == []
     assert first.answers[0].slot == 30
 
@@ -297,7 +297,7 @@ def test_what_comes_after_the_last_slot_is_refused(do: str) -> None:
     run = Run()
     asked = run.asks(do, reported=SLOTS - 3, event=SET, slots=2)
     run.steering.over(SLOTS, complete=True)
-    assert asked.answers[0].refused == ("the run came to its end before; nothing was done",)
+    assert asked.answers[0].refused == ("the run ended first; nothing was done",)
     assert (run.events, run.kept) == ([], [])
 
 

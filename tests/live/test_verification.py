@@ -174,14 +174,14 @@ def slots_of(**changes: Any) -> Slots:
 
 
 CLAIMS = {
-    "received": ({"action": np.array([[2, 0, 2, 2], [0, 0, 2, 2]], np.uint8)}, "eve contradicts router: of slot 9, trial 11, it "
-                 r"says that it received nothing \(action 0\), and the journal that it was delivered"),
-    "lost": ({"action": np.array([[2, 3, 2, 2], [0, 2, 2, 2]], np.uint8)}, "eve contradicts router: of slot 8, trial 11, it "
-             r"says that it received the packet \(action 3\), and the journal that it was not delivered"),
-    "late": ({"late": np.eye(2, TRIALS, dtype=np.uint16)}, "eve contradicts router: of slot 8, trial 10, it says that 1 late "
-             "packets came, and the journal 0"),
-    "sent": ({"sent": np.ones((2, TRIALS), bool) & (np.arange(TRIALS) > 0)}, "sensor contradicts router: of slot 8 it says that "
-             "1 trials sent nothing, and the journal 0"),
+    "received": ({"action": np.array([[2, 0, 2, 2], [0, 0, 2, 2]], np.uint8)}, "eve contradicts router: in slot 9, trial 11, it "
+                 r"says that it received nothing \(action 0\), but the journal says that it was delivered"),
+    "lost": ({"action": np.array([[2, 3, 2, 2], [0, 2, 2, 2]], np.uint8)}, "eve contradicts router: in slot 8, trial 11, it "
+             r"says that it received the packet \(action 3\), but the journal says that it was not delivered"),
+    "late": ({"late": np.eye(2, TRIALS, dtype=np.uint16)}, "eve contradicts router: in slot 8, trial 10, it says that 1 late "
+             "packets arrived, but the journal says 0"),
+    "sent": ({"sent": np.ones((2, TRIALS), bool) & (np.arange(TRIALS) > 0)}, "sensor contradicts router: in slot 8 it says that "
+             "1 trials sent nothing, but the journal says 0"),
 }  # fmt: skip
 """What somebody claims against the journal → the columns, and what is said of it."""
 

@@ -67,7 +67,7 @@ def test_lists_are_read_as_toml(text: str, values: list[object]) -> None:
         (["slots"], "expected KEY="),
         (["=1,2"], "expected KEY="),
         (["slots="], "expected KEY="),
-        (["a=1", "a=2"], "is there twice"),
+        (["a=1", "a=2"], "is given twice"),
         (["a=5:1:1"], "the range is empty"),
         (["a=1:5:-1"], "the range is empty"),
         (["a=1:5:0"], "the range is empty"),

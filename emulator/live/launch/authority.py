@@ -1,4 +1,4 @@
-"""The authority of one run: it makes the certificate of every process, and then its own key is forgotten.
+"""The certificate authority of one run: it makes the certificate of every process, and then forgets its own key.
 
 Source: docs/protocol.md, certificates.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime
 import ipaddress
 from collections.abc import Sequence
+from typing import final
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -17,20 +18,21 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from evedrop.live.protocol.brief import Identity
 
-_BEFORE = datetime.timedelta(days=1)  # a host whose clock is some hours late or in another zone can take part
+_BEFORE = datetime.timedelta(days=1)  # so that a host whose clock is late or in another zone can take part
 _VALID = datetime.timedelta(days=30)
 
 
 def authority_name(run: str) -> str:
-    """What the authority of a run is called: who cannot believe a certificate sees by it whose it is."""
+    """The name of a run's authority; a process that rejects a certificate tells from it which run the certificate is of."""
     return f"evedrop {run}"
 
 
+@final
 class Authority:
-    """Final. Its key is in this object alone; P-256, which every TLS library takes."""
+    """The certificate authority of one run. Only this object holds its key: P-256, which every TLS library supports."""
 
     def __init__(self, run: str, now: datetime.datetime | None = None) -> None:
-        """now: when it begins; default now."""
+        """now: the start of its validity; by default, the present time."""
         begin = now or datetime.datetime.now(datetime.UTC)
         self._from, self._until = begin - _BEFORE, begin + _VALID
         self._key = ec.generate_private_key(ec.SECP256R1())
@@ -43,9 +45,9 @@ class Authority:
         )
 
     def identity(self, process: str, hosts: Sequence[str] = ()) -> Identity:
-        """A process's certificate and key.
+        """Make a process's certificate and key.
 
-        hosts: names and addresses at which it is a router; nobody else's certificate is taken for a router's.
+        hosts: names and addresses of a router; other certificates are not accepted as a router's.
         """
         key = ec.generate_private_key(ec.SECP256R1())
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * bool(hosts)

@@ -1,4 +1,4 @@
-"""From one scenario to the briefs of its processes: who is told what, and who holds which key."""
+"""Makes the briefs of a scenario's processes: the knowledge and the keys of each process."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LAUNCHED_PATIENCE = 30  # seconds
 
 
 def flow_of(scenario: Scenario) -> Flow:
-    """A window of some megabytes under way, and reports four times in it; in real time, some tens of milliseconds apart."""
+    """The flow control: a window of some megabytes, and four reports per window; with a pace, every 40 ms."""
     receivers = len(scenario.receivers)
     slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
     window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
@@ -43,7 +43,7 @@ def flow_of(scenario: Scenario) -> Flow:
 
 
 def sizes_of(scenario: Scenario, batch: int) -> Sizes:
-    """What the sizes of messages follow from, with reports of so many slots."""
+    """The dimensions that determine the sizes of messages; batch: slots of a report."""
     plant, table = scenario.driven, scenario.controller
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     return Sizes(
@@ -60,10 +60,10 @@ def sizes_of(scenario: Scenario, batch: int) -> Sizes:
 
 
 def history_of(scenario: Scenario) -> int:
-    """How many slots before those that are not done the router must hear of once more, if it was started anew.
+    """How many slots before the first that is not done a restarted router must receive again.
 
-    A packet may be under way for its link's window; and bursts of losses, which a slot without a packet ends, are told
-    apart up to a length.
+    A packet may be under way for its link's window. Bursts of losses, which a slot without a packet ends, are counted up
+    to a maximal length.
     """
     window = max(scenario.window(name) for name in scenario.receivers)
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
@@ -72,12 +72,12 @@ def history_of(scenario: Scenario) -> int:
 
 @dataclass(frozen=True)
 class ObserverTask:
-    """What the observer is told besides the scenario."""
+    """The observer's task, in addition to the scenario."""
 
     results: Path
     recording: bool
     shard: bool = False
-    """Whether the run is a shard of a larger one: it leaves its score to be merged, and is not steered by itself."""
+    """Whether the run is a shard of a larger one: its score will be merged, and it cannot be steered."""
 
 
 def briefs_of(
@@ -87,10 +87,10 @@ def briefs_of(
     ends_with_stdin: bool = True,
     patience: int = _LAUNCHED_PATIENCE,
 ) -> dict[str, Brief]:
-    """Process name → brief, with run name, passwords and, where the router takes them, certificates made afresh.
+    """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
 
-    places: a text is an endpoint of one router, that is both listened on and connected to. Raises UsageError if they are
-    not as many as the scenario's routers.
+    places: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
+    differs from the scenario's number of routers.
     """
     run = f"r{secrets.token_hex(4)}"
     if isinstance(places, str):
@@ -112,7 +112,7 @@ def briefs_of(
     limits = sizes_of(scenario, flow.batch).of_kinds
 
     def imports(process: str, part: Mapping[str, Any]) -> bool:
-        """Whether a process may need a class that is not built in. Of links, somebody may set another while the run goes on."""
+        """Whether a process may need a class that is not built in. The router may: an operator can set another link model."""
         own = process != OBSERVER and (process == ROUTER or any(named_in(part)))
         return own and scenario.modules is not None
 
@@ -207,12 +207,12 @@ def briefs_of(
 
 
 def _answers(scenario: Scenario) -> dict[str, Any]:
-    """What eavesdroppers' classes that are not built in say of themselves: all that the observer will ask."""
+    """The answers of eavesdroppers' classes that are not built in to all questions that the observer will ask."""
     tables = scenario.eavesdroppers
     names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
     foreign = {name for name in names if STRATEGIES.foreign(name)}
     if foreign:
-        from evedrop.expected.expectations import expectations_of  # noqa: PLC0415 - it is long to import, and seldom needed
+        from evedrop.expected.expectations import expectations_of  # noqa: PLC0415 - slow to import, and seldom needed
 
         for name, expectation in expectations_of(scenario).items():
             if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:
@@ -220,27 +220,26 @@ def _answers(scenario: Scenario) -> dict[str, Any]:
                     expectation.traces(scenario.slots)
                     _ = expectation.limit, expectation.infinite_variance
                 except NoAnswer as error:
-                    raise UsageError(f"eavesdroppers.{name}: its class has no theory of itself ({error})") from error
+                    raise UsageError(f"eavesdroppers.{name}: its class cannot give its theory ({error})") from error
     return ANSWERS.of(foreign)
 
 
 def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
-    """What a receiver is told of late packets, and of its own outages alone."""
+    """A receiver's window for late packets, and its own outages only."""
     outages = [[one.start, one.stop, one.keeps_state] for one in scenario.timeline.outages[receiver]]
     return {"window": scenario.window(receiver), "outages": outages}
 
 
 def write_briefs(scenario: Scenario, places: RouterEndpoints, results: Path, folder: Path, patience: int) -> list[Path]:
-    """Write the briefs into a folder, for processes that are started by hand, on whichever hosts.
+    """Write the briefs into a folder, for processes that are started by hand, on any hosts.
 
-    results: the observer's folder, on its host; relative to where it is started. patience: seconds that everybody waits for
-    the others. Raises UsageError if the folder has something in it or cannot be written, and for a scenario in
-    shards.
+    results: the observer's folder, on its host, relative to its working directory. patience: how many seconds processes
+    wait for each other. Raises UsageError if the folder is not empty or cannot be written, and for a scenario in shards.
     """
     if scenario.shards > 1:
         raise UsageError(
-            f"shards = {scenario.shards}: briefs are of one run; give --set shards=1, or write those of every shard by "
-            "itself, with its own --first-trial and --trials"
+            f"shards = {scenario.shards}: briefs belong to one run; give --set shards=1, or write the briefs of each shard "
+            "separately, with its own --first-trial and --trials"
         )
     made = briefs_of(scenario, places, ObserverTask(results, True), ends_with_stdin=False, patience=patience)
     try:

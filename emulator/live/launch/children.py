@@ -1,4 +1,4 @@
-"""The processes of a run as the launcher sees them: started, listened to, ended, and asked what went wrong."""
+"""The launcher's child processes: starts, watches and ends them, and finds the cause of a failure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, final
 
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
@@ -26,11 +26,11 @@ from evedrop.results.held_folder import HeldFolder
 from evedrop.signals import held_back
 
 News = Mapping[str, Any]
-GRACE_SECONDS = 3.0  # for everybody to leave
-ROUTER_RESTARTS = 3  # of a router that a signal ended: the run goes on with the new one
-SILENCE_SECONDS = 30.0  # after which an observer that says nothing is given up: its heartbeat is a second
-_BEGIN_SECONDS = 30.0  # for an observer that lives to begin to write what there is
-_GONE_SECONDS = 5.0  # for who has left the network to end, and so to say why
+GRACE_SECONDS = 3.0  # for all processes to leave
+ROUTER_RESTARTS = 3  # how often a router that a signal ended is restarted: the run goes on with the new one
+SILENCE_SECONDS = 30.0  # after which a silent observer is given up: it sends a heartbeat every second
+_BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
+_GONE_SECONDS = 5.0  # for a process that has left the network to end, and so to say why
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
@@ -52,7 +52,7 @@ _SENDERS: Mapping[str, str] = {
 
 
 def _sender(complaint: str) -> str | None:
-    """The process that sent what a complaint about a message is about (docs/protocol.md, keys)."""
+    """The sender of the message that a complaint is about, from its key (docs/protocol.md, keys)."""
     found = _REFUSED.search(complaint)
     if found is None:
         return None
@@ -62,14 +62,14 @@ def _sender(complaint: str) -> str | None:
 
 @dataclass(frozen=True)
 class Exit:
-    """A child ended."""
+    """The end of a child process."""
 
     process: str
     status: int
 
     @property
     def manner(self) -> str:
-        """As a sentence goes on after the process's name."""
+        """How it ended, as the end of a sentence that begins with the process's name."""
         if self.status < 0:
             return f"was ended by signal {-self.status}"
         if self.status == INTERRUPTED:
@@ -77,27 +77,28 @@ class Exit:
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
+@final
 class Children:
-    """The processes of a run. Final; on leaving the block all are gone."""
+    """The processes of a run; all are ended on leaving the block."""
 
     def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
-        """folder: of the results; lock_step: the processes wait for each other in every slot, or every few."""
+        """folder: of the results; private: of the briefs; lock_step: whether processes wait for each other every few slots."""
         self._folder = folder
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
         self.silent_seconds = 0.0
-        """How long the observer has given no sign of life."""
+        """For how long the observer has been silent."""
         self.started = False
         """Whether the conductor has started the run."""
         self.over = False
-        """Whether all is done, and everybody told to leave."""
+        """Whether the run is over, and all processes have been told to leave."""
         self._finishing = False
         self._restarts = 0
         self._briefs: dict[str, Brief] = {}
         self._killed: set[int] = set()
-        """Processes that were ended because the scenario says so."""
+        """Ids of processes whose end is not a failure: those killed by the scenario, and routers that were restarted."""
 
     def __enter__(self) -> Children:
         return self
@@ -105,7 +106,7 @@ class Children:
     def __exit__(self, *_: object) -> None:
         for name, process in self._processes.items():
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal(signal.SIGCONT)  # one that is paused could not end
+                process.send_signal(signal.SIGCONT)  # a paused process could not end
             self.terminate(name, 0.0)
         deadline = time.monotonic() + GRACE_SECONDS
         for process in self._processes.values():
@@ -118,9 +119,9 @@ class Children:
                 process.stdin.close()
 
     def start(self, brief: Brief, again: bool = False) -> None:
-        """Start the process of a brief, or start it again. Its output goes to its log, an observer's news to us.
+        """Start the process of a brief, or restart it. Its output goes to its log, an observer's news to the launcher.
 
-        Raises RunError if the system does not let us.
+        Raises RunError if the system cannot start it.
         """
         conducts = brief.role == "observer"
         self._briefs[brief.process] = brief
@@ -135,7 +136,7 @@ class Children:
             "PYTHONUNBUFFERED": "1",
         }
         if brief.role in {"router", "relay"}:
-            environment["TMPDIR"] = str(self._private)  # their files of passwords go with the briefs
+            environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
         try:
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
@@ -151,7 +152,7 @@ class Children:
                 )
         except OSError as error:
             raise RunError(
-                f"{brief.process} cannot be started ({error}); free what the system lacks and run again"
+                f"{brief.process} cannot be started ({error}); free system resources and run again"
             ) from error
         self._processes[brief.process] = process
         threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
@@ -167,7 +168,7 @@ class Children:
             self._news.put(Exit(name, status))
 
     def restart_router(self, ended: Exit) -> bool:
-        """Start a router again if a signal ended it, a few times at most; whether it was started."""
+        """Restart a router if a signal ended it, a few times at most; returns whether it was restarted."""
         signalled = ended.status < 0 or ended.status == INTERRUPTED
         if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
@@ -177,9 +178,9 @@ class Children:
         return True
 
     def act(self, request: News) -> None:
-        """Do to a process what the observer asks for, and tell it so.
+        """Carry out the observer's request on a process, and confirm it.
 
-        Raises RunError if a process cannot be started again.
+        Raises RunError if a process cannot be restarted.
         """
         name, do = str(request["process"]), request["do"]
         process = self._processes[name]
@@ -201,7 +202,7 @@ class Children:
                 observer.flush()
 
     def news(self, seconds: float) -> News | Exit | None:
-        """The next news, or None if there are none for so long."""
+        """The next news, or None if there are none within `seconds`."""
         try:
             news = self._news.get(timeout=seconds)
         except Empty:
@@ -221,14 +222,14 @@ class Children:
         return None if news["event"] in {"alive", "over", "finishing", "back"} else news
 
     def _forget_briefs(self) -> None:
-        """Everybody has read its own: the keys need not lie on a disk any longer."""
+        """Delete the briefs: every process has read its own, and the keys should not stay on disk."""
         for path in self._private.glob("*.json"):
             path.unlink(missing_ok=True)
 
     def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
-        """Have the observer end, at once or after so many seconds; its last news if it came to it.
+        """End the observer, at once or after `patience` seconds; returns its `ended` news, or None if it sent none.
 
-        Once it has begun to finish it may take its time, as long as it says that it lives.
+        Once it has begun to finish, it may take its time, as long as it sends heartbeats.
         """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
@@ -244,7 +245,7 @@ class Children:
         return ending
 
     def terminate(self, name: str, after: float = 0.0) -> None:
-        """Ask a child to end, unless it ends by itself within so many seconds."""
+        """Ask a child to end, unless it ends by itself within `after` seconds."""
         process = self._processes.get(name)
         if process is None:
             return
@@ -254,19 +255,19 @@ class Children:
             process.terminate()
 
     def wait_all(self) -> None:
-        """Let everybody leave in peace, within the grace."""
+        """Wait for all processes to leave by themselves, for `GRACE_SECONDS` at most."""
         deadline = time.monotonic() + GRACE_SECONDS
         for process in self._processes.values():
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
 
     def failure_report(self, first: Exit | None, ending: News | None) -> str:
-        """What happened: the process at fault, and the last lines of its log and of who complained."""
+        """The failure in words: the process at fault, and the last lines of its log and of the complaining process's log."""
         suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
         why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
         lost = None if first is None else self._lost_by_all(first.process, suspects)
         if lost is not None:
-            first, suspects = None, [lost]  # it is at fault, and not the process that gave up first
+            first, suspects = None, [lost]  # the router is at fault, not the process that gave up first
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
         if accused and why:
@@ -286,7 +287,7 @@ class Children:
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
-        """A child that failed, or left too early; never the observer. Who is missed is given a moment to be gone."""
+        """A child that failed, or left too early; never the observer. Missing processes get a moment to end."""
         deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
             ended = {
@@ -304,11 +305,11 @@ class Children:
             time.sleep(0.01)
 
     def _lost_router(self, name: str) -> bool:
-        """Whether a process ended because it could not reach its router any more."""
+        """Whether a process ended because it could no longer reach its router."""
         return any(_ROUTER_LOST in line for line in self._log(name))
 
     def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
-        """The router that a process gave up, if the observer misses it too, or all others that are connected to it; else None."""
+        """The router that a process gave up, if the observer or all its other users miss it, too; else None."""
         if not self._lost_router(name):
             return None
         if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
@@ -323,7 +324,7 @@ class Children:
         return None
 
     def _log(self, name: str) -> list[str]:
-        """The lines of a log, without what Zenoh says of every message that arrives while its session closes."""
+        """The lines of a log, without Zenoh's lines about messages that arrive while its session closes."""
         try:
             text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text(errors="replace"))
         except OSError as error:

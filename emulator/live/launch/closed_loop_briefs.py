@@ -1,4 +1,4 @@
-"""What a closed loop puts into the briefs: who is told what of plant, inputs and disturbances.
+"""A closed loop's parts of the briefs: what each process knows of plant, inputs and disturbances.
 
 Source: docs/protocol.md, the brief.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from base64 import b64encode
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 from evedrop.live.network.access import Wiring
 from evedrop.scenario import Scenario
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from evedrop.scenario.stream_keys import StreamKeys
 
 
+@final
 class LoopBriefs:
-    """The parts of a scenario's briefs; None wherever there is no plant, or no controller. Final."""
+    """A closed loop's parts of a scenario's briefs; None if there is no plant, or no controller."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -30,28 +31,28 @@ class LoopBriefs:
 
     @property
     def wiring(self) -> dict[str, Any] | None:
-        """How the controller is connected: for the router."""
+        """The controller's connections, for the router."""
         return None if self._wiring is None else asdict(self._wiring)
 
     @property
     def plant(self) -> dict[str, Any] | None:
-        """What moves the states: for the sensor."""
+        """The plant with its disturbances, for the sensor."""
         return None if self._plant is None else {**self._plant, "disturbances": self._disturbances}
 
     def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
-        """The streams that the sensor owns, those of the secret aside."""
+        """The keys of the sensor's own streams, without the secret's."""
         driven = self._scenario.driven
         measures = driven is not None and driven.output_matrix is not None
         return {"process": keys.process, **({"measurement": keys.measurement} if measures else {})}
 
     @property
     def of_sensor(self) -> dict[str, Any] | None:
-        """When it waits for inputs, and whether it says the state."""
+        """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
         return None if self._wiring is None else {"period": self._period, "acts_on": self._wiring.acts_on}
 
     @property
     def of_legitimate(self) -> dict[str, Any] | None:
-        """When it says its estimate, if it does, and the plant, if it is told the inputs; nothing if neither."""
+        """For the legitimate estimator: when it sends its estimate, and the plant if it knows the inputs; None if neither."""
         wiring = self._wiring
         if wiring is None or (wiring.on_truth and not wiring.knows_input):
             return None
@@ -63,7 +64,7 @@ class LoopBriefs:
 
     @property
     def of_controller(self) -> dict[str, Any] | None:
-        """What it is to do."""
+        """The controller's part: its strategy, assignment, plant and disturbances."""
         assignment, table = self._scenario.assignment, self._scenario.controller
         if assignment is None or table is None:
             return None

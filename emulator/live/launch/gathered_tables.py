@@ -1,7 +1,7 @@
-"""The tables of a run's shards as one, some slots at a time, so that a long run's fit into memory.
+"""Merges the tables of a run's shards, some slots at a time, so that a long run's tables fit into memory.
 
-A table's rows come in order of slots for each receiver, but the receivers take turns as the run went. A gathered one has, for
-every few thousand slots, the receivers one after the other, which is how an unsharded run that reports so many at once has it.
+The rows of each receiver are in order of slots, but the receivers alternate as they did in the run. A merged table has, for
+every few thousand slots, one receiver after the other, like the table of an unsharded run that reports that many at once.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pyarrow as pa
@@ -28,17 +28,17 @@ _ROWS = 65_536
 
 
 class Gathered(ABC):
-    """How the rows of some slots of all shards become those of the run. Abstract."""
+    """Merges the rows of all shards into those of the run. Abstract."""
 
     def __init__(self, receivers: Sequence[str], row_bytes: float) -> None:
-        """receivers: none of a table without a column of them; row_bytes: how large a row of the run's table is, about."""
+        """receivers: empty for a table without a column of receivers; row_bytes: approximate size of a row of the table."""
         self.receivers = pa.array(receivers)
         self.by = "peer"
-        """The column of the receivers."""
+        """Name of the column of the receivers."""
         self.slots_at_once = max(1, int(min(_ROWS, _BYTES / row_bytes)) // max(1, len(receivers)))
 
     def write(self, sources: Sequence[Path], table: Path) -> None:
-        """Put together the tables of the shards, in order, in place of an empty table of the run."""
+        """Merge the tables of the shards, in order, and replace the empty table of the run with the result."""
         schema = pq.read_schema(table)
         rows = [_Rows(source, schema, self) for source in sources]
         unfinished = table.with_suffix(".new")
@@ -51,7 +51,7 @@ class Gathered(ABC):
         os.replace(unfinished, table)
 
     def codes(self, table: pa.Table) -> NDArray[np.int64]:
-        """The receiver of every row, by its place among them; 0 of a table without them."""
+        """The index of the receiver of every row; 0 for a table without receivers."""
         if not len(self.receivers):
             return np.zeros(table.num_rows, np.int64)
         found = pc.index_in(table[self.by].cast(pa.string()), value_set=self.receivers)
@@ -60,15 +60,15 @@ class Gathered(ABC):
 
     @abstractmethod
     def _one(self, first: int, parts: Sequence[pa.Table], schema: pa.Schema) -> pa.Table:
-        """The rows of the slots from `first` on, from those of each shard."""
+        """Merge the rows of the slots from `first` on; parts: the rows of each shard."""
 
     def _places(self, first: int, part: pa.Table) -> NDArray[np.int64]:
-        """Where the rows go in an array with a place for every receiver and slot."""
+        """The places of the rows in an array with one place for each receiver and slot."""
         slots: NDArray[np.int64] = part["slot"].to_numpy()
         return self.codes(part) * self.slots_at_once + (slots - first)
 
     def _rows_of(self, first: int, places: NDArray[np.int64], columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
-        """The rows of some places, from columns of all."""
+        """The rows of some places, from columns of all places."""
         named = (places // self.slots_at_once).astype(np.int8)
         own = {
             "slot": pa.array(first + places % self.slots_at_once),
@@ -84,8 +84,9 @@ class Gathered(ABC):
         return pa.Table.from_arrays(arrays, schema=schema)
 
 
+@final
 class _Rows:
-    """A table of one shard, read in order of slots; nothing where whoever wrote it was killed before it was whole. Final."""
+    """A table of one shard, read in order of slots; it ends early if its writer was killed."""
 
     def __init__(self, path: Path, schema: pa.Schema, gathered: Gathered) -> None:
         self._gathered = gathered
@@ -94,7 +95,7 @@ class _Rows:
         self._batches = parquet_or_stream(path.parent, path.stem, gathered.slots_at_once * len(self._reach))
 
     def below(self, end: int) -> pa.Table:
-        """The rows of all slots below `end` that have not been given before."""
+        """The rows of all slots below `end` that have not been returned before."""
         parts = [self._held]
         while int(self._reach.min()) < end and (batch := next(self._batches, None)) is not None:
             part = pa.Table.from_batches([batch])
@@ -106,10 +107,11 @@ class _Rows:
         return held.filter(due)
 
 
+@final
 class Statistics(Gathered):
-    """Of every slot: means over trials are weighted by them, and standard errors pooled. Final."""
+    """Merges statistics of slots: means are weighted by the number of trials, and standard errors pooled."""
 
-    # Theory, which is the same for all, and what a live run has none of.
+    # Theory, which is the same in all shards, and quantiles, which a live run does not have.
     _TAKEN = ("expected", "error_quantile", "trace_quantile")
 
     def __init__(self, receivers: Sequence[str]) -> None:
@@ -144,11 +146,12 @@ class Statistics(Gathered):
         return self._rows_of(first, np.flatnonzero(total), columns, schema)
 
 
+@final
 class Journals(Gathered):
-    """Of every slot and link: counts are added up, and bit masks put side by side. Final."""
+    """Merges journals of slots and links: counts are added, and bit masks concatenated."""
 
     def __init__(self, receivers: Sequence[str], trials: Sequence[int]) -> None:
-        """trials: of each shard."""
+        """trials: how many each shard has."""
         super().__init__(receivers, 100.0 + sum(trials))
         self.by = "link"
         self._trials = trials
@@ -175,11 +178,12 @@ class Journals(Gathered):
         return self._rows_of(first, places, {**columns, "delivered_mask": masks}, schema)
 
 
+@final
 class Recorded(Gathered):
-    """The recorded trials, each in full. Final."""
+    """Merges the recorded trials, each in full."""
 
     def __init__(self, receivers: Sequence[str], trials: range, numbers: int) -> None:
-        """trials: those that are recorded; numbers: in a row of one of them."""
+        """trials: the recorded ones; numbers: how many a row of one of them has."""
         super().__init__(receivers, len(trials) * 8.0 * numbers)
         self._trials = trials
 

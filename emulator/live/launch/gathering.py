@@ -1,7 +1,7 @@
-"""The results folders of a run's shards made one: what the run would have left without shards.
+"""Merges the results folders of a run's shards into one, as the run would have written it without shards.
 
-Trials are put side by side and counts added up. Means over all trials are made of the shards' means, so they agree with an
-unsharded run's within rounding; digests, fates, recorded trials and all that is kept by trial are the same to the bit.
+Trials are concatenated and counts added. Means over all trials are computed from the shards' means, so they agree with an
+unsharded run's within rounding; digests, fates, recorded trials and everything else kept by trial are the same to the bit.
 
 Source: docs/results.md, shards.
 """
@@ -43,10 +43,10 @@ _RECORDING = "recording.rrd"
 def gather(
     scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str
 ) -> Mapping[str, Any]:
-    """Fill a run's folder from those of its shards, which are removed then; the run's summary.
+    """Fill a run's folder from those of its shards, which are then removed; returns the run's summary.
 
     started: when the first shard began, by the monotonic clock, if one did; how: as in `Ending`. Raises OSError if the folder
-    cannot be written, with the shards' own as they are.
+    cannot be written; the shards' folders are then unchanged.
     """
     write_resolved(folder, scenario)
     with ResultsWriter.of(folder, scenario) as writer:
@@ -66,7 +66,7 @@ def gather(
 
 
 def _tables(scenario: Scenario, shards: Sequence[Shard]) -> dict[str, Gathered]:
-    """How the tables are made one, by name."""
+    """Table → how it is merged."""
     n, receivers, first = len(scenario.process.A), scenario.receivers, scenario.first_trial
     recorded = range(first, first + scenario.record_trials)
     tables: dict[str, Gathered] = {
@@ -81,7 +81,7 @@ def _tables(scenario: Scenario, shards: Sequence[Shard]) -> dict[str, Gathered]:
 
 
 def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: ResultsWriter) -> str | None:
-    """Write the digests of one who makes them, and make that of the run of them; None if some blocks are missing."""
+    """Write the digests of one process, and return its digest of the run; None if some blocks are missing."""
     blocks = [_blocks(shard, name) for shard in shards]
     for block in sorted(set(chain.from_iterable(blocks))):
         for shard, own in zip(shards, blocks, strict=True):
@@ -105,7 +105,7 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
 
 
 def _events(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
-    """All that happened in any shard: each once, in order of slots."""
+    """The events of all shards: each once, in order of slots."""
     found: list[Mapping[str, Any]] = []
     for _, summary in _summaries(shards):
         found += [one for one in summary["events"] if one not in found]
@@ -113,7 +113,7 @@ def _events(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
 
 
 def _outages(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
-    """Who was cut off in any shard, and in which, in order of slots."""
+    """The outages of all shards, each with its shard, in order of slots."""
     found = [{"shard": shard.number, **one} for shard, summary in _summaries(shards) for one in summary["outages"]]
     return sorted(found, key=lambda one: int(one["slot"]))
 
@@ -128,7 +128,7 @@ def _misdelivered(shards: Sequence[Shard]) -> dict[str, int]:
 
 
 def _summaries(shards: Sequence[Shard]) -> Iterator[tuple[Shard, Mapping[str, Any]]]:
-    """Of those that have left one."""
+    """The shards that have written a summary, with it."""
     for shard in shards:
         with suppress(UsageError):
             yield shard, load_results(shard.folder).summary

@@ -1,6 +1,6 @@
-"""The launcher: runs a scenario in one set of processes, or in one for each of its shards.
+"""The launcher: runs a scenario in one set of processes, or in one set for each of its shards.
 
-It imports neither zenoh nor rerun, and it alone decides how the run ended.
+It imports neither zenoh nor rerun. It alone decides how the run ended.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ def launch(
 
     listen, relay: the endpoints of router and, if there is one, relay; free ports by default.
 
-    Raises UsageError before anything is started, RunError when the run failed, Interrupted on Ctrl-C or SIGTERM; in the
-    last two cases what was measured is in the folder and no process is left.
+    Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
+    last two cases the results so far are in the folder and no process is left.
     """
     view = choose(view)
     with stop_on_signals() as stop:
         if scenario.shards == 1:
             return launch_one(scenario, folder, view, loopback_places(listen, relay, scenario.relayed), tell, stop)
-        from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - a run in one set of processes does without
+        from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 
         given = {"--listen": listen, "--relay": relay}
         for option, endpoint in given.items():

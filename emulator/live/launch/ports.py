@@ -1,4 +1,4 @@
-"""Where the routers of a run may listen: a free port on loopback, or what was asked for, if that is safe and can be had."""
+"""The endpoints of a run's routers: a free port on loopback, or the requested endpoint if it is safe and available."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _EXAMPLE = "give one such as tls/router.lan:7447"
 
 @dataclass(frozen=True)
 class RouterEndpoint:
-    """Where the router listens, and what the others connect to."""
+    """The endpoint at which a router listens, and the one that the other processes connect to."""
 
     listen: Endpoint
     connect: Endpoint
 
     @property
     def secure(self) -> bool:
-        """Whether it takes certificates."""
+        """Whether the router takes certificates."""
         return self.listen.secure
 
     @property
@@ -32,22 +32,22 @@ class RouterEndpoint:
 
 @dataclass(frozen=True)
 class RouterEndpoints:
-    """Where everybody meets."""
+    """The endpoints of a run's routers."""
 
     router: RouterEndpoint
     relay: RouterEndpoint | None = None
-    """Of a run with two routers: where all but the sensor are."""
+    """In a run with two routers, the endpoint of all processes but the sensor."""
 
     @property
     def far(self) -> RouterEndpoint:
-        """Where all but the sensor connect to."""
+        """The endpoint that all processes but the sensor connect to."""
         return self.relay or self.router
 
     def check(self, relayed: bool) -> None:
-        """Raise UsageError unless there is a place for as many routers as a scenario has."""
+        """Raise UsageError unless there is an endpoint for each of the scenario's routers; relayed: whether it has two."""
         if relayed and self.relay is None:
             raise UsageError(
-                "the scenario has two routers; add --relay ENDPOINT with the place where the second one listens"
+                "the scenario has two routers; add --relay ENDPOINT with the endpoint where the second one listens"
             )
         if self.relay is not None and not relayed:
             raise UsageError("--relay: the scenario has one router; leave it out, or add --set network.routers=2")
@@ -64,12 +64,14 @@ def places_at(
     relay_connect: str | None = None,
     insecure: bool = False,
 ) -> RouterEndpoints:
-    """The places that the options of `evedrop brief` name, on whichever hosts. Raises UsageError if they are none."""
+    """The endpoints that the options of `evedrop brief` name, on any hosts. Raises UsageError if they are malformed."""
     second = None
     if relay is not None:
         second = meeting_at(relay, relay_connect, insecure, ("--relay", "--relay-connect"))
     elif relay_connect is not None:
-        raise UsageError("--relay-connect is of a second router; add --relay ENDPOINT with the place where it listens")
+        raise UsageError(
+            "--relay-connect belongs to a second router; add --relay ENDPOINT with the endpoint where it listens"
+        )
     return RouterEndpoints(meeting_at(listen, connect, insecure), second)
 
 
@@ -79,10 +81,10 @@ def meeting_at(
     insecure: bool = False,
     options: tuple[str, str] = ("--listen", "--connect"),
 ) -> RouterEndpoint:
-    """The meeting that two options name, on whichever host.
+    """The endpoint of one router that two options name, on any host.
 
-    insecure: whether the user said that it may be in clear although others can get at it. Raises UsageError if it is no
-    place to meet at.
+    insecure: whether the user allows an unencrypted endpoint that other machines can reach. Raises UsageError if the router
+    cannot listen there or the others cannot connect there.
     """
     listening, connecting = options
     here = _endpoint(listening, listen)
@@ -90,19 +92,21 @@ def meeting_at(
     if there.everywhere:
         asked = listening if connect is None else connecting
         raise UsageError(
-            f"{asked} {there} is every address of a host, and none to connect to; add {connecting} {there.protocol}/HOST:"
-            f"{there.port} with the name or address that the others reach it by"
+            f"{asked} {there} means every address of a host, so nothing can connect to it; add {connecting} {there.protocol}/"
+            f"HOST:{there.port} with the name or address by which the others reach it"
         )
     if here.protocol != there.protocol:
-        raise UsageError(f"{connecting} {there} is not what {listening} {here} speaks; give both as tls/HOST:PORT")
+        raise UsageError(
+            f"{connecting} {there} differs in protocol from {listening} {here}; give both as tls/HOST:PORT"
+        )
     if there.secure and there.address is not None and there.address.version == 6:
         raise UsageError(
-            f"{connecting} {there}: no certificate can be checked against an address of IPv6; give the host's name"
+            f"{connecting} {there}: no certificate can be checked against an IPv6 address; give the host's name"
         )
     if not here.secure and not insecure and not here.loopback:
         raise UsageError(
-            f"{listening} {here} is in clear, and others than this machine can get at it: they would read everything, and "
-            f"could pose as the router; give tls/{str(here).partition('/')[2]}, or add --insecure"
+            f"{listening} {here} is not encrypted, and other machines can reach it: they could read everything, and pose as "
+            f"the router; give tls/{str(here).partition('/')[2]}, or add --insecure"
         )
     return RouterEndpoint(here, there)
 
@@ -115,10 +119,10 @@ def _endpoint(option: str, text: str) -> Endpoint:
 
 
 def loopback_places(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
-    """The places of a run whose processes are all here: what was asked for, or free ports.
+    """The endpoints of a run whose processes are all on this host: the requested ones, or free ports.
 
-    Two routers take certificates unless they are asked not to: without, a router is told from others by what is no secret.
-    Raises UsageError unless they can be listened on, on loopback.
+    Two routers take certificates by default: without, a router is recognised by its id alone, which is not a secret.
+    Raises UsageError unless they are on loopback and a router can listen there.
     """
     asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls" if relayed else "tcp")
     router = _loopback_meeting(listen, "--listen", asked)
@@ -139,12 +143,12 @@ def _loopback_meeting(listen: str | None, option: str, protocol: str) -> RouterE
         raise UsageError(f"{option} {error}; give one such as tcp/127.0.0.1:17460") from error
     if not endpoint.loopback:
         raise UsageError(
-            f"{option} {listen} is no loopback endpoint; give one such as tcp/127.0.0.1:17460, or start the processes by "
+            f"{option} {listen} is not a loopback endpoint; give one such as tcp/127.0.0.1:17460, or start the processes by "
             "hand: evedrop brief"
         )
     meeting = meeting_at(listen)
     try:
         endpoint.try_to_listen()
     except OSError as error:
-        raise UsageError(f"{option} {listen}: {error.strerror}; leave it out, and a free port is found") from error
+        raise UsageError(f"{option} {listen}: {error.strerror}; leave it out to use a free port") from error
     return meeting

@@ -1,8 +1,8 @@
-"""The folder for the briefs of a run, which hold keys and passwords; and its end, even if the launcher is killed.
+"""The folder for the briefs of a run, which hold keys and passwords; it is removed even if the launcher is killed.
 
-A shell that holds the other end of a pipe to the launcher removes the folder when the launcher is dead. The launcher also holds
-a lock in the folder, which the system takes from the dead: if the shell was killed too, the next run finds a folder whose lock
-is free, and removes it.
+A shell that holds the other end of a pipe to the launcher removes the folder when the launcher is dead. The launcher also
+holds a lock in the folder, which the system releases when the launcher dies: if the shell was killed, too, the next run finds
+the folder unlocked, and removes it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from evedrop.errors import UsageError
 _PREFIX = "evedrop-"
 _LOCK = "lock"
 _GUARD_SECONDS = 5.0
-# A process that is still starting may write into the folder while it is removed: then it is removed again.
+# A process that is still starting may write into the folder during the removal: so try again.
 _GUARD = (
     "while read -r _; do :; done; tries=0; "
     'while [ -e "$1" ] && [ $tries -lt 50 ]; do rm -rf -- "$1" 2>/dev/null || sleep 0.2; tries=$((tries + 1)); done'
@@ -32,7 +32,7 @@ _GUARD = (
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A folder that nobody else may look into, gone after the block. Raises UsageError if none can be made."""
+    """A folder that only this user can read, removed after the block. Raises UsageError if it cannot be made."""
     try:
         where = Path(tempfile.gettempdir()).absolute()
         _sweep(where)
@@ -57,18 +57,18 @@ def _locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise _unmade(error) from error
     with lock:
-        with contextlib.suppress(OSError):  # of a file system without locks, where nothing is swept then
+        with contextlib.suppress(OSError):  # on a file system without locks, nothing is swept
             fcntl.flock(lock, fcntl.LOCK_EX)
-            os.replace(lock.name, folder / _LOCK)  # nobody finds one that is not locked
+            os.replace(lock.name, folder / _LOCK)  # so that the file never exists unlocked
         yield
 
 
 def _unmade(error: OSError) -> UsageError:
-    return UsageError(f"no temporary folder can be made ({error.strerror}); set TMPDIR to one")
+    return UsageError(f"cannot make a temporary folder ({error.strerror}); set TMPDIR to a folder that can be written")
 
 
 def _guard(folder: Path) -> subprocess.Popen[bytes]:
-    """Start the shell that removes the folder when we are dead; before there is a folder, so that there never is one without."""
+    """Start the shell that removes the folder when the launcher is dead; called before the folder is made."""
     return subprocess.Popen(
         ["/bin/sh", "-c", _GUARD, "sh", str(folder)],
         stdin=subprocess.PIPE,
@@ -80,8 +80,8 @@ def _guard(folder: Path) -> subprocess.Popen[bytes]:
 
 
 def _dismiss(guard: subprocess.Popen[bytes]) -> None:
-    """Let the shell end, which finds nothing to remove."""
-    assert guard.stdin is not None  # noqa: S101 - as it was started
+    """End the shell, which finds nothing to remove."""
+    assert guard.stdin is not None  # noqa: S101 - it was started with a pipe
     guard.stdin.close()
     try:
         guard.wait(_GUARD_SECONDS)
@@ -91,7 +91,7 @@ def _dismiss(guard: subprocess.Popen[bytes]) -> None:
 
 
 def _sweep(where: Path) -> None:
-    """Remove the folders that were ours and whose launcher is dead."""
+    """Remove this user's folders whose launcher is dead."""
     for folder in where.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():

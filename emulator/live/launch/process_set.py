@@ -1,7 +1,7 @@
-"""One set of processes launched, watched to its end, and ended whatever happens.
+"""Launches one set of processes, watches it to its end, and ends it whatever happens.
 
-Children have sessions of their own, so a Ctrl-C reaches the launcher only; each holds the other end of a pipe, so none outlives
-even a killed launcher.
+Children have sessions of their own, so a Ctrl-C reaches only the launcher. Each holds the other end of a pipe, so none
+outlives the launcher, even if that is killed.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from evedrop.view.viewer import Viewer
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
 _AFTERTHOUGHT_SECONDS = (
-    0.5  # a signal that ended a child may be about to reach us: a terminal that closes hangs up on all
+    0.5  # a signal that ended a child may be about to reach the launcher: a closing terminal hangs up on all
 )
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended."""
+    """The end of a run."""
 
     status: int
     """Its exit status."""
     viewer: Viewer | None
     """The viewer, if one is still open."""
     folder: Path
-    """Where its results are: the folder may have been renamed."""
+    """The results folder, which may have been renamed."""
 
 
 def launch_one(
@@ -57,7 +57,7 @@ def launch_one(
 ) -> Ended:
     """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
 
-    shard: whether others carry further trials.
+    shard: whether other sets of processes carry further trials.
     """
     with private_folder() as private, contextlib.closing(HeldFolder(new_folder(folder))) as held:
         make_private(folder / "logs")
@@ -68,7 +68,7 @@ def launch_one(
             with Children(held, private, scenario.controller is not None) as children:
                 for brief in briefs.values():
                     children.start(brief)
-                # The others find their feet while the viewer does.
+                # The other processes start up at the same time as the viewer.
                 viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
                     tell({"event": "view", "address": viewer.address, "warning": viewer.warning})
@@ -91,7 +91,7 @@ def launch_one(
 
 
 def _now(held: HeldFolder, tell: Callable[[News], None]) -> Path:
-    """Where the results folder is when the run is over; a folder that was renamed or removed is told of."""
+    """The results folder when the run is over; reports if it was renamed."""
     try:
         now = held.now
     except FileNotFoundError:
@@ -103,7 +103,7 @@ def _now(held: HeldFolder, tell: Callable[[News], None]) -> Path:
 
 
 def _forget(folder: Path) -> None:
-    """Leave no folder of a run that was not started, so that the next one can have it."""
+    """Remove the folder of a run that was not started, so that the next run can use it."""
     with contextlib.suppress(OSError):
         for log in (folder / "logs").iterdir():
             log.unlink()
@@ -112,11 +112,11 @@ def _forget(folder: Path) -> None:
 
 
 def _note(folder: Path, scenario: Scenario, how: str) -> None:
-    """Write how the run ended into its summary, and finish the tables that the observer could not finish itself.
+    """Write the reason of the run's end into its summary, and finish the tables that the observer could not finish.
 
     Raises OSError if the folder cannot be written.
     """
-    # Tables and theory take longer to import than all else here, and a run that ends well needs neither.
+    # Tables and theory are slow to import, and a run that ends well needs neither.
     from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished  # noqa: PLC0415
     from evedrop.results.writer import ResultsWriter, load_results, write_summary  # noqa: PLC0415
     from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
@@ -134,22 +134,22 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
                 pass
     else:
         if left_behind:
-            # Its end is missing, and `evedrop view` makes another one from the tables.
+            # The recording lacks its end; `evedrop view` makes another one from the tables.
             (folder / "recording.rrd").unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # of a full disk: the streams stay, and can be read
+            with contextlib.suppress(OSError):  # the disk is full: the streams stay, and can be read
                 finish(folder)
     write_summary(folder, summary)
 
 
 def _supervise(children: Children, stop: threading.Event, tell: Callable[[News], None]) -> int:
-    """Follow the run to its end; the exit status that the observer gives it."""
+    """Follow the run to its end; returns the exit status that the observer gives it."""
     early: tuple[Exit, float] | None = None
     while True:
         if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
             raise RunError(children.failure_report(early[0], children.conclude(tell)))
         if stop.is_set():
             children.conclude(tell)
-            raise Interrupted("interrupted; what was measured is in the results folder")
+            raise Interrupted("interrupted; the results so far are in the results folder")
         if children.silent_seconds > SILENCE_SECONDS:
             raise RunError(children.failure_report(None, {"suspects": [OBSERVER]}))
         news = children.news(_LOOK_SECONDS)
@@ -158,11 +158,11 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
             if _meant_us_too(news, stop) or (
                 news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
             ):
-                # Who leaves at the end may be faster than the word that it is the end.
+                # A process that leaves at the end may be faster than the news that the run is over.
                 early = early or ((news, time.monotonic()) if news.status == 0 else None)
                 continue
             if news.process != OBSERVER:
-                # An observer that has just ended may still say so; one that goes on would wait for who will not come back.
+                # An observer that has just ended may still report so; a running one would wait for the lost process in vain.
                 ending = children.conclude(tell)
             if ending is None or not _ended_well(ending):
                 raise RunError(children.failure_report(news, ending))
@@ -172,7 +172,7 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
         if ending is not None:
             break
     if ending["status"] == Interrupted.exit_status:
-        raise Interrupted("interrupted; what was measured is in the results folder")
+        raise Interrupted("interrupted; the results so far are in the results folder")
     if not _ended_well(ending):
         raise RunError(children.failure_report(None, ending))
     children.wait_all()
@@ -180,7 +180,7 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
 
 
 def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
-    """Whether the signal that ended a child reaches us within a moment: a terminal that closes hangs up on everybody."""
+    """Whether the signal that ended a child reaches the launcher, too, within a moment: a closing terminal hangs up on all."""
     return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)
 
 

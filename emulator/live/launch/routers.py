@@ -1,4 +1,4 @@
-"""Who is let in at which router, by what: passwords, certificates, and the id by which two routers know each other."""
+"""The credentials at each router: passwords, certificates, and the id by which two routers recognise each other."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from evedrop.names import RELAY, ROUTER, SENSOR
 
 @dataclass(frozen=True)
 class Routers:
-    """Who is let in where."""
+    """The users of each router, with their passwords."""
 
     places: RouterEndpoints
     at_router: Mapping[str, str]
-    """User → password."""
+    """User of the router → password."""
     at_relay: Mapping[str, str]
     zid: str | None
-    """The router's Zenoh id, by which the relay knows it."""
+    """The router's Zenoh id, by which the relay recognises it; None without a relay."""
 
     @classmethod
     def of(cls, users: Mapping[str, str], places: RouterEndpoints) -> Routers:
-        """All at the router; or, if there is a relay, the sensor and the relay there, and all others at the relay."""
+        """Assign all users to the router; with a relay, the sensor and the relay to the router, all others to the relay."""
         if places.relay is None:
             return cls(places, users, {}, None)
-        # Router and relay are users too: of themselves, which ask whether they are there.
+        # Router and relay are users, too: each asks itself whether it is present.
         near = {**{user: users[user] for user in (ROUTER, SENSOR)}, RELAY: secrets.token_urlsafe(24)}
         far = {**{user: password for user, password in users.items() if user not in near}, RELAY: near[RELAY]}
         # Zenoh takes ids of up to 16 bytes, in hexadecimal without zeros at the ends.
@@ -36,24 +36,24 @@ class Routers:
         return cls(places, near, far, zid)
 
     def endpoint(self, process: str) -> str:
-        """What a process connects to."""
+        """The endpoint that a process connects to."""
         return str((self.places.router if process in self.at_router else self.places.far).connect)
 
     def password(self, process: str) -> str:
-        """A process's."""
+        """The password of a process."""
         return {**self.at_router, **self.at_relay}.get(process, "")
 
     def relay_part(self, receivers: tuple[str, ...], relay: RouterEndpoint) -> dict[str, Any]:
-        """What the relay is told."""
+        """The relay's part of its brief."""
         listen = str(relay.listen)
         return {"users": self.at_relay, "receivers": list(receivers), "listen": listen, "zid": self.zid}
 
 
 def identities_of(run: str, places: RouterEndpoints, users: tuple[str, ...]) -> dict[str, Identity]:
-    """Process name, or operator → its certificate; nobody has one of a router that listens in clear."""
+    """Process name, or operator → its certificate; empty if the router listens without TLS."""
     if not places.router.secure:
         return {}
-    from evedrop.live.launch.authority import Authority  # noqa: PLC0415 - 50 ms that most runs need not
+    from evedrop.live.launch.authority import Authority  # noqa: PLC0415 - saves most runs 50 ms
 
     authority = Authority(run)
     return {

@@ -1,7 +1,7 @@
-"""A live run in shards: its trials in contiguous ranges, each carried by a run of its own, all under one launcher.
+"""A live run in shards: contiguous ranges of its trials, each carried by a run of its own, all under one launcher.
 
-Trials have nothing in common but the scenario, and every random number is addressed by its trial. So a shard is a whole run,
-with router, sensor, receivers and observer, that knows of no other. What they leave is made one in `gathering`.
+Trials share only the scenario, and every random number is addressed by its trial. So a shard is a complete run, with router,
+sensor, receivers and observer, independent of all others. `gathering` merges their results.
 
 Source: docs/scale.md.
 """
@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.children import News
@@ -26,7 +26,7 @@ from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
 from evedrop.view.viewer import Viewer
 
-_FOLDER = "shards"  # in the results folder, until they are made one
+_FOLDER = "shards"  # in the results folder, until the shards are merged
 
 
 @dataclass(frozen=True)
@@ -34,32 +34,32 @@ class Shard:
     """A range of the trials of a run."""
 
     number: int
-    """From 1 on, in the order of trials."""
+    """Number of the shard, from 1 on, in order of trials."""
     scenario: Scenario
-    """That of the run, of these trials alone."""
+    """The run's scenario, with only these trials."""
     folder: Path
-    """Its own results."""
+    """Its own results folder."""
 
     @property
     def name(self) -> str:
-        """Where its logs are, among those of the run."""
+        """Name of the folder of its logs, in the run's log folder."""
         return f"shard-{self.number}"
 
     @property
     def trials(self) -> range:
-        """By their numbers in the scenario."""
+        """The shard's trials, by their numbers in the scenario."""
         first = self.scenario.first_trial
         return range(first, first + self.scenario.trials)
 
     def of_run(self, said: object) -> str:
-        """What it says of itself, as it is for the run: who, and where the logs will be."""
+        """A message of the shard as a message of the run: names the shard, and its logs by their place in the run's folder."""
         trials = self.trials
         which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
         return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(said))
 
 
 def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:
-    """The shards of a run into a results folder, as equal as can be; who has no recorded trial records its first all the same."""
+    """The shards of a run, as equal as possible; a shard without a recorded trial records its first trial nevertheless."""
     trials, recorded, count = scenario.trials, scenario.record_trials, scenario.shards
     bounds = [trials * i // count for i in range(count + 1)]
     tables = scenario.model_dump(mode="json")
@@ -75,8 +75,9 @@ def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:
     return made
 
 
+@final
 class OneProgress:
-    """The news of all shards as those of one run: as far as the slowest. Final; may be told from any thread."""
+    """Merges the news of all shards into those of one run, whose progress is the slowest shard's; thread-safe."""
 
     def __init__(self, shards: Sequence[Shard], tell: Callable[[News], None]) -> None:
         self._trials = {shard.number: shard.scenario.trials for shard in shards}
@@ -86,10 +87,10 @@ class OneProgress:
         self._latest: dict[int, News] = {}
         self._waited_for = set(self._trials)
         self.started: float | None = None
-        """When the first of them began, by the monotonic clock."""
+        """When the first shard began, by the monotonic clock."""
 
     def of(self, shard: Shard) -> Callable[[News], None]:
-        """What is to be told of one shard."""
+        """The function that takes the news of one shard."""
 
         def tell(news: News) -> None:
             with self._lock:
@@ -108,13 +109,13 @@ class OneProgress:
             self._latest[number] = news
             if len(self._latest) == len(self._trials):
                 self._tell(self._all())
-        elif kind != "moved":  # with the folder of all, which is told of itself
-            if kind == "ended" and number in self._latest:  # its last slots were too few to be told of
+        elif kind != "moved":  # a shard's folder moves with the run's, which is reported separately
+            if kind == "ended" and number in self._latest:  # its last slots were too few for a progress report
                 self._latest[number] = {**self._latest[number], "done": self._slots}
             self._tell({**news, "shard": number} if kind == "reconnected" else news)
 
     def _all(self) -> dict[str, Any]:
-        """The slowest one's place and rate, and errors over all trials."""
+        """The slowest shard's progress and rate, with the errors over all trials."""
         slowest = min(self._latest.values(), key=lambda news: int(news["done"]))
         total = sum(self._trials.values())
         errors = {
@@ -125,18 +126,19 @@ class OneProgress:
         return {**slowest, "squared_errors": errors}
 
 
+@final
 @dataclass
 class _Course:
-    """What has become of the shards so far. Final."""
+    """The state of the shards so far."""
 
     failures: list[tuple[Shard, BaseException]] = field(default_factory=list)
-    """In the order of time."""
+    """In order of time."""
     viewer: Viewer | None = None
 
     def launched(
         self, shard: Shard, at: RouterEndpoints, tell: Callable[[News], None], view: str, stop: threading.Event
     ) -> None:
-        """Launch one, its routers at places, to its end; whatever ends it early ends all."""
+        """Run one shard to its end, its routers at these endpoints; if it ends early, all shards end."""
         try:
             ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, shard=True)
         except BaseException as error:
@@ -147,7 +149,7 @@ class _Course:
 
     @property
     def fault(self) -> tuple[Shard, BaseException] | None:
-        """The first that failed; the others were interrupted because of it. None if all ended well, or by the user."""
+        """The first shard that failed, and so interrupted the others; None if all ended well, or by the user."""
         found = (one for one in self.failures if not isinstance(one[1], Interrupted))
         return next(found, None)
 
@@ -159,9 +161,9 @@ def launch_shards(
     tell: Callable[[News], None],
     stop: threading.Event,
 ) -> Ended:
-    """Run a scenario in its shards, all at once, into one results folder; raises as `launch` does.
+    """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
 
-    The view is of the first shard, which has the recorded trials.
+    The view shows the first shard, which has the recorded trials.
     """
     places = _places(scenario)
     held = HeldFolder(new_folder(folder))
@@ -171,7 +173,7 @@ def launch_shards(
     threads = [threading.Thread(target=course.launched, args=(*one, "off", stop)) for one in others]
     for thread in threads:
         thread.start()
-    # Here, not on a thread: a viewer ends with the thread that has started it.
+    # Here, not on another thread: a viewer ends with the thread that has started it.
     course.launched(*first, view, stop)
     for thread in threads:
         thread.join()
@@ -194,7 +196,7 @@ def launch_shards(
 
 
 def _places(scenario: Scenario) -> list[RouterEndpoints]:
-    """RouterEndpoints for all shards; of ports that are found one by one, two might be the same while nobody listens yet."""
+    """Router endpoints for all shards; free ports found one by one may coincide as long as no router listens on them."""
     found: list[RouterEndpoints] = []
     taken = set[int]()
     while len(found) < scenario.shards:
@@ -207,14 +209,14 @@ def _places(scenario: Scenario) -> list[RouterEndpoints]:
 
 
 def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course: _Course, started: float | None) -> int:
-    """Make the shards' results those of the run; its exit status. Raises what ended it, if anything did."""
-    from evedrop.live.launch.gathering import gather  # noqa: PLC0415 - tables take long to import, and the run can start before
+    """Merge the shards' results into the run's; returns its exit status. Raises the error that ended it, if there was one."""
+    from evedrop.live.launch.gathering import gather  # noqa: PLC0415 - slow to import: start the run first
 
     fault, how = course.fault, "interrupted" if course.failures else "complete"
     if fault is not None:
         shard, error = fault
         if isinstance(error, UsageError):
-            shutil.rmtree(folder)  # nothing that could be used was started
+            shutil.rmtree(folder)  # the run was not started
         if not isinstance(error, RunError):
             raise error
         how = shard.of_run(error)
@@ -222,8 +224,8 @@ def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course:
         summary = gather(scenario, folder, shards, started, how)
     except OSError as error:
         raise RunError(
-            f"the results of the shards cannot be made one ({error}); those of each are in {folder / _FOLDER}; free some "
-            "room, and run again"
+            f"the results of the shards cannot be merged ({error}); those of each are in {folder / _FOLDER}; free some "
+            "space, and run again"
         ) from error
     if fault is not None:
         raise RunError(how)

@@ -1,1 +1,1 @@
-"""The transport: sessions, who may use which key, the router, the relay, and what is sent again after a lost connection."""
+"""The transport: sessions, access to keys, the router, the relay, and resending after a lost connection."""

@@ -1,6 +1,6 @@
-"""Who may use which key: one table, from which the router's access control is made. Whatever is not in it is denied.
+"""The keys that each process may use: one table, from which the router's access control is made. All else is denied.
 
-Readers name every key they read: a wildcard subscription is not covered by exact rules and receives nothing.
+Readers name every key they read: exact rules do not cover a wildcard subscription, so it receives nothing.
 
 Source: docs/protocol.md, keys.
 """
@@ -17,7 +17,7 @@ from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROU
 
 @dataclass(frozen=True)
 class Grant:
-    """What one user may do; everything else is denied."""
+    """The rights of one user; everything else is denied."""
 
     process: str
     writes: tuple[str, ...]
@@ -26,19 +26,19 @@ class Grant:
     watches: tuple[str, ...] = ()
     """Liveliness tokens it may watch."""
     answers: tuple[str, ...] = ()
-    """RunKeys at which it may be asked."""
+    """Keys at which it may answer questions."""
     asks: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
-    """Liveliness tokens that it may ask for: its own, and so learns no more than that it is there."""
+    """Liveliness tokens that it may ask for: only its own, so it learns only that it is present itself."""
     further_tokens: tuple[str, ...] = ()
-    """Of those on whose behalf it speaks."""
+    """Liveliness tokens of the processes on whose behalf it speaks."""
     zid: str | None = None
-    """Its Zenoh id, of who has no user: the router, which does not ask to be let in."""
+    """The Zenoh id of a process that has no user name: the router, which does not log in."""
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """How a controller is connected."""
+    """A controller's connections."""
 
     acts_on: str
     """`estimate` or `truth`."""
@@ -47,7 +47,7 @@ class Wiring:
 
     @classmethod
     def of(cls, part: Mapping[str, Any] | None) -> Wiring | None:
-        """As a brief tells it; None without a controller."""
+        """The wiring in a brief's part; None without a controller."""
         return None if part is None else cls(**part)
 
     @property
@@ -57,9 +57,9 @@ class Wiring:
 
 
 def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, relayed: bool = False) -> list[Grant]:
-    """The table of docs/protocol.md for a run, with a controller if there is a loop; routers need none but to ask for themselves.
+    """The table of docs/protocol.md for a run, with a controller if there is a loop; routers may only ask for their own token.
 
-    relayed: whether there is a relay, which the observer watches and tells the end.
+    relayed: whether there is a relay, which the observer watches, and tells when the run ends.
     """
     keys = RunKeys(run)
     followers = (*receivers, OBSERVER)
@@ -123,7 +123,7 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
 def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any]:
     """The `access_control` section of the router's Zenoh configuration.
 
-    certified: whether who says to be a user must have that user's certificate, too.
+    certified: whether a user must have that user's certificate, too.
     """
     rules = [rule for grant in table for rule in _rules(grant)]
     return {
@@ -141,7 +141,7 @@ def _subject(grant: Grant, certified: bool) -> dict[str, Any]:
 
 
 def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
-    """Both directions of every permission: a writer must also learn that its reader is there."""
+    """Both directions of every permission: a writer must also learn that it has a reader."""
     kinds: list[tuple[str, str, str, tuple[str, ...]]] = [
         ("write", "ingress", "put", grant.writes),
         ("reader", "egress", "declare_subscriber", grant.writes),

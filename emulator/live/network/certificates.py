@@ -1,4 +1,4 @@
-"""What a process does with its certificate: see that it fits before anything is tried, and hand it to Zenoh.
+"""A process's certificate: checks that it fits before any connection is tried, and hands it to Zenoh.
 
 Source: docs/protocol.md, certificates.
 """
@@ -21,14 +21,14 @@ _AGAIN = "write the briefs again with `evedrop brief`, all of them"
 
 
 def check_identity(identity: Identity, process: str, now: datetime.datetime | None = None) -> None:
-    """Raise BriefError unless a process can show this identity now; now: default the clock's."""
+    """Raise BriefError unless a process can use this identity now; now: by default, the clock's time."""
     now = now or datetime.datetime.now(datetime.UTC)
     try:
         authority = x509.load_pem_x509_certificate(identity.authority.encode())
         certificate = x509.load_pem_x509_certificate(identity.certificate.encode())
         key = load_pem_private_key(identity.key.encode(), None)
     except (ValueError, TypeError) as error:
-        raise BriefError(f"identity is none ({_first_line(error)}); {_AGAIN}") from error
+        raise BriefError(f"identity cannot be read ({_first_line(error)}); {_AGAIN}") from error
     form = (Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     if key.public_key().public_bytes(*form) != certificate.public_key().public_bytes(*form):
         raise BriefError(f"identity.key is not that of identity.certificate; {_AGAIN}")
@@ -54,12 +54,12 @@ def check_identity(identity: Identity, process: str, now: datetime.datetime | No
 
 
 def name_of(certificate: x509.Certificate) -> str:
-    """Whose it is."""
+    """Name of the process or authority that a certificate belongs to."""
     return _common_name(certificate.subject)
 
 
 def maker_of(certificate: bytes) -> str:
-    """The name of the authority that a certificate, in DER, says it is of. Raises ValueError if it is no certificate."""
+    """Name of the authority that a DER certificate gives as its issuer. Raises ValueError if it is not a certificate."""
     return _common_name(x509.load_der_x509_certificate(certificate).issuer)
 
 

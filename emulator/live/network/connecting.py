@@ -1,6 +1,6 @@
-"""How a process gets to the router: it waits for one that is not there yet, and says at once what no waiting mends.
+"""Connecting to the router: a process waits for a router that is not there yet, but reports lasting errors at once.
 
-Zenoh alone cannot tell these apart: whatever is wrong, it says after its time limit that it could not connect.
+Zenoh alone cannot tell these apart: for any error it only reports, after its time limit, that it could not connect.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief import Identity
 
 WAITING_SECONDS = 3.0
-"""After which a process says that it still waits for its router, and again after each so many."""
+"""How often a process says that it still waits for its router."""
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ATTEMPT_SECONDS = 3.0
-_UNKNOWN_HOST_SECONDS = 2.5  # a host that is just coming up may not be named yet
-_REFUSALS, _REFUSED_SECONDS = 4, 1.5  # a router that is just coming up may hang up once
-_QUICK_SECONDS = 2.0  # a refusal comes at once; what takes longer is a machine that is busy
+_UNKNOWN_HOST_SECONDS = 2.5  # the name of a host that is just starting may not be known yet
+_REFUSALS, _REFUSED_SECONDS = 4, 1.5  # a router that is just starting may hang up once
+_QUICK_SECONDS = 2.0  # a refusal comes at once; a slower failure means that the machine is busy
 
 _NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of OpenSSL's X509_V_ERR
 
 
 @dataclass(frozen=True)
 class RouterAddress:
-    """Where to, with what, and whose."""
+    """A router's address, and the configuration and user to connect with."""
 
     router: str
     """Zenoh endpoint."""
     run: str
     config: dict[str, Any]
-    """Zenoh's; one attempt."""
+    """Zenoh's configuration for one attempt."""
     identity: Identity | None = None
     process: str = "operator"
-    """Who asks to be let in."""
+    """The connecting process."""
 
 
 @final
 class Waiting:
-    """Says every few seconds on standard error that a process waits for its router."""
+    """Reports every few seconds on standard error that a process waits for its router."""
 
     def __init__(self, process: str, router: str) -> None:
         self._process, self._router = process, router
         self.begin()
 
     def begin(self, again: bool = False) -> None:
-        """The waiting begins now. again: because a connection was lost."""
+        """Start the clock. again: because a connection was lost."""
         self._began = self._said = time.monotonic()
         self._what = "lost the connection; waiting again" if again else "waiting"
 
     def look(self, why: object) -> None:
-        """Say that it goes on, if it is time to; why: what came of the last attempt."""
+        """Report that the process still waits, if a report is due; why: the result of the last attempt."""
         now = time.monotonic()
         if now - self._said >= WAITING_SECONDS:
             self._said = now
@@ -70,7 +70,7 @@ class Waiting:
             sys.stderr.flush()
 
     def attempt(self, connect: Callable[[], zenoh.Session]) -> zenoh.Session:
-        """What `connect` returns; where that raises, the waiting goes on."""
+        """Return the session that `connect` opens; if `connect` raises, report that the process still waits, and re-raise."""
         try:
             return connect()
         except (OSError, zenoh.ZError) as error:
@@ -83,9 +83,9 @@ def _reason(error: OSError | zenoh.ZError) -> object:
 
 
 def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None) -> zenoh.Session:
-    """A session with the router; `meanwhile` is called again and again until there is one.
+    """Open a session with the router; `meanwhile` is called before each attempt.
 
-    Raises BriefError for what no waiting mends, RunError if no router has answered after so many seconds.
+    Raises BriefError for an error that waiting cannot mend, RunError if no router has answered after `patience` seconds.
     """
     endpoint = endpoint_of(door.router, door.identity)
     began = time.monotonic()
@@ -108,20 +108,21 @@ def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None
             if failures.refused:
                 raise BriefError(
                     f"{door.router} does not let this brief in, which is of run {door.run}: the router there is of another run, "
-                    "or something else listens there; start the router of this run, or give the brief of that one"
+                    "or another program listens there; start the router of this run, or give the brief of that one"
                 ) from error
             if time.monotonic() - began > patience:
                 raise RunError(
-                    f"no router answered at {door.router} within {patience:.0f} s ({why}); start it there, and see that no "
-                    "firewall is between"
+                    f"no router answered at {door.router} within {patience:.0f} s ({why}); start it there, and check that no "
+                    "firewall is in between"
                 ) from error
             waiting.look(why)
         time.sleep(pause)
         pause = min(longest, pause * 1.5)
 
 
+@final
 class Failures:
-    """What came of the attempts so far. Final."""
+    """The results of the attempts so far."""
 
     def __init__(self) -> None:
         self._unknown: float | None = None
@@ -129,11 +130,11 @@ class Failures:
         self._refusals = 0
 
     def add(self, error: Exception, seconds: float) -> None:
-        """Take an attempt that failed after so many seconds."""
+        """Add an attempt that failed after `seconds`."""
         now = time.monotonic()
         unknown = isinstance(error, socket.gaierror)
         self._unknown = (self._unknown or now) if unknown else None
-        # Whoever listens and hangs up does not want us; one that is slow, or not there, may still come.
+        # A listener that hangs up refuses us; one that is slow, or not there, may still answer.
         hung_up = isinstance(error, zenoh.ZError | ssl.SSLError | ConnectionResetError | BrokenPipeError)
         if hung_up and seconds < _QUICK_SECONDS:
             self._refused, self._refusals = self._refused or now, self._refusals + 1
@@ -142,12 +143,12 @@ class Failures:
 
     @property
     def unknown_seconds(self) -> float:
-        """For how long the host has not been known."""
+        """For how long the host's name has been unknown."""
         return 0.0 if self._unknown is None else time.monotonic() - self._unknown
 
     @property
     def refused(self) -> bool:
-        """Whether it is certain that we are not wanted."""
+        """Whether it is certain that the router refuses this process."""
         return (
             self._refused is not None
             and self._refusals >= _REFUSALS
@@ -156,7 +157,7 @@ class Failures:
 
 
 def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
-    """Where a brief says the router is. Raises BriefError if that is nowhere, or needs what the brief does not have."""
+    """The router's endpoint in a brief. Raises BriefError if it is malformed, or does not fit the brief's identity."""
     try:
         endpoint = Endpoint.of(router)
     except ValueError as error:
@@ -168,22 +169,22 @@ def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
 
 
 def _knock(endpoint: Endpoint, door: RouterAddress) -> None:
-    """See whether something listens there and, by its certificate, is the router of this run.
+    """Check that a program listens there and, by its certificate, is the router of this run.
 
-    Raises OSError if nothing does, BriefError if the certificate is not to be believed.
+    Raises OSError if none does, BriefError if the certificate cannot be trusted.
     """
     try:
         with socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS) as link:
             if door.identity is not None:
                 trust = ssl.create_default_context(cadata=door.identity.authority)
-                # The router shows its certificate first, and nothing more is asked of it here.
+                # The router shows its certificate first; nothing more is needed here.
                 trust.wrap_socket(link, server_hostname=endpoint.host).close()
     except ssl.SSLCertVerificationError as error:
         raise _mistrusted(endpoint, door, error) from error
 
 
 def _mistrusted(endpoint: Endpoint, door: RouterAddress, error: ssl.SSLCertVerificationError) -> BriefError:
-    """Why the certificate that is shown at an endpoint cannot be believed."""
+    """The error that says why an endpoint's certificate cannot be trusted."""
     if error.verify_code in {_NOT_YET_VALID, _EXPIRED}:
         return BriefError(
             f"{door.router}: the router's certificate is not valid now by this host's clock ({error.verify_message}); set the "
@@ -197,14 +198,14 @@ def _mistrusted(endpoint: Endpoint, door: RouterAddress, error: ssl.SSLCertVerif
         )
     whose = f"has a certificate of {maker}, and this brief is of run {door.run}"
     if error.verify_code == _WRONG_PURPOSE:
-        whose = f"has the certificate of another process of {maker}, and is no router"
+        whose = f"has the certificate of another process of {maker}, and is not a router"
     return BriefError(
-        f"{door.router}: what listens there {whose}; start the router of this run there, or give the brief of that one"
+        f"{door.router}: the program listening there {whose}; start the router of this run there, or give the brief of that one"
     )
 
 
 def _maker_at(endpoint: Endpoint) -> str:
-    """Who is said to have made the certificate that is shown at an endpoint."""
+    """Name of the authority that an endpoint's certificate gives as its issuer."""
     from evedrop.live.network.certificates import maker_of  # noqa: PLC0415 - 50 ms that only a failure needs
 
     anybody = ssl.create_default_context()
@@ -216,4 +217,4 @@ def _maker_at(endpoint: Endpoint) -> str:
         ):
             return maker_of(shown.getpeercert(binary_form=True) or b"")
     except (OSError, ValueError):
-        return "somebody else"
+        return "an unknown authority"

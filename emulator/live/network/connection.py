@@ -1,7 +1,7 @@
-"""A process's connection with its router: one Zenoh session after another, with all that the process has declared on each.
+"""A process's connection with its router: one Zenoh session after another, each with everything the process has declared.
 
-Zenoh itself would connect a session again, and then may deliver one key's messages to another key's subscriber
-(docs/upstream.md). So a session that has lost its router is closed, and another one is opened: nothing is left in it that
+Zenoh would reconnect a session by itself, but then may deliver one key's messages to another key's subscriber
+(docs/upstream.md). So a session that has lost its router is closed and another one is opened, which holds nothing that
 could be out of date.
 
 Source: docs/protocol.md, lost connections.
@@ -23,7 +23,7 @@ from evedrop.live.network.declared import Declared, Inbox, Watch
 
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ANSWER_SECONDS = 1.0
-_RENEW_SECONDS = 1.0  # between sessions that are given up because they take one key for another
+_RENEW_SECONDS = 1.0  # between sessions that are closed because they confuse keys
 _POLL_SECONDS = 0.02
 _LINGER_SECONDS = 10.0  # longer than a router needs to find out that a connection is lost
 
@@ -32,10 +32,10 @@ One = TypeVar("One", bound=Declared)
 
 @final
 class Connection:
-    """For several threads; close it, or its threads outlive the program.
+    """A connection that survives the loss of a session; thread-safe; close it, or its threads outlive the program.
 
-    first: the open session. again: one attempt to open another; None of a router, which is the one that others connect to.
-    changed: told of each loss with false, of each new session with true, on a thread of its own.
+    first: the open session. again: makes one attempt to open another; None for a router, to which the others connect.
+    changed: called with false at each loss, with true at each new session, on a thread of the connection's.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Connection:
         self._over = threading.Event()
         self._keeper: threading.Thread | None = None
         self.session = first
-        """The session of now, which is closed while another one is opened."""
+        """The current session, which is closed while another one is opened."""
         self._opened = time.monotonic()
         self.openings = 1
         """How many sessions there have been."""
@@ -63,20 +63,20 @@ class Connection:
             self._keeper.start()
 
     def add(self, one: One) -> One:
-        """Declare something, now and on every later session."""
+        """Declare an object, now and on every later session."""
         with self._lock:
             self._declared.append(one)
             self._declare(self.session, one)
         return one
 
     def appear(self, key: str) -> None:
-        """Show that this process is there, now and on every later session."""
+        """Show that this process is present, now and on every later session."""
         with self._lock:
             self._token_key = key
             self._show(self.session)
 
     def disappear(self) -> None:
-        """Withdraw what `appear` shows."""
+        """Withdraw the token that `appear` declared."""
         with self._lock:
             self._token_key = None
             if self._token is not None and not self.session.is_closed():
@@ -84,12 +84,12 @@ class Connection:
                     self._token.undeclare()  # type: ignore[no-untyped-call]
 
     def renew(self) -> None:
-        """Open another session, since this one takes one key for another; but not one after another."""
+        """Open another session, since this one confuses keys; at most once per second."""
         if self._again is not None and time.monotonic() - self._opened > _RENEW_SECONDS:
             self._losses.put(self.session)
 
     def close(self) -> None:
-        """For good."""
+        """Close the connection for good."""
         self._over.set()
         self._losses.put(None)
         if self._keeper is not None and self._keeper is not threading.current_thread():
@@ -100,7 +100,7 @@ class Connection:
                 one.close()
 
     def _declare(self, session: zenoh.Session, one: Declared) -> None:
-        """On a session that may be closed already: the next one is given all of it."""
+        """Declare an object on a session that may be closed already: the next session will have it, too."""
         try:
             one.declare(session)
         except zenoh.ZError:
@@ -113,7 +113,7 @@ class Connection:
                 self._token = session.liveliness().declare_token(self._token_key)
 
     def _listen(self, session: zenoh.Session) -> None:
-        """Notice when the session loses its router. To close it here, on a thread of Zenoh's, would be a deadlock."""
+        """Notice when the session loses its router. Closing it here, on a thread of Zenoh's, would deadlock."""
         session.info.declare_transport_events_listener(
             lambda event: self._losses.put(session) if event.kind == zenoh.SampleKind.DELETE else None
         )
@@ -143,7 +143,7 @@ class Connection:
             return
 
     def _adopt(self, session: zenoh.Session) -> None:
-        """Declare everything on another session, in the order of before; last that this process is there."""
+        """Declare everything on another session, in the same order; the token of this process comes last."""
         with self._lock:
             self.session, self._opened = session, time.monotonic()
             self.openings += 1
@@ -158,9 +158,9 @@ class Connection:
             self._show(session)
 
     def _wait_for_own_end(self, session: zenoh.Session, key: str) -> None:
-        """Wait until the router knows that the former session is lost: others must see this process go and come back.
+        """Wait until the router knows that the previous session is lost: others must see this process leave and return.
 
-        It may find out later than this process: then it still has the former token, and another one would not be news.
+        The router may find out later than this process: until then it has the previous token, and a new one would not show.
         """
         deadline = time.monotonic() + _LINGER_SECONDS
         with suppress(zenoh.ZError):

@@ -1,6 +1,6 @@
-"""How the user who started a run gets at it while it goes on: `control.json` in its results folder, mode 0600.
+"""The operator's access to a run while it goes on: `control.json` in the run's results folder, mode 0600.
 
-It is written when the run starts and removed when it ends, whatever ends it.
+The file is written when the run starts and removed when it ends, for whatever reason.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _MOST_BYTES = 2**20
 
 @dataclass(frozen=True)
 class Control:
-    """Where the router of a run is, and the operator's credentials, made for this run alone."""
+    """The address of a run's router, and the operator's credentials, made for this run alone."""
 
     run: str
     router: str
@@ -29,10 +29,10 @@ class Control:
     user: str
     password: str
     identity: Identity | None = None
-    """The operator's, of a run whose router takes certificates."""
+    """The operator's certificate and key, if the run's router takes certificates."""
 
     def write(self, folder: Path) -> None:
-        """Write it into a results folder, readable by nobody else."""
+        """Write the file into a results folder, readable by its owner only."""
         unfinished = folder / f"{_NAME}.new"
         with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             json.dump(asdict(self), file, indent=1)
@@ -40,26 +40,26 @@ class Control:
 
 
 def remove_control(folder: Path) -> None:
-    """The run is over: nobody can get at it any more."""
-    with suppress(OSError):  # of a disk that cannot be written any more: the password is of no run then
+    """Remove the control file of a run that is over."""
+    with suppress(OSError):  # the disk may not be writable any more; the password is useless after the run
         (folder / _NAME).unlink()
 
 
 def no_run(folder: Path, why: str) -> UsageError:
-    """The error of who would steer a run that does not go on."""
+    """The error for steering a run that is not going on; why: how that was found out."""
     return UsageError(
         f"no run is going on in {folder}; {why}; give the results folder of a run between its start and its end"
     )
 
 
 def read_controls(folder: Path) -> list[Control]:
-    """The control file of a run that goes on, or those of its shards. Raises UsageError as `read_control` does."""
+    """Read the control file of a run that goes on, or those of its shards. Raises UsageError as `read_control` does."""
     shards = sorted(path.parent for path in folder.glob(f"shards/*/{_NAME}"))
     return [read_control(shard) for shard in shards] or [read_control(folder)]
 
 
 def read_control(folder: Path) -> Control:
-    """The control file of a run that goes on. Raises UsageError if there is none, or it is none."""
+    """Read the control file of a run that goes on. Raises UsageError if there is none, or it is malformed."""
     path = folder / _NAME
     try:
         found = json.loads(text_of(path, _MOST_BYTES))
@@ -72,9 +72,9 @@ def read_control(folder: Path) -> Control:
         why = "it is over" if over else f"it has no {_NAME} (yet)" if is_folder(folder) else "there is no such folder"
         raise no_run(folder, why) from error
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise no_run(folder, f"{path.name} is not one ({error})") from error
+        raise no_run(folder, f"{path.name} is not a control file ({error})") from error
     entries = asdict(control)
     texts = [*(entries.pop("identity") or {}).values(), *entries.values()]
     if not all(isinstance(value, str) for value in texts):
-        raise no_run(folder, f"{path.name} is not one (an entry is no string)")
+        raise no_run(folder, f"{path.name} is not a control file (an entry is not a string)")
     return control

@@ -1,6 +1,6 @@
-"""What a process declares on its session, in a form that can be declared again on the next session.
+"""Publishers, subscribers and the like that a process declares on its session, and again on each later session.
 
-Each keeps what it has towards the process: an inbox is read on without a break while its subscriber is replaced by another.
+The process keeps one object: it reads an inbox without a break while another subscriber replaces the inbox's own.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from evedrop.live.protocol.whereabouts import Place
 
 
 class Declared(Protocol):
-    """Anything that is declared on every session of a process."""
+    """An object that is declared on every session of a process."""
 
     def declare(self, session: zenoh.Session) -> None:
-        """Declare it on this session; the former one is closed."""
+        """Declare it on this session; the previous session is closed."""
 
 
 class InboxClosedError(Exception):
@@ -34,7 +34,7 @@ class Inbox:
     """A subscription to one exact key, read in order with `recv`."""
 
     def __init__(self, key: str, dropped: Dropped, place: Place, room: int) -> None:
-        """place: of the process, which is there waiting while it reads; room: for so many messages."""
+        """place: of the process, which records there that it waits; room: how many messages the inbox holds."""
         self._room = room
         self._key, self._head, self._dropped, self._place = key, head_of(key), dropped, place
         self._waits = (key,)
@@ -42,11 +42,11 @@ class Inbox:
         self._subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
 
     def declare(self, session: zenoh.Session) -> None:
-        """Subscribe; what arrived before is read first."""
+        """Subscribe; messages that arrived on earlier sessions are read first."""
         self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(self._room)))
 
     def close(self) -> None:
-        """There will be no other session."""
+        """End the inbox: there will be no other session."""
         self._subscribers.put(None)
 
     def recv(self) -> bytes:
@@ -64,7 +64,7 @@ class Inbox:
                     raise InboxClosedError(self._key)
             try:
                 message = self._subscriber.recv().payload.to_bytes()
-            except zenoh.ZError:  # its session is closed, and all that had arrived is read
+            except zenoh.ZError:  # its session is closed, and all messages that had arrived are read
                 self._subscriber = None
                 continue
             payload = self._dropped.contents(self._key, self._head, message)
@@ -79,7 +79,7 @@ class Inbox:
 
 @final
 class Funnel:
-    """A subscription to one exact key whose messages are handed on by a thread of Zenoh's."""
+    """A subscription to one exact key; a thread of Zenoh's hands its messages on."""
 
     def __init__(self, key: str, dropped: Dropped, receive: Callable[[bytes], None]) -> None:
         self._key, self._head, self._dropped, self._receive = key, head_of(key), dropped, receive
@@ -96,7 +96,7 @@ class Funnel:
 
 @final
 class Outlet:
-    """A publisher for one exact key. What is put while there is no connection is lost, and sent again in a later round."""
+    """A publisher for one exact key. Messages put without a connection are lost, and sent again in a later round."""
 
     def __init__(self, key: str) -> None:
         self.key, self._head = key, head_of(key)
@@ -123,7 +123,7 @@ class Outlet:
 
     @property
     def matched(self) -> bool:
-        """Whether somebody reads the key."""
+        """Whether the key has a reader."""
         publisher, session = self._publisher, self._session
         if publisher is None or session is None or session.is_closed():
             return False
@@ -132,15 +132,16 @@ class Outlet:
         return False
 
 
+@final
 class Question:
-    """What somebody asks, to be answered once. Final."""
+    """A question from another process, to be answered once."""
 
     def __init__(self, key: str, query: zenoh.Query, payload: bytes) -> None:
         self._key, self._query = key, query
         self.payload = payload
 
     def answer(self, payload: bytes) -> None:
-        """Send the answer, if whoever asked is still there."""
+        """Send the answer, if the asking process is still connected."""
         with suppress(zenoh.ZError):
             self._query.reply(self._key, head_of(self._key) + payload)
         self._query.drop()  # type: ignore[no-untyped-call]
@@ -148,13 +149,13 @@ class Question:
 
 @final
 class Questions:
-    """A key at which this process is asked; each question is handed on by a thread of Zenoh's."""
+    """A key at which this process answers questions; a thread of Zenoh's hands each question on."""
 
     def __init__(self, key: str, dropped: Dropped, receive: Callable[[Question], None]) -> None:
         self._key, self._head, self._dropped, self._receive = key, head_of(key), dropped, receive
 
     def declare(self, session: zenoh.Session) -> None:
-        """Be asked."""
+        """Accept questions on this session."""
         session.declare_queryable(self._key, self._take)
 
     def _take(self, query: zenoh.Query) -> None:
@@ -168,17 +169,17 @@ class Questions:
 
 @final
 class Watch:
-    """Whether a process is on the network. `changed` is told of every change, on a thread of Zenoh's or of the connection's."""
+    """Whether a process is on the network. Calls `changed` at every change, on a thread of Zenoh's or of the connection's."""
 
     def __init__(self, key: str, changed: Callable[[bool], None]) -> None:
         self._key, self._changed = key, changed
         self._lock = threading.Lock()
         self._session = 0
-        """Number of the session that it listens to: what an earlier one still says is out of date."""
+        """Number of the session that it listens to: messages of an earlier session are out of date."""
         self._there = False
 
     def declare(self, session: zenoh.Session) -> None:
-        """Watch, beginning with how it is now."""
+        """Watch on this session, beginning with the present state."""
         with self._lock:
             self._session += 1
             number = self._session
@@ -187,7 +188,7 @@ class Watch:
         )
 
     def lose(self) -> None:
-        """The connection is lost, and with it the sight of everybody."""
+        """Handle the loss of the connection: the process counts as absent."""
         with self._lock:
             self._session += 1
             number = self._session

@@ -1,6 +1,6 @@
-"""Deliveries that take a part of a slot in real time: put when they are due, in order, while the router goes on.
+"""Deliveries delayed by a fraction of a slot in real time: sent when they are due, in order, while the router goes on.
 
-Whole slots of delay are emulated time, the same in every run; this is only when a message really goes out.
+Delays of whole slots are emulated time, the same in every run; this module only decides when a message is really sent.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ import itertools
 import threading
 import time
 from collections.abc import Callable
+from typing import final
 
 Put = Callable[[bytes], None]
 
 
+@final
 class DelayedSender:
-    """Puts messages at their times, on a thread of its own. Final; daemonic, since a run ends when all have arrived."""
+    """Sends messages when they are due, on a daemon thread of its own: a run ends only when all have arrived."""
 
     def __init__(self) -> None:
         self._due: list[tuple[float, int, Put, bytes]] = []
@@ -24,7 +26,7 @@ class DelayedSender:
         threading.Thread(target=self._go_round, name="postman", daemon=True).start()
 
     def round(self, put: Put) -> Callable[[bytes, float], None]:
-        """An outlet for messages that go out some seconds later each, but never before the one before."""
+        """An outlet that sends each message the given seconds later, but never before the previous message."""
         last = 0.0
 
         def send(payload: bytes, seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""An endpoint of Zenoh's, `tcp/HOST:PORT` or `tls/HOST:PORT`: where a router listens, and where the others find it."""
+"""Zenoh endpoints, `tcp/HOST:PORT` or `tls/HOST:PORT`: a router listens there, and the other processes connect there."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ _MOST_LABEL = 63
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Its parts."""
+    """The parts of an endpoint."""
 
     protocol: str
-    """`tcp`, in clear, or `tls`."""
+    """`tcp`, unencrypted, or `tls`."""
     host: str
-    """A name or an address; one of IPv6 without brackets."""
+    """A name or an address; an IPv6 address without brackets."""
     port: int
 
     @classmethod
     def of(cls, text: str) -> Endpoint:
-        """The endpoint that a text names. Raises ValueError if it names none."""
+        """Parse an endpoint. Raises ValueError if the text is not an endpoint."""
         found = _FORM.fullmatch(text)
         if found is None:
-            raise ValueError(f"{text} is no endpoint")
+            raise ValueError(f"{text} is not an endpoint")
         protocol, sixth, host, port = found.groups()
         endpoint = cls(protocol, sixth or host, int(port))
         if not 0 < endpoint.port < 2**16:
@@ -43,7 +43,7 @@ class Endpoint:
 
     @property
     def address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-        """The host's, if it is given by one."""
+        """The host's address, if the host is given as an address."""
         try:
             return ipaddress.ip_address(self.host)
         except ValueError:
@@ -51,22 +51,22 @@ class Endpoint:
 
     @property
     def secure(self) -> bool:
-        """Whether what goes over it is encrypted, and both ends show who they are."""
+        """Whether messages are encrypted, and both ends show certificates."""
         return self.protocol == "tls"
 
     @property
     def loopback(self) -> bool:
-        """Whether nobody but this machine can get at it."""
+        """Whether only this machine can reach it."""
         return self.host == "localhost" or (self.address is not None and self.address.is_loopback)
 
     @property
     def everywhere(self) -> bool:
-        """Whether it is every address of a machine: to listen on, and not to connect to."""
+        """Whether it stands for every address of a machine: a router can listen there, but nothing can connect there."""
         return self.address is not None and self.address.is_unspecified
 
     @property
     def nearby(self) -> Endpoint:
-        """Where whoever listens there is found from the same machine."""
+        """The endpoint at which processes of the same machine reach a router that listens here."""
         if not self.everywhere:
             return self
         return replace(self, host="::1" if ":" in self.host else "127.0.0.1")

@@ -1,4 +1,4 @@
-"""Whether a process is on the network now: asked of the router, for only what it says holds for everybody else."""
+"""Whether a process is on the network now, according to the router: only the router's view counts for other processes."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _ANSWER_SECONDS = 3.0
 
 
 def is_there(brief: Brief) -> bool:
-    """Whether the router knows the process of a brief to be there: connected, ready, and not lost since.
+    """Whether the router sees the process of a brief: connected, ready, and not lost since.
 
-    It is asked with the credentials of the process itself, which may ask for nobody else.
+    Asks with the credentials of the process itself, which may ask for no other process.
     """
     zenoh.init_log_from_env_or("off")
     config = client_config(brief)
     config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
     if brief.role in {"router", "relay"}:
-        # Asked of itself; where it listens may be everywhere: by that name it has no certificate.
+        # The router asks itself. It may listen on every address, which its certificate does not name.
         listens = brief.part["listen"] if brief.role == "relay" else brief.router
         config["connect"]["endpoints"] = [str(Endpoint.of(listens).nearby)]
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False

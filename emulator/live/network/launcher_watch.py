@@ -1,4 +1,4 @@
-"""What a process does when whoever launched it is gone."""
+"""Detects that the launcher of a process is gone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None
     """
 
     def wait() -> None:
-        # Not sys.stdin: a thread that waits in its lock makes the interpreter abort when it ends.
+        # Not sys.stdin: a thread that waits in its lock makes the interpreter abort at exit.
         rest = b""
         while read := os.read(0, 4096):
             *lines, rest = (rest + read).split(b"\n")
@@ -27,7 +27,7 @@ def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None
 
 
 def launcher_is_gone() -> bool:
-    """Whether the other end of standard input, a pipe, is closed: known at once, whichever thread is scheduled."""
+    """Whether the other end of standard input, a pipe, is closed; asks the system, so it does not depend on a thread."""
     poll = select.poll()
     poll.register(0, 0)
     return bool(poll.poll(0))

@@ -1,4 +1,4 @@
-"""A process that has had no connection with its router for too long ends itself: nobody can tell it that the run is over."""
+"""A process that has had no connection with its router for too long ends itself: the observer cannot tell it to end."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Lifeline:
         self._released = False
 
     def changed(self, connected: bool) -> None:
-        """The connection was lost or is back."""
+        """Handle the loss or the return of the connection."""
         self._set(lost=not connected)
 
     def release(self) -> None:
-        """The process closes its connection itself."""
+        """Stop watching: the process closes its connection itself."""
         self._released = True
         self._set(lost=False)
 
@@ -43,7 +43,7 @@ class Lifeline:
     def _give_up(self) -> None:
         sys.stderr.write(
             f"evedrop: {self._brief.process} has had no connection with the router at {self._brief.router} for "
-            f"{self._brief.flow.longest_outage:g} s; look whether the router runs and can be reached\n"
+            f"{self._brief.flow.longest_outage:g} s; check that the router runs and can be reached\n"
         )
         sys.stderr.flush()
         os._exit(RunError.exit_status)

@@ -1,8 +1,8 @@
-"""Two routers that are linked: who is at which, and the keys that cross between them. What need not cross is denied.
+"""Two linked routers: which process connects to which, and the keys that cross between them. All other keys are denied.
 
     sensor ── router ═════ relay ── receivers, observer, operator
 
-The first is the router, which decides every fate, at the sensor's site; the relay only passes on, at the receivers'.
+The router, at the sensor's site, decides every fate; the relay, at the receivers' site, only passes messages on.
 
 Source: docs/protocol.md, two routers.
 """
@@ -17,7 +17,7 @@ _NEAR = frozenset({SENSOR, ROUTER})
 
 
 def at_router(run: str, table: list[Grant]) -> list[Grant]:
-    """Who is let in at the router, when there is a relay: those at its own site, and the relay for all others."""
+    """The grants at the router, when there is a relay: processes of its own site, and the relay on behalf of all others."""
     to_router, from_router = _crossing(table)
     near, far = _sites(table)
     relay = Grant(
@@ -27,7 +27,7 @@ def at_router(run: str, table: list[Grant]) -> list[Grant]:
 
 
 def at_relay(run: str, table: list[Grant], zid: str) -> list[Grant]:
-    """Who is let in at the relay: those of its site, and the router, by its Zenoh id, for all others."""
+    """The grants at the relay: processes of its own site, and the router, known by its Zenoh id, for all others."""
     to_router, from_router = _crossing(table)
     near, far = _sites(table)
     token = RunKeys(run).alive(ROUTER)
@@ -44,11 +44,12 @@ def _tokens(site: list[Grant]) -> tuple[str, ...]:
 
 
 def _crossing(table: list[Grant]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The keys that go to the router's site, and those that come from it."""
+    """The keys of messages that go to the router's site, and of those that come from it."""
     keys = dict.fromkeys(key for grant in table for key in (*grant.writes, *grant.reads))
     to_router, from_router = [], []
     for key in keys:
-        # What nobody else writes is the router's, and so is what nobody else reads, but for what the relay is told.
+        # The router writes the keys that no process in the table writes; it reads those that none reads, except the
+        # relay's control key.
         writers = {one.process for one in table if key in one.writes} or {ROUTER}
         other = RELAY if key.endswith(f"/control/{RELAY}") else ROUTER
         readers = {one.process for one in table if key in one.reads} or {other}

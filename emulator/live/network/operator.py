@@ -1,4 +1,4 @@
-"""What the operator asks of a run that goes on, and what it is answered: a query of Zenoh's to the observer.
+"""The operator's requests to a run that goes on, and the answers: a Zenoh query to the observer.
 
 Source: docs/protocol.md, request and answer.
 """
@@ -20,28 +20,28 @@ from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import OBSERVER
 
 DOES = ("link", "pause", "resume", "step", "status")
-"""What can be asked for."""
+"""The possible requests."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """One thing the operator asks for."""
+    """One request of the operator."""
 
     do: str
     """One of `DOES`."""
     event: Mapping[str, Any] | None = None
-    """Of `link`: what an [[event]] of a scenario says, but when."""
+    """For `link`: the entries of an [[event]] of a scenario, except its time."""
     slots: int | None = None
-    """Of `step`."""
+    """For `step`."""
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         optional = {"event": self.event, "slots": self.slots}
         return pack({"do": self.do, **{name: value for name, value in optional.items() if value is not None}})
 
 
 def read_request(key: str, payload: bytes) -> Request:
-    """The request in a message. Raises MalformedMessage if it is none."""
+    """Decode a request. Raises MalformedMessage if the message is not a request."""
     message = Reader(key, payload)
     do = message.text("do")
     if do not in DOES:
@@ -54,19 +54,19 @@ def read_request(key: str, payload: bytes) -> Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a request."""
+    """The answer to a request."""
 
     slot: int | None = None
-    """The slot from which on it holds."""
+    """The slot from which on the request takes effect."""
     said: str = ""
-    """As a sentence."""
+    """The effect, as a sentence."""
     refused: tuple[str, ...] = ()
-    """What is wrong with it, a line each; nothing has changed then."""
+    """The mistakes in the request, a line each; then nothing has changed."""
     status: Mapping[str, Any] | None = None
-    """How the run is doing, for who asked for that."""
+    """The run's status, if the request was `status`."""
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         if self.refused:
             return pack({"refused": list(self.refused)})
         if self.status is not None:
@@ -75,7 +75,7 @@ class Answer:
 
 
 def read_answer(key: str, payload: bytes) -> Answer:
-    """The answer in a message. Raises MalformedMessage if it is none."""
+    """Decode an answer. Raises MalformedMessage if the message is not an answer."""
     message = Reader(key, payload)
     if message.has("refused"):
         return Answer(refused=message.names("refused"))
@@ -85,13 +85,13 @@ def read_answer(key: str, payload: bytes) -> Answer:
 
 
 def ask(control: Control, request: Request, patience: float) -> Answer | None:
-    """Ask the observer of a run; None if nobody answers within so many seconds, because the run is over or ends.
+    """Ask the observer of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
 
-    Raises zenoh.ZError if the router is not there or does not let us in.
+    Raises zenoh.ZError if the router is not there or refuses the operator.
     """
     zenoh.init_log_from_env_or("off")
     key = RunKeys(control.run).control(OBSERVER)
-    # A run that goes on has a router: one attempt will do.
+    # A run that goes on has a router: one attempt is enough.
     with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
         for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
             answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())

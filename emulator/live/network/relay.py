@@ -1,4 +1,4 @@
-"""The relay: the second of two routers, at the receivers' site. It decides nothing, and passes on what is granted.
+"""The relay: the second of two routers, at the receivers' site. It decides nothing, and passes on the granted messages.
 
 Source: docs/protocol.md, two routers.
 """
@@ -16,15 +16,15 @@ from evedrop.live.protocol.brief import Brief
 
 
 def relay(brief: Brief) -> None:
-    """Run the relay of a brief until the conductor ends it and everybody at it has left.
+    """Run the relay of a brief until the conductor ends it and all processes connected to it have left.
 
-    Raises BriefError if it does not fit, RunError if there is no router within the brief's patience.
+    Raises BriefError if the router does not accept the brief, RunError if no router answers within the brief's patience.
     """
     part = brief.part
     table = at_relay(
         brief.run, grants(brief.run, tuple(part["receivers"]), Wiring.of(part["controller"]), relayed=True), part["zid"]
     )
-    # As a client first, which says what is wrong; Zenoh links routers in the background and says nothing.
+    # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
     with connected(door_of(brief), float(brief.patience)):
         pass
     with _opened(brief, access_control(table, brief.identity is not None)) as session:
@@ -41,7 +41,7 @@ def _opened(brief: Brief, access: dict[str, Any]) -> Session:
 
 
 def _config(brief: Brief, users: str, access: dict[str, Any]) -> dict[str, Any]:
-    """A router's, which besides connects to the router as a client does, and again whenever the link is lost."""
+    """Configuration of a router that also connects to the first router as a client, and reconnects when the link is lost."""
     listening = router_config(brief, users, access, brief.part["listen"])
     connecting = client_config(brief)
     auth = {"usrpwd": {**listening["transport"]["auth"]["usrpwd"], **connecting["transport"]["auth"]["usrpwd"]}}

@@ -1,12 +1,13 @@
-"""What a process reports, and when: columns of many slots, never a message per number.
+"""The reports of each process, and when it sends them: columns of many slots, never a message per number.
 
-Reports end at the same slots everywhere: at the end of every `flow.batch` slots, at the last, and at every mark between two
-slots. So a window that is full always holds a reported slot, and nobody can wait for a report that itself waits for a packet.
+Reports end at the same slots in every process: at the end of every `flow.batch` slots, at the last slot, and at every
+barrier. So a full window always holds a reported slot, and no process waits for a report that itself waits for a packet.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,11 @@ def is_due(brief: Brief, k: int) -> bool:
     return (k + 1) % brief.flow.batch == 0 or k + 1 == brief.slots
 
 
+@final
 class TruthReporter:
-    """The sensor's reports: states and schedule; what was sent at all, alarms, and inputs, where there are such things. Final.
+    """The sensor's reports: states and schedule; sent flags, alarms and inputs, if the scenario has them.
 
-    inputs: how many a controller decides; measures: whether the sensor filters what it measures.
+    inputs: how many a controller decides; measures: whether the sensor filters its measurements.
     """
 
     def __init__(
@@ -61,9 +63,10 @@ class TruthReporter:
         steered: tuple[Floats, Flags] | None = None,
         true: Floats | None = None,
     ) -> None:
-        """Take slot k, and report if it is time.
+        """Add slot k, and report if a report is due.
 
-        steered: its inputs (m, R), and where their decision failed, (R,); true: its true state, (n, R), if x is a filter's.
+        steered: its inputs (m, R), and the trials in which the decision failed, (R,); true: its true state, (n, R), if x
+        is a filter's.
         """
         row = k % self._brief.flow.batch
         self._x[row] = x
@@ -91,8 +94,9 @@ class TruthReporter:
         self._first = end
 
 
+@final
 class DecisionReporter:
-    """The controller's reports: how long it took to decide, and digests of what was decided. Final."""
+    """The controller's reports: decision times, and digests of the decisions."""
 
     def __init__(self, brief: Brief, put: Callable[[int, bytes], None], inputs: int, period: int) -> None:
         self._brief, self._put, self._period = brief, put, period
@@ -102,7 +106,7 @@ class DecisionReporter:
         self._first = 0
 
     def add(self, k: int, u: Floats, failed: Flags, seconds: float) -> None:
-        """Take the decision of slot k, which holds until the next; report if it is time."""
+        """Add the decision of slot k, which holds until the next decision; report if a report is due."""
         end, batch = min(k + self._period, self._brief.slots), self._brief.flow.batch
         for slot in range(k, end):
             self._digests.update(filter(None, [self._log.add(slot, u, failed)]))
@@ -113,11 +117,12 @@ class DecisionReporter:
             self._first, self._seconds, self._digests = end, [], {}
 
 
+@final
 class BeliefReporter:
-    """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress. Final.
+    """A receiver's reports: estimates, actions, recorded covariances, digests, and its progress.
 
-    put, put_progress: take the last slot that a message tells of, and the message. cuts: where it goes away or is back;
-    first: its first slot; counts_late: whether it can make use of late packets.
+    put, put_progress: called with the last slot that a message covers, and the message. cuts: slots in which the receiver
+    goes away or returns. first: its first slot. counts_late: whether it can use late packets.
     """
 
     def __init__(
@@ -137,9 +142,9 @@ class BeliefReporter:
         self._first = first
 
     def add(self, k: int, belief: Belief, late: tuple[NDArray[np.uint16], NDArray[np.uint16]] | None = None) -> None:
-        """Take slot k, in which so many late packets of each trial arrived and were used, (R,) each, and report if it is time.
+        """Add slot k, and report if a report is due: also at the end of a digest's block, where the log starts over.
 
-        It is, too, at the end of a digest's block, where the log starts anew.
+        late: how many late packets arrived and how many were used in each trial, (R,) each.
         """
         if self._late is not None:
             self._late[:, k % self._brief.flow.batch] = 0 if late is None else late
@@ -150,12 +155,12 @@ class BeliefReporter:
             self._put_progress(k, progress(k + 1))
 
     def flush(self, end: int) -> None:
-        """Report all slots below `end`, and that they are done."""
+        """Report all slots below `end`, and the progress to there."""
         self._report(end, {})
         self._put_progress(end - 1, progress(end))
 
     def skip(self, end: int) -> None:
-        """Go on from slot `end`: somebody else reports the slots before it, in which this receiver was not there."""
+        """Go on from slot `end`: the observer reports the slots before it, in which this receiver was absent."""
         self._first = end
 
     def _report(self, end: int, digests: dict[int, Digests]) -> None:

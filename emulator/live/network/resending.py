@@ -1,7 +1,7 @@
-"""What may be lost with a connection is kept, and sent once more when the conductor asks for it.
+"""Messages that may be lost with a connection are kept, and sent again when the conductor asks for them.
 
-Nothing is acknowledged by itself. The sensor is never further than the window ahead of what the observer has written, so
-whatever is older than a window has done its work and is forgotten.
+Messages are not acknowledged one by one. The sensor is never further than the window ahead of the slots that the observer
+has written, so messages older than a window are no longer needed and are forgotten.
 
 Source: docs/protocol.md, lost connections.
 """
@@ -12,18 +12,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import final
 
 from evedrop.errors import Gap
 from evedrop.live.protocol.codec import Reader
 
 
+@final
 class ReplayBuffer:
-    """An outlet that keeps what went through it; for several threads. Final.
+    """An outlet that keeps the messages sent through it; thread-safe.
 
-    span: what is older than so many slots is forgotten; None: only what `forget` says.
-    head: makes a message that goes before those that are sent once more, of (round, first slot that is not done, first slot
-    that follows).
-    back: so many slots more are sent than are not done.
+    span: messages older than this many slots are forgotten; None: only `forget` forgets.
+    head: makes the message that precedes the resent ones, from (round, first slot that is not done, first slot that is
+    resent).
+    back: how many slots before the first that is not done are resent, too.
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class ReplayBuffer:
         self._lock = threading.Lock()
 
     def __call__(self, k: int, payload: bytes) -> None:
-        """Send what belongs to slot k, and keep it."""
+        """Send a message that belongs to slot k, and keep it."""
         with self._lock:
             self._messages.append((k, payload))
             self._put(payload)
@@ -47,16 +49,16 @@ class ReplayBuffer:
             self.forget(k - self._span)
 
     def forget(self, k: int) -> None:
-        """Slots below k are done, and so many before them as are sent with them."""
+        """Forget messages of slots below k, which are done, except the `back` slots before k."""
         with self._lock:
             self._forgotten = max(self._forgotten, k)
             while self._messages and self._messages[0][0] < k - self._back:
                 self._messages.popleft()
 
     def again(self, number: int, k: int) -> None:
-        """Send once more what belongs to slots that are not done, those from k on; the last message in any case."""
+        """Send the messages of slots from k on, which are not done, again; the last message in any case."""
         with self._lock:
-            k = max(k, self._forgotten)  # a round that is asked for late must not announce slots that are gone
+            k = max(k, self._forgotten)  # a late request must not announce slots that are forgotten
             first = max(0, k - self._back)
             if self._head is not None:
                 self._put(self._head(number, k, first))
@@ -65,22 +67,23 @@ class ReplayBuffer:
                     self._put(payload)
 
 
+@final
 class GapDetector:
-    """What a reader makes of slots that are not due: older ones it has, for later ones it waits. Final."""
+    """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
 
     def __init__(self, key: str, patience: float) -> None:
-        """patience: how many seconds later slots may arrive while the one that is due does not."""
+        """patience: for how many seconds later slots may arrive while the due one does not."""
         self._key, self._patience = key, patience
         self._slot, self._since = -1, 0.0
 
     def take(self, receive: Callable[[], Reader], due: int) -> Reader:
-        """The message of slot `due`, as soon as it is received. Raises Gap as `missed` does."""
+        """Wait for the message of slot `due`. Raises Gap as `missed` does."""
         while (found := (message := receive()).integer("k")) != due:
             self.missed(due, found)
         return message
 
     def missed(self, due: int, found: int) -> None:
-        """Slot `found` arrived where `due` was due. Raises Gap if that one has been missing for too long."""
+        """Slot `found` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
         now = time.monotonic()
         if found < due:
             return

@@ -4,9 +4,9 @@
                      ├── link of receiver 2 ── fate, γ ── downlink/2      fates of all ── journal
                      └── …
 
-A receiver that is there gets one delivery in every slot, with all that arrives in it. At a mark on the uplink it journals
-all slots before, and waits until the conductor lets it go on; links change nowhere else. When packets are sent once more it
-routes them once more, to the same fates, as a router does that was started anew.
+A receiver that is present gets one delivery in every slot, with everything that arrives in the slot. At a barrier on the
+uplink the router journals all slots before it and waits until the conductor lets it go on; links change nowhere else. When
+packets are sent again, the router routes them again, with the same fates, as a restarted router would.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -52,8 +52,9 @@ from evedrop.model.slot.transit import Late, Transit
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE
 
 
+@final
 class Downlink:
-    """One receiver's link, decided a batch of slots ahead, and its outlet. Final."""
+    """One receiver's link, whose fates are decided a batch of slots ahead, and its outlet."""
 
     def __init__(self, name: str, course: LinkSchedule, brief: Brief, put: Callable[[bytes, float], None]) -> None:
         self._course = course
@@ -64,7 +65,7 @@ class Downlink:
         self._put = put
         self._pace = float(brief.part["pace"])
         self._rests: dict[int, float] = {}
-        """Slot → the part of a slot that the first trial's packet takes besides, of packets that may still arrive."""
+        """Slot → the fraction of a slot that the first trial's packet takes in addition, for packets that may still arrive."""
         self._leak: int | None = brief.part["leaks"].get(name)
         self._slots = range(0)
         self._fates: Fates
@@ -73,11 +74,11 @@ class Downlink:
         self._received: list[int]
 
     def plan(self, slots: range) -> None:
-        """Decide the next batch of slots."""
+        """Decide the fates of the next batch of slots."""
         self._take(slots, self._link.planned(slots))
 
     def amend(self, at: int, changes: Iterable[Change]) -> None:
-        """Decide the slots of the batch from `at` on once more, by what changes from then on; none may have been journaled."""
+        """Decide the slots of the batch from `at` on again, with these changes; none of them may have been journaled."""
         self._take(range(at, self._slots.stop), self._link.amended(at, changes))
 
     def _take(self, slots: range, fates: Fates) -> None:
@@ -86,21 +87,21 @@ class Downlink:
         self._received = np.count_nonzero(self._in_time, axis=1).tolist()
 
     def account(self, slots: range) -> Account:
-        """What became of the packets of the next slots, which are of the batch at hand."""
+        """The fates of the packets of the next slots, which belong to the current batch."""
         rows = slice(slots.start - self._slots.start, slots.stop - self._slots.start)
         return self._accountant.account(slots, self._fates.part(rows))
 
     def present(self, k: int) -> bool:
-        """Whether the receiver is there in slot k."""
+        """Whether the receiver is present in slot k."""
         return not any(away.start <= k < away.stop for away in self._course.outages)
 
     def gamma(self, k: int) -> Flags:
-        """γ of slot k, which is of the batch at hand and was delivered, (R,)."""
+        """γ of slot k, which belongs to the current batch and was delivered, (R,)."""
         in_time: Flags = self._in_time[k - self._slots.start]
         return in_time
 
     def _silence(self, row: int, sent: Flags) -> None:
-        """Take the packets that are not sent out of the account."""
+        """Remove the packets that were not sent from the account."""
         if not self._own:
             self._fates, self._own = self._fates.copied(), True
         self._fates.silence(row, sent)
@@ -109,9 +110,10 @@ class Downlink:
         self._received[row] = int(np.count_nonzero(self._in_time[row]))
 
     def deliver(self, k: int, z: Floats, whole: bytes, beside: PacketExtras, known: bool = False) -> None:
-        """Send slot k's delivery: of the packets z (n, R), or as bytes the whole of them, those that arrive in it.
+        """Send slot k's delivery: the packets of z (n, R) that arrive in the slot.
 
-        known: the receiver has it, and only what arrives later is of interest.
+        whole: z as bytes, for a slot in which all packets arrive.
+        known: the receiver has the delivery; only update the packets under way.
         """
         row = k - self._slots.start
         if beside.sent is not None:
@@ -134,7 +136,7 @@ class Downlink:
         self._put(delivery(k, self._masks[row], payload, late, header, truth), self._rest(k, row, late) * self._pace)
 
     def _rest(self, k: int, row: int, late: tuple[Late, ...]) -> float:
-        """The part of a slot by which slot k's delivery is to be later than the slot: of what the first trial receives in it."""
+        """The fraction of a slot by which to delay slot k's delivery: the longest among the first trial's packets in it."""
         if self._fates.rests is not None:
             self._rests[k] = float(self._fates.rests[row])
         if not self._rests:
@@ -145,15 +147,17 @@ class Downlink:
         return rest
 
     def mark(self, k: int) -> None:
-        """Pass a mark on, if the receiver is there."""
+        """Pass a barrier on, if the receiver is present."""
         if not any(away.start < k <= away.stop for away in self._course.outages):
             self._put(barrier(k), 0.0)
 
 
+@final
 class Burst:
-    """Deliveries to who keeps nobody waiting, passed on many at a time. Final.
+    """Deliveries to a receiver that nobody waits for, sent many at a time.
 
-    Where the sensor waits for somebody in every slot, a message by itself costs a receiver's waking up, and most of the time.
+    When the sensor waits for another process in every slot, single messages would wake this receiver for each of them, and
+    these wake-ups would take most of the time.
     """
 
     def __init__(self, put: Callable[[bytes], None]) -> None:
@@ -161,18 +165,19 @@ class Burst:
         self._held: list[bytes] = []
 
     def hold(self, payload: bytes, _: float) -> None:
-        """Take one."""
+        """Hold one message back until `flush`."""
         self._held.append(payload)
 
     def flush(self) -> None:
-        """Pass on all that are held."""
+        """Send all held messages."""
         for payload in self._held:
             self._put(payload)
         self._held.clear()
 
 
+@final
 class WayBackLink:
-    """The link of the acknowledgements, from the legitimate estimator to the sensor, and who attacks it. Final."""
+    """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
 
     def __init__(self, brief: Brief, session: Session, spec: Mapping[str, Any]) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
@@ -182,14 +187,14 @@ class WayBackLink:
         self._key = session.keys.acknowledged
         self._due = GapDetector(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
-        """What the legitimate estimator acknowledges; None: the conductor has said something that may end the waiting."""
+        """The legitimate estimator's acknowledgements; None: the conductor sent a command that may end the waiting."""
         session.funnel(self._key, self.sent.put)
         self._put = session.outlet(session.keys.acknowledgements)
 
     def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink], commands: Commands) -> None:
-        """Wait for the acknowledgements of slot k, and pass on what reaches the sensor; sent (R,): as in `PacketExtras`.
+        """Wait for the acknowledgements of slot k, and send on those that reach the sensor; sent (R,): as in `PacketExtras`.
 
-        A receiver that is not there acknowledges nothing. Raises what `Commands.check` does.
+        An absent receiver acknowledges nothing. Raises the errors of `Commands.check`.
         """
         gamma = np.zeros(self._trials, np.bool_)
         if downlinks[LEGITIMATE].present(k):
@@ -211,7 +216,7 @@ class WayBackLink:
 
 
 def route(brief: Brief) -> None:
-    """Run the router of a brief until the conductor ends it and everybody has left."""
+    """Run the router of a brief until the conductor ends it and all other processes have left."""
     table = grants(brief.run, tuple(brief.part["links"]), Wiring.of(brief.part["controller"]))
     let_in = table if brief.part["zid"] is None else at_router(brief.run, table)
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
@@ -221,8 +226,9 @@ def route(brief: Brief) -> None:
         until_all_left(present, session.linked)
 
 
+@final
 class Routing:
-    """The router's work on an open session. Final."""
+    """The router's work on an open session."""
 
     def __init__(self, brief: Brief, session: Session) -> None:
         self._brief, self._session = brief, session
@@ -245,16 +251,16 @@ class Routing:
         self._outlets = {name: outlet(name, course) for name, course in self._courses.items()}
         acknowledgements = brief.part["acknowledgements"]
         self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
-        # To its own uplink, so that whoever waits there wakes: only the conductor ends a router.
+        # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
         waiting = [] if self._way_back is None else [self._way_back.sent]
         self._commands = Commands(session, lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage)
         self._stale = False
-        """Whether what comes is of no interest until it is said to come once more."""
+        """Whether to ignore packets until the resend begins."""
         self._begin(0, 0)
 
     def _is_waited_for(self, receiver: str) -> bool:
-        """Whether the sensor waits in some slots for what a receiver makes of them."""
+        """Whether the sensor waits in some slots for a receiver's acknowledgement or estimate."""
         part = self._brief.part
         wiring = Wiring(**part["controller"])
         return receiver == LEGITIMATE and (
@@ -262,8 +268,8 @@ class Routing:
         )
 
     def carry_on(self) -> None:
-        """Route all slots, once more as often as it is asked for, until the conductor's end."""
-        # Nobody to wait for: who is alive has subscribed before it said so, and it said so to this very session.
+        """Route all slots, again as often as the conductor asks, until it ends the run."""
+        # No need to wait: a process subscribes before it shows its token, and it showed the token to this very session.
         self._session.appear()
         while not self._commands.over():
             try:
@@ -272,12 +278,12 @@ class Routing:
                 self._stale = True
 
     def _begin(self, start: int, done: int) -> None:
-        """Be as a router is before slot `start` to which nothing has happened but what is known of all slots before.
+        """Restore the router's state before slot `start`, which follows from the links alone.
 
-        done: all slots below have been delivered, acknowledged and journaled.
+        done: all slots below it have been delivered, acknowledged and journaled.
         """
         self._stale = False
-        self._flush()  # of no use to anybody, but in no way of what comes now
+        self._flush()  # nobody needs these messages, but they must not mix with the following ones
         self._k, self._done, self._journaled = start, done, start
         self._downlinks = {
             name: Downlink(name, course, self._brief, self._outlets[name]) for name, course in self._courses.items()
@@ -285,12 +291,12 @@ class Routing:
         for first in range(0, start + 1, self._brief.flow.batch):
             slots = self._plan(first)
             before = range(first, min(slots.stop, start))
-            if before and before.stop > start - COUNTED_BURSTS:  # what bursts go on, and which packets are under way
+            if before and before.stop > start - COUNTED_BURSTS:  # for unfinished bursts and packets under way
                 for downlink in self._downlinks.values():
                     downlink.account(before)
 
     def _plan(self, first: int) -> range:
-        """Decide the batch that begins with a slot."""
+        """Decide the fates of the batch that begins with this slot."""
         self._slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
         if self._slots:
             for downlink in self._downlinks.values():
@@ -298,7 +304,7 @@ class Routing:
         return self._slots
 
     def _take(self, message: Reader) -> None:
-        """Take what the sensor sends: a packet, a mark, or the word that packets come once more."""
+        """Handle a message of the sensor: a packet, a barrier, or the announcement of a resend."""
         if is_resend(message):
             self._resend(message)
             return
@@ -322,7 +328,7 @@ class Routing:
             self._plan(k + 1)
 
     def _route(self, k: int, message: Reader) -> None:
-        """Deliver the packet of slot k, unless it is known that this is done."""
+        """Deliver the packet of slot k, unless it is known to have been delivered."""
         z = read_uplink(message, k, self._shape)
         beside = read_beside(message, self._shape, self._brief.model.header)
         whole, known = z.tobytes(), k < self._done
@@ -337,10 +343,10 @@ class Routing:
             burst.flush()
 
     def _resend(self, message: Reader) -> None:
-        """Begin anew, as the conductor and the sensor say: what the one says is waited for, if the other was faster."""
+        """Begin a resend, which the conductor and the sensor announce in either order; wait for the conductor if need be."""
         number, done, start = read_resend(message, self._brief.slots)
         anew = self._commands.anew(number)
-        if anew is None:  # it has asked once more since
+        if anew is None:  # the conductor has asked again since
             self._stale = True
             return
         for name, changes in read_links(anew, self._courses, self._brief.slots).items():
@@ -348,7 +354,7 @@ class Routing:
         self._begin(start, done)
 
     def _journal(self, end: int) -> None:
-        """Journal all slots below `end`; of those that are journaled already, only remember what goes on after them."""
+        """Journal all slots below `end`; for those already journaled, only keep the state that later slots need."""
         slots = range(self._journaled, end)
         self._journaled = end
         if slots:
@@ -357,7 +363,7 @@ class Routing:
                 self._put_journal(Journal(slots.start, len(slots), accounts).pack())
 
     def _hold(self, k: int) -> None:
-        """Pass a mark on, and do what the conductor says until it lets us go on."""
+        """Pass a barrier on, and obey the conductor until it lets the router go on."""
         for downlink in self._downlinks.values():
             downlink.mark(k)
         self._flush()
@@ -366,21 +372,19 @@ class Routing:
                 self._amend(command, k)
 
     def _amend(self, command: Reader, k: int) -> None:
-        """Change a link from slot k on, as the conductor says."""
+        """Change a link from slot k on, as the conductor's command says."""
         name = command.choice("link", self._courses)
         changes = read_changes(command, "changes", self._brief.slots)
         try:
             self._downlinks[name].amend(k, changes)
         except (KeyError, TypeError, ValueError, NotRegistered) as error:
-            raise command.malformed(
-                f"settings that are none ({error!r:.80})", f"settings of the link of {name}"
-            ) from error
+            raise command.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
         course = self._courses[name]
         self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
 
 
 def read_changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
-    """The changes of a link in a run of so many slots, in a field of a command."""
+    """The changes of a link in a field of a command; slots: how many the run has."""
     return tuple(
         Change(
             one.integer("at", 0, slots),
@@ -392,7 +396,7 @@ def read_changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
 
 
 def read_links(command: Reader, names: Collection[str], slots: int) -> dict[str, tuple[Change, ...]]:
-    """Receiver → all changes of its link, of those that an `again` names."""
+    """Receiver → all changes of its link, for the links that an `again` command names."""
     links = command.nested("links")
     for name in command.map("links"):
         if name not in names:

@@ -1,4 +1,4 @@
-"""What the conductor tells the router, sorted: what is to be done at a hold, and what ends whatever it waits for.
+"""The conductor's commands to the router: those to carry out at a barrier, and those that end any waiting.
 
 Source: docs/protocol.md, control and lost connections.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
+from typing import final
 
 from evedrop.errors import EvedropError
 from evedrop.live.network.session import Session
@@ -16,19 +17,21 @@ from evedrop.names import ROUTER
 
 
 class ReplayRequested(Exception):
-    """The conductor asks for packets once more: whatever is waited for may have been lost."""
+    """The conductor asks for packets again: the message that the router waits for may have been lost."""
 
 
+@final
 class Commands:
-    """Final. Reads the session's commands on a thread of its own.
+    """Reads the session's commands on a thread of its own.
 
-    knock: wakes who waits for packets, when the run has ended. waiting: get None when a waiting may be in vain.
+    knock: wakes the thread that waits for packets when the run has ended.
+    waiting: queues that get a None when waiting for their next item may be in vain.
     """
 
     def __init__(
         self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]], patience: float
     ) -> None:
-        """patience: seconds that a round which the sensor tells of is waited for."""
+        """patience: how many seconds to wait for the conductor's command for a round that the sensor has announced."""
         self._session, self._knock, self._waiting = session, knock, tuple(waiting)
         self._patience = patience
         self._orders: SimpleQueue[tuple[int, Reader] | None] = SimpleQueue()
@@ -43,7 +46,7 @@ class Commands:
         try:
             while not self._ended:
                 self._sort(self._session.command())
-        except EvedropError as error:  # for whoever works, who says so
+        except EvedropError as error:  # the working thread raises it
             self._failure = error
         with self._news:
             self._news.notify()
@@ -68,18 +71,18 @@ class Commands:
             queue.put(None)
 
     def over(self) -> bool:
-        """Whether the conductor has ended the run. Raises MalformedMessage if it has said what nobody understands."""
+        """Whether the conductor has ended the run. Raises MalformedMessage if it sent a malformed command."""
         if self._failure is not None:
             raise self._failure
         return self._ended
 
     def check(self) -> None:
-        """Raise ReplayRequested if the conductor has ended the run, or asked for packets once more since it was heeded last."""
+        """Raise ReplayRequested if the conductor has ended the run, or asked for packets since its last heeded request."""
         if self.over() or self._asked.number != self._heeded:
             raise ReplayRequested
 
     def next(self) -> Reader:
-        """The next command of the round at hand, not one of before. Raises ReplayRequested as `check` does."""
+        """The next command of the current round; those of earlier rounds are skipped. Raises ReplayRequested as `check` does."""
         while True:
             with self._session.place.waiting(self._session.keys.control(ROUTER)):
                 order = self._orders.get()
@@ -88,12 +91,12 @@ class Commands:
                 return order[1]
 
     def anew(self, number: int) -> Reader | None:
-        """What the conductor said when it asked for that round, as soon as it has; None if that is not its last.
+        """Wait for the conductor's command for this round; None if the conductor has asked for a later one.
 
-        Nor if it has ended the run meanwhile.
+        Also None if it has ended the run meanwhile, or if no such command arrives within the patience.
         """
         with self._news:
-            # Sensor and router are told at the same time; a round of which we hear nothing for so long there is not.
+            # Sensor and router are told at the same time: if the command does not arrive, the round does not exist.
             if not self._news.wait_for(lambda: self.over() or self._asked.number >= number, self._patience):
                 return None
             if self._ended or self._asked.number > number:
@@ -102,8 +105,9 @@ class Commands:
             return self._asked.command
 
 
+@final
 class ReplayRound:
-    """Packets are sent once more: how often they were, and the command. Final."""
+    """A round in which packets are sent again: its number, counted from 1 (0: none yet), and the conductor's command."""
 
     def __init__(self, number: int = 0, command: Reader | None = None) -> None:
         self.number, self.command = number, command

@@ -1,4 +1,4 @@
-"""What router and relay both do: know the passwords of those whom they let in, and leave after them."""
+"""Tasks of both router and relay: write the passwords of the users they let in, and leave after those users."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FAREWELL_SECONDS = 10.0
 
 @contextmanager
 def users_file(users: Mapping[str, str]) -> Iterator[Path]:
-    """The dictionary of users and passwords that Zenoh reads once, when the session opens; then it must not stay."""
+    """The file of users and passwords that Zenoh reads once, when the session opens; afterwards it is deleted."""
     handle, name = tempfile.mkstemp(prefix="evedrop-users-")
     path = Path(name)
     try:
@@ -26,9 +26,9 @@ def users_file(users: Mapping[str, str]) -> Iterator[Path]:
 
 
 def until_all_left(present: Mapping[str, bool], linked: Callable[[], bool] = lambda: False) -> None:
-    """Wait until nobody is present any more and no other router is linked, or some seconds at most.
+    """Wait until no process is present and no other router is linked, for a few seconds at most.
 
-    Two routers that close their link at the same time trip over each other in Zenoh 1.10, so one must leave first.
+    Two routers that close their link at the same time fail in Zenoh 1.10, so one must leave first.
     """
     deadline = time.monotonic() + _FAREWELL_SECONDS
     while (any(present.values()) or linked()) and time.monotonic() < deadline:

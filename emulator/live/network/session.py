@@ -1,8 +1,9 @@
-"""What one process has on the network: how it connects, what it declares, when it is ready, how it ends.
+"""A process's session on the network: how it connects, what it declares, when it is ready, how it ends.
 
-Nothing here relies on the transport not to lose: it blocks when full, and what goes down with a connection is seen as a gap
-in the slot numbers that every message carries, and sent again. A process whose connection is lost opens another session
-and declares all of it there; each message names its key, and what arrives under another key is dropped.
+Nothing here assumes that the transport loses no messages. The transport blocks when full; messages lost with a connection
+show as a gap in the slot numbers that every message carries, and are sent again. A process whose connection is lost opens
+another session and declares everything there. Each message names its key; messages that arrive under another key are
+dropped.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, final
 
 import zenoh
 
@@ -40,31 +41,31 @@ from evedrop.names import OBSERVER, ROUTER
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
-_LEASE_SECONDS = 4.0  # a connection over which nothing comes for so long is lost
-_HEARD_SECONDS = 2.0  # for readers to be found again once a connection is back
+_LEASE_SECONDS = 4.0  # a connection on which nothing arrives for this long is lost
+_HEARD_SECONDS = 2.0  # to find the readers again when a connection is back
 _NEVER_MS = 86_400_000
 _ANSWER_BYTES = 64 * 2**20  # for the operator
-_WINDOWS = 8  # that an inbox has room for: what was sent again in some rounds waits there too
-_LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # that we are not let in we say ourselves
+_WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
+_LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
 
 
 def _transport(identity: Identity | None, largest: int, listens: bool = False) -> dict[str, Any]:
-    # A full queue waits a minute, not five seconds, before it gives a reader up: the window bounds what can be under way.
+    # A full queue waits a minute, not five seconds, before it drops a reader: the window bounds the messages under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
     link: dict[str, Any] = {
         "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
         "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
     if identity is not None:
-        from evedrop.live.network.certificates import tls_section  # noqa: PLC0415 - 50 ms that most runs need not
+        from evedrop.live.network.certificates import tls_section  # noqa: PLC0415 - saves most runs 50 ms
 
         link |= {"protocols": ["tls"], "tls": tls_section(identity, listens)}
-    # Shared memory would put what the router sends to one receiver into the memory of all.
+    # Shared memory would expose the router's messages for one receiver to all.
     return {"link": link, "shared_memory": {"enabled": False}}
 
 
 class Credentials(Protocol):
-    """Where the router is, and who asks to be let in: a brief, or the operator's control file."""
+    """The router's address, and a user with a password: a brief, or the operator's control file."""
 
     @property
     def run(self) -> str:
@@ -76,19 +77,19 @@ class Credentials(Protocol):
 
     @property
     def user(self) -> str:
-        """Its user."""
+        """Name of the user."""
 
     @property
     def password(self) -> str:
-        """The user's."""
+        """Password of the user."""
 
     @property
     def identity(self) -> Identity | None:
-        """Its certificate, if the router takes any."""
+        """Certificate of the user, if the router takes certificates."""
 
 
 def client_config(entry: Credentials) -> dict[str, Any]:
-    """Configuration of everybody but the router: one connection, to it, and no other peer is looked for."""
+    """Zenoh configuration of every process but the router: one connection, to the router, and no scouting for others."""
     largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
     return {
@@ -105,12 +106,12 @@ def client_config(entry: Credentials) -> dict[str, Any]:
 
 
 def door_of(entry: Credentials) -> RouterAddress:
-    """The way in for a brief, or for the operator."""
+    """The router's address for a brief, or for the operator."""
     return RouterAddress(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
 
 
 def _once(door: RouterAddress) -> zenoh.Config:
-    """The configuration of a session that is closed when its connection is lost: Zenoh is to connect it once at most."""
+    """The configuration of a session that is closed when its connection is lost: Zenoh must not reconnect it."""
     config = dict(door.config)
     config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
     config["transport"] = {**config["transport"], "unicast": {"open_timeout": int(_LEASE_SECONDS * 1000)}}
@@ -118,7 +119,7 @@ def _once(door: RouterAddress) -> zenoh.Config:
 
 
 def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
-    """Configuration of a router: it listens, asks for user and password, and drops what is not granted or too large."""
+    """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
     transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
         "mode": "router",
@@ -132,7 +133,7 @@ def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen:
 
 
 def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -> zenoh.Session:
-    """A router's session. Raises BriefError if it cannot listen where its brief says."""
+    """Open a router's session. Raises BriefError if it cannot listen at the address in its brief."""
     endpoint = endpoint_of(listen, identity)
     try:
         endpoint.try_to_listen()
@@ -154,8 +155,9 @@ def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -
         ) from error
 
 
+@final
 class Session:
-    """What a process has on the network. Final; use it as a context manager, or its threads outlive the program."""
+    """A process's session on the network; use it as a context manager, or its threads outlive the program."""
 
     def __init__(
         self,
@@ -164,18 +166,18 @@ class Session:
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
     ) -> None:
-        """config, listen: of a router, and where it listens; meanwhile: called while there is no router to connect to yet."""
+        """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
         zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
         self.keys = RunKeys(brief.run)
         self._process = brief.process
         self.patience = float(brief.patience)
-        """Seconds that are waited for the others."""
+        """How many seconds to wait for other processes."""
         self.place = Place()
-        """Where this process is, to be kept up to date as it works."""
+        """The slot this process is at and what it waits for; to be kept up to date."""
         self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
-        """Bytes that one sender may have waiting to be read."""
+        """How many unread bytes of one sender may wait."""
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
@@ -193,7 +195,7 @@ class Session:
         self._rounds: SimpleQueue[Reader] = SimpleQueue()
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
-        # A router has nobody to connect to: it is its network.
+        # A router connects to no other process, so it is always on its network.
         self._heartbeat = HeartbeatFile((lambda: True) if brief.role in ("router", "relay") else self.linked)
         self.funnel(self._control, self._told)
 
@@ -211,7 +213,7 @@ class Session:
         self._connection.close()
 
     def _complain(self, error: MalformedMessage | Gap) -> None:
-        """Tell the observer, which ends the run, what cannot be read and why; wait a moment for it to do so."""
+        """Tell the observer which message cannot be read, and why; wait a moment for it to end the run."""
         outlet = self._reporting
         if outlet is not None and outlet.matched:
             outlet(refusal(error.key, str(error)))
@@ -220,27 +222,27 @@ class Session:
 
     @property
     def _reporting(self) -> Outlet | None:
-        """Where this process reports to the observer, if it does."""
+        """The outlet for reports to the observer, if this process has one."""
         key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
         return self._outlets.get(key)
 
     def _changed(self, connected: bool) -> None:
-        """The connection was lost or is back."""
+        """Handle the loss or the return of the connection."""
         self._waiting.begin(again=True)
         if self._lifeline is not None:
             self._lifeline.changed(connected)
 
     def _mistaken(self) -> None:
-        """A message of another key arrived: the connection takes one for the other."""
+        """Handle a message that arrived under another key: the connection confuses the two keys."""
         self._connection.renew()
 
     @property
     def dropped(self) -> int:
-        """How many messages this process has dropped because they name another key than the one they came on."""
+        """How many messages this process has dropped because they arrived under another key than they name."""
         return self._dropped.count
 
     def inbox(self, key: str) -> Inbox:
-        """Subscribe to one exact key, to be read in order with `recv`."""
+        """Subscribe to one exact key; read its messages in order with `recv`."""
         return self._connection.add(Inbox(key, self._dropped, self.place, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
@@ -259,30 +261,30 @@ class Session:
         head: Callable[[int, int, int], bytes] | None = None,
         back: int = 0,
     ) -> ReplayBuffer:
-        """A publisher for one exact key, of what is sent once more after a connection was lost; as in `ReplayBuffer`."""
+        """A publisher for one exact key, whose messages are sent again after a lost connection; as in `ReplayBuffer`."""
         kept = ReplayBuffer(self.outlet(key), span, head, back)
         self._kept.append(kept)
         return kept
 
     def reaches(self, key: str) -> bool:
-        """Whether somebody reads a key that this process has a publisher for: who does has opened its session."""
+        """Whether a key that this process publishes has a reader: such a reader has opened its session."""
         return key in self._outlets and self._outlets[key].matched
 
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
-        """Be asked at one exact key; `receive` is called on a thread of Zenoh's and must only hand the question on."""
+        """Answer questions at one exact key; a thread of Zenoh's calls `receive`, which must only hand the question on."""
         self._connection.add(Questions(key, self._dropped, receive))
 
     def watch(self, process: str, changed: Callable[[bool], None]) -> None:
-        """Call `changed` with true when a process is there, with false when it is gone; it must only hand that on."""
+        """Call `changed` with true when a process appears, with false when it leaves; it must only hand that on."""
         self._connection.add(Watch(self.keys.alive(process), changed))
 
     @property
     def router_id(self) -> str | None:
-        """Which router there is a connection with; one that was started again is another one."""
+        """Zenoh id of the connected router; a restarted router has another id."""
         return next((str(found) for found in self._connection.session.info.routers_zid()), None)
 
     def attendance(self, processes: Iterable[str]) -> dict[str, bool]:
-        """Process → whether it is there, kept up to date by a thread of Zenoh's."""
+        """Process → whether it is present, kept up to date by a thread of Zenoh's."""
         present = dict.fromkeys(processes, False)
         for name in present:
             self.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
@@ -293,7 +295,7 @@ class Session:
         return self.router_id is not None
 
     def wait_for_link(self) -> None:
-        """Wait until there is one. Raises RunError after the brief's patience."""
+        """Wait until there is a link with another router. Raises RunError after the brief's patience."""
         deadline = time.monotonic() + self.patience
         self._waiting.begin()
         while not self.linked():
@@ -305,10 +307,10 @@ class Session:
             time.sleep(_POLL_SECONDS)
 
     def ready(self) -> None:
-        """Wait until every publisher has a reader, then show that this process is there.
+        """Wait until every publisher has a reader, then show that this process is present.
 
-        Raises RunError after the brief's patience, naming who is missing and the keys that they do not read; but while the
-        observer is there it is left to that one to say who is missing.
+        Raises RunError after the brief's patience, naming the missing processes and the keys without a reader. While the
+        observer is present, this process waits on: the observer reports the missing processes.
         """
         deadline = time.monotonic() + self.patience
         while unread := self._unread():
@@ -324,7 +326,7 @@ class Session:
         self.appear()
 
     def appear(self) -> None:
-        """Show that this process is there."""
+        """Show that this process is present."""
         outlet = self._reporting
         if outlet is not None:
             self.place.answer(outlet)
@@ -334,7 +336,7 @@ class Session:
         self._heartbeat.start()
 
     def conclude(self) -> None:
-        """Confirm that this process ends because it was told to, and say how many messages it has dropped.
+        """Confirm that this process ends on the conductor's command, and report how many messages it has dropped.
 
         The relay, which reports nothing, withdraws its token instead.
         """
@@ -349,7 +351,7 @@ class Session:
         return [key for key, outlet in self._outlets.items() if not outlet.matched]
 
     def _send_again(self) -> None:
-        """On a thread of its own, since whoever works may be waiting for just what is to come of it."""
+        """Send messages again as asked; on a thread of its own, since the working thread may be waiting for the effect."""
         while True:
             command = self._rounds.get()
             deadline = time.monotonic() + _HEARD_SECONDS
@@ -359,11 +361,11 @@ class Session:
                 kept.again(command.integer("n"), command.integer("k"))
 
     def _told(self, payload: bytes) -> None:
-        """Sort what the conductor says; what is no message is for whoever reads commands, who says so."""
+        """Sort the conductor's commands; a malformed one is left to the reader of the commands, which raises the error."""
         with suppress(MalformedMessage):
             command = Reader(self._control, payload)
             if self._by_hand and command.text("do") == "abandon":
-                # Whatever this process waits for will not come, and nobody has launched it who would end it.
+                # Its messages will not come, and there is no launcher to end it.
                 sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
                 sys.stderr.flush()
                 os._exit(RunError.exit_status)
@@ -385,9 +387,9 @@ class Session:
             self.conclude()
 
     def command(self) -> Reader:
-        """The next command of the conductor; its field `do` says what."""
+        """Wait for the next command of the conductor, named in its field `do`."""
         return Reader(self._control, self._commands.get())
 
     def commanded(self) -> Reader | None:
-        """The next command of the conductor if there is one."""
+        """The next command of the conductor, or None without waiting."""
         return None if self._commands.empty() else self.command()

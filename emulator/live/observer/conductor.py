@@ -1,4 +1,4 @@
-"""The conductor, inside the observer: waits until everybody is there, starts, reports how far the run is, ends it."""
+"""The conductor, a part of the observer: waits for all processes, starts the run, reports its progress, ends it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection
 from queue import Empty, SimpleQueue
-from typing import Any, NoReturn
+from typing import Any, NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.declared import Question
@@ -15,33 +15,35 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, control, is_over, progress, read_over
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 
-_AFTERTHOUGHT_SECONDS = 0.5  # whoever ended a process may be about to end us too: then it is no failure
-_ABANDON_SECONDS = 2.0  # for who is told to go
+_AFTERTHOUGHT_SECONDS = 0.5  # the user who ended a process may be about to end the observer: then the run did not fail
+_ABANDON_SECONDS = 2.0  # for processes to leave when told
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
-_END_SECONDS = 0.5  # after which a process that is still there is told again that the run is over
-_RETURN_SECONDS = 3.0  # for a process to come back that vanished when it was told so, and did not confirm it
+_END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
+_RETURN_SECONDS = 3.0  # for a process to return that vanished when told to end, without confirming it
 _ROUTERS_SECONDS = 5.0  # for a router to confirm
 
 
+@final
 class Stop:
-    """Set by a signal: the run must end now. Final."""
+    """Set by a signal: the run must end now."""
 
     def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
-        """orphaned: whether the launcher is gone, which asks for the end too."""
+        """orphaned: whether the launcher is gone, which ends the run, too."""
         self._orphaned = orphaned
         self.wanted = False
 
     def check(self, patience: float = 0.0) -> None:
-        """Raise Interrupted if the end was asked for, or is within so many seconds."""
+        """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
         deadline = time.monotonic() + patience
         while not (asked := self.wanted or self._orphaned()) and time.monotonic() < deadline:
             time.sleep(0.01)
         if asked:
-            raise Interrupted("interrupted; what was measured is in the results folder")
+            raise Interrupted("interrupted; the results so far are in the results folder")
 
 
+@final
 class Conductor:
-    """Final. Its news are (source, payload): telemetry and journal as they come; everything else it keeps to itself."""
+    """Conducts a run; hands on telemetry and journal as (source, payload), and handles all other messages itself."""
 
     def __init__(
         self,
@@ -50,15 +52,15 @@ class Conductor:
         stop: Stop,
         relayed: bool = False,
     ) -> None:
-        """reporters: who reports besides router and sensor: the receivers, and a controller."""
+        """reporters: the processes that report besides router and sensor: the receivers, and a controller."""
         self._session = session
         self._stop = stop
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
-        """Whether we are connected to a relay, and not to the router itself."""
+        """Whether the observer is connected to a relay, and not to the router itself."""
         self._router: str | None = None
         self.lost: dict[str, float] = {}
-        """Process → when it vanished from the network, of those that have, on the clock of `time.monotonic`."""
+        """Process that has vanished from the network → when, on the clock of `time.monotonic`."""
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
@@ -68,11 +70,11 @@ class Conductor:
         for name in self._present:
             session.watch(name, lambda there, name=name: self._news.put(name, there))  # type: ignore[misc]
         self.misdelivered: dict[str, int] = {}
-        """Process → how many messages it dropped because they name another key, of those that have confirmed their end."""
+        """Process that has confirmed its end → how many messages it dropped because they name another key."""
         self.absent: set[str] = set()
-        """Who is away by intent, and not missed."""
+        """Processes that are away because the scenario says so; they do not count as missing."""
         self.questions: SimpleQueue[Question] = SimpleQueue()
-        """What the operator asks."""
+        """The operator's questions."""
         session.asked(keys.control(OBSERVER), self.questions.put)
         self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
         self._progress = session.outlet(keys.progress(OBSERVER))
@@ -83,7 +85,7 @@ class Conductor:
         return [name for name, there in self._present.items() if not there and name not in self.absent]
 
     def router_changed(self) -> bool:
-        """Whether we are connected to another router than that which the run began with, or than when this was asked last."""
+        """Whether the observer is connected to another router than at the previous call, or at the start of the run."""
         before, self._router = self._router, self._session.router_id
         return before != self._router
 
@@ -97,12 +99,12 @@ class Conductor:
         return dict(self._present)
 
     def assemble(self) -> None:
-        """Wait for every process. Raises RunError naming those that are missing after the brief's patience."""
+        """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
         deadline = time.monotonic() + self._session.patience
         while self.missing:
             self._stop.check()
             if time.monotonic() > deadline:
-                # Who waits for somebody else is not the one to be named.
+                # Do not name processes that wait for another one themselves.
                 names = [name for name in self.missing if not self._reaches(name)]
                 names = names or self.missing
                 do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
@@ -116,9 +118,9 @@ class Conductor:
         self._commands[SENSOR](control("start"))
 
     def news(self) -> tuple[str, bytes] | None:
-        """The next message and who sent it, or None if there was none for a moment.
+        """The next message with its sender, or None if there was none for a moment.
 
-        Raises Interrupted when the end was asked for.
+        Raises Interrupted if the run was told to end.
         """
         self._stop.check()
         news = self._next()
@@ -128,16 +130,16 @@ class Conductor:
         return news[0], news[1]
 
     def despair(self, names: Collection[str], patience: float) -> NoReturn:
-        """Raise RunError since these have been missing for so many seconds, unless the end is asked for just now."""
+        """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if just told to end."""
         self._stop.check(_AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
     def command(self, name: str, do: str, **fields: Any) -> None:
-        """Tell one process what to do."""
+        """Send a command to one process."""
         self._commands[name](control(do, **fields))
 
     def ask(self, what: str) -> None:
-        """Ask everybody who is there and reports for something."""
+        """Send a command to every process that is present and reports."""
         for name in self.keys:
             if self._present[name]:
                 self.command(name, what)
@@ -147,9 +149,9 @@ class Conductor:
         self._progress(progress(done))
 
     def end(self, patience: float) -> None:
-        """Tell everybody that the run is over, and again those who were cut off meanwhile; the routers when all others have left.
+        """Tell all processes that the run is over, again if they were cut off meanwhile; the routers when the others have left.
 
-        patience: how many seconds a process is waited for that is missing just now.
+        patience: how many seconds to wait for a process that is missing just now.
         """
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
@@ -166,20 +168,20 @@ class Conductor:
                         self.command(name, "end")
                         told.add(name)
             self._hear_out(self._next())
-        # The relay after the router: what the router has to say comes over it.
+        # The relay after the router: the router's messages pass through it.
         for name in (ROUTER, RELAY):
             if name in self._present:
                 self._end_router(name)
 
     def _has_ended(self, name: str, told: Collection[str]) -> bool:
-        """Whether a process has left for good: it said so, or it vanished when it was told to end and does not come back."""
+        """Whether a process has left for good: it confirmed its end, or it vanished when told to end and did not return."""
         if self._present[name]:
             return False
         gone = time.monotonic() - self.lost.get(name, -math.inf)
         return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
 
     def _end_router(self, name: str) -> None:
-        """Tell a router that the run is over until it confirms that: the router by a message, the relay by its token."""
+        """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
         deadline = time.monotonic() + _ROUTERS_SECONDS
         said = 0.0
         while time.monotonic() < deadline and name not in self.misdelivered:
@@ -191,7 +193,7 @@ class Conductor:
             self._hear_out(self._next())
 
     def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
-        """Note who is there, and who confirms that the run is over; everything else has come before."""
+        """Note which processes are present, and which confirm that the run is over; no other message is due any more."""
         if news is not None and isinstance(news[1], bytes):
             message = Reader(self.keys[news[0]], news[1])
             if is_over(message):
@@ -199,9 +201,9 @@ class Conductor:
         self._note(news)
 
     def abandon(self, why: str) -> None:
-        """Tell everybody who is there that the run will not go on."""
+        """Tell all processes that the run has been given up."""
         others = [name for name in self._commands if name not in {ROUTER, RELAY}]
-        # The routers last, and the relay after the router: what they still have to pass on would go with them.
+        # The routers last, and the relay after the router: they may still have messages to pass on.
         for names in (others, [ROUTER], [RELAY]):
             told = [name for name in names if name in self._commands]
             for name in told:
@@ -211,7 +213,7 @@ class Conductor:
                 time.sleep(0.01)
 
     def _reaches(self, name: str) -> bool:
-        """Whether a process has opened its session, whatever it waits for."""
+        """Whether a process has opened its session; it may still wait for others."""
         return self._session.reaches(self._session.keys.control(name))
 
     def _next(self) -> tuple[str, bytes | bool] | None:

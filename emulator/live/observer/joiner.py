@@ -1,10 +1,10 @@
-"""Joins what all processes report: slots are complete when everybody has reported them."""
+"""Joins the reports of all processes: slots are complete when every process has reported them."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,9 @@ from evedrop.score.slots import InputSlots, ReceiverSlots, Slots, all_set
 Message = TypeVar("Message")
 
 
+@final
 class Joiner:
-    """Takes the messages of all processes as they come and gives back slots as soon as all have reported them. Final."""
+    """Takes the messages of all processes as they come, and returns slots as soon as all have reported them."""
 
     def __init__(
         self,
@@ -35,7 +36,7 @@ class Joiner:
     ) -> None:
         """windows: receiver → slots by which a packet may be late for it; blocks: of the digests of receivers and controller.
 
-        period: a controller's; None without one. check: is given every receiver's report before anything is made of it.
+        period: the controller's period; None without a controller. check: called with every receiver's report before use.
         """
         self._check = check
         self._extent, self._windows, self._blocks, self._period = extent, windows, blocks, period
@@ -51,7 +52,7 @@ class Joiner:
 
     @property
     def done(self) -> int:
-        """The first slot that has not been given back."""
+        """The first slot that has not been returned."""
         return self._done
 
     @property
@@ -69,15 +70,15 @@ class Joiner:
         return self._decided if name == CONTROLLER else self._reports[name].end
 
     def places(self, reporters: Iterable[str]) -> dict[str, int]:
-        """Process → the first slot that it has not reported: sensor, router, and these."""
+        """Process → the first slot that it has not reported, for sensor, router, and these reporters."""
         return {SENSOR: self.sent, ROUTER: self.journaled, **{name: self.reported(name) for name in reporters}}
 
     def complete(self, slots: int) -> bool:
-        """Whether so many slots have been given back, and a controller has reported them."""
+        """Whether this many slots have been returned, and the controller, if any, has reported them."""
         return self._done == slots and (self._period is None or self._decided == slots)
 
     def decisions(self, telemetry: Reader) -> Floats:
-        """Take the controller's telemetry; what its decisions took."""
+        """Take the controller's telemetry; returns the seconds that its decisions took."""
         message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
         self._decided += message.count
         self.digests[CONTROLLER].update(message.digests)
@@ -97,13 +98,13 @@ class Joiner:
         self.digests[name].update(message.digests)
 
     def journal(self, journal: Reader) -> Mapping[str, Account]:
-        """Take the router's journal; the accounts in it."""
+        """Take the router's journal; returns the accounts in it."""
         message = read_journal(journal, self._journal.end, self._windows, self._extent)
         self._journal.add(message, message.count)
         return message.links
 
     def take(self) -> Slots | None:
-        """The next slots that all have reported, if there are any."""
+        """The next slots that all processes have reported, or None."""
         count = min(self._truth.available, self._journal.available, *(c.available for c in self._reports.values()))
         if count == 0:
             return None
@@ -159,11 +160,11 @@ def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArr
 
 
 class _Column(Generic[Message]):
-    """Messages of one sender, some of whose slots were taken."""
+    """Messages of one sender, and how many of their slots have been taken."""
 
     def __init__(self) -> None:
         self._messages: deque[tuple[Message, int]] = deque()
-        self._taken = 0  # slots of the first message that are gone
+        self._taken = 0  # slots taken from the first message
         self.end = 0
         self.available = 0
 
@@ -173,7 +174,7 @@ class _Column(Generic[Message]):
         self.available += count
 
     def take(self, count: int) -> list[tuple[Message, slice]]:
-        """The next slots, as messages and which of their rows."""
+        """The next slots, as messages with the slices of their rows."""
         self.available -= count
         parts = []
         while count:

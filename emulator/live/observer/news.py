@@ -1,7 +1,7 @@
-"""The observer's news to its launcher, and its heartbeat among them.
+"""The observer's news to its launcher, including its heartbeat.
 
-The launcher gives up an observer that says nothing for half a minute. So the heartbeat has a thread of its own: it does not
-stop while the observer imports, computes or writes, however long that takes on a busy machine.
+The launcher gives up an observer that is silent for half a minute. So the heartbeat has a thread of its own: it goes on
+while the observer imports, computes or writes, however long that takes on a busy machine.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ _LINE = threading.Lock()  # one line at a time
 
 
 def set_news_apart() -> None:
-    """Let the file descriptor 1 be standard error from now on: Zenoh logs there, in the middle of the news."""
+    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the news."""
     sys.stdout.flush()
     sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 
 
 def tell(event: str, **news: Any) -> None:
-    """Write a line to standard output for the launcher; nobody has to read it."""
+    """Write a line to standard output for the launcher; works also without a reader."""
     left = memoryview(json.dumps({"event": event, **news}, ensure_ascii=False).encode() + b"\n")
-    with _LINE, suppress(OSError, ValueError, AttributeError):  # a launcher that is gone, or no standard output
+    with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
         while left:
             left = left[os.write(sys.stdout.fileno(), left) :]
 
 
 @final
 class Heartbeat:
-    """Says that this process lives, every second while the block runs."""
+    """Sends the heartbeat to the launcher, every second while the block runs."""
 
     def __init__(self, seconds: float = _BEAT_SECONDS) -> None:
         self._seconds = seconds

@@ -1,4 +1,4 @@
-"""One run as the observer sees it: conducted, scored, recorded, steered, and written to the results folder."""
+"""The observer's work on one run: conducts, scores, records and steers it, and writes the results folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
@@ -49,17 +49,18 @@ if TYPE_CHECKING:
     from evedrop.view.recording import ViewRecording
 
 Report = Callable[[Path, int, str], None]
-"""Prints how a run ended: its results folder, its exit status, and why it failed."""
+"""Prints the end of a run from its results folder, its exit status, and the reason of a failure."""
 _PROGRESS_SECONDS = 0.25
 
 
+@final
 class ObservedRun:
-    """One run as the observer sees it. Final."""
+    """The observer's work on one run."""
 
     def __init__(
         self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
-        """by_hand: whether nobody has launched the others who would end them."""
+        """by_hand: whether the processes were started by hand, so that there is no launcher to end them."""
         self._place = Path(brief.part["results"])
         self._held: HeldFolder | None = None
         self._final: dict[str, Any] | None = None
@@ -85,7 +86,7 @@ class ObservedRun:
         self._started = self._ended = self._told = time.monotonic()
         self._suspects: list[str] = []
         self._accused: tuple[str, ...] = ()
-        """Processes that the run ends with because of what they did."""
+        """Processes whose misbehaviour ended the run."""
         self._recovery: Recovery
         self._stall: Stall
         self._outages: list[Mapping[str, Any]] = []
@@ -95,15 +96,15 @@ class ObservedRun:
 
     @property
     def folder(self) -> Path:
-        """The results folder, also if it was renamed. Raises FileNotFoundError if it was removed."""
+        """The results folder, even if it was renamed. Raises FileNotFoundError if it was removed."""
         return self._place if self._held is None else self._held.now
 
     def hold(self) -> None:
-        """Keep hold of the results folder from now on. Raises OSError if there is none."""
+        """Open the results folder, to find it again if it is renamed. Raises OSError if it does not exist."""
         self._held = HeldFolder(self._place)
 
     def show(self, stand: WebAddress) -> Viewer:
-        """A viewer for browsers, which the run will be streamed to."""
+        """Start a viewer for browsers, and stream the run to it."""
         viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
         tell("view", address=viewer.address)
         return viewer
@@ -114,7 +115,7 @@ class ObservedRun:
         return self._writer
 
     def conduct(self, stop: Stop) -> None:
-        """Carry the run through. Raises RunError when it fails, Interrupted when the end was asked for."""
+        """Conduct the run to its end. Raises RunError if it fails, Interrupted if it was told to end."""
         with Session(self._brief, meanwhile=stop.check) as session:
             conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part["recording"]:
@@ -163,7 +164,7 @@ class ObservedRun:
                     self._misdelivered[OBSERVER] = session.dropped
 
     def _look(self, conductor: Conductor) -> None:
-        """See whether a process that is there keeps the run waiting."""
+        """Check whether a process that is present keeps the run waiting."""
         done, at = self._joiner.done, self._steering.at
         held = at is not None and done >= at
         present = set(self._scenario.digested) - conductor.absent
@@ -178,12 +179,12 @@ class ObservedRun:
         return Control(self._brief.run, self._brief.router, OPERATOR, part["operator"], identity)
 
     def _keep(self, scenario: Scenario) -> None:
-        """The run is of another scenario from now on, of which all slots so far are too."""
+        """Replace the scenario; the slots so far satisfy it, too."""
         self._scenario = scenario
         write_resolved(self.folder, scenario)
 
     def _steer(self, conductor: Conductor) -> None:
-        """Do what is due, what the operator asks for, and what the launcher has done."""
+        """Handle confirmations of the launcher and questions of the operator, and carry out due events."""
         while not self._confirmations.empty():
             self._steering.done(int(self._confirmations.get()))
         while not conductor.questions.empty():
@@ -195,7 +196,7 @@ class ObservedRun:
                 self._recording.note(event["slot"], "INFO", event_line(event))
 
     def _answer(self, conductor: Conductor, question: Question) -> None:
-        """Take what the operator asks; what breaks the protocol is refused and does the run no harm."""
+        """Take a question of the operator; a malformed one is refused and does not harm the run."""
         try:
             order = Order(read_request(OPERATOR, question.payload), question)
         except MalformedMessage as error:
@@ -204,12 +205,12 @@ class ObservedRun:
         if order.request.do == "status":
             order.tell(self._status(conductor))
         elif self._brief.part["shard"]:
-            order.refuse("this run is in shards, which are not steered; run it with --set shards=1 for that")
+            order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
         else:
             self._steering.take(order, self._joiner.done)
 
     def _dismiss(self, conductor: Conductor) -> None:
-        """The run is over: nobody can get at it, and whoever waits is told."""
+        """Remove the control file of the run, which is over, and answer all open questions."""
         with suppress(FileNotFoundError):
             remove_control(self.folder)
         self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
@@ -217,7 +218,7 @@ class ObservedRun:
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
 
     def _status(self, conductor: Conductor) -> dict[str, Any]:
-        """How the run is doing."""
+        """The status of the run."""
         before, done = self._recent
         rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)
         return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.totals)
@@ -258,7 +259,7 @@ class ObservedRun:
         self._progress(scored)
 
     def _stand_in(self) -> None:
-        """Report for receivers that are away."""
+        """Report on behalf of receivers that are away."""
         for name, stand_in in list(self._stand_ins.items()):
             if self._joiner.reported(name) == stand_in.next:
                 stand_in.follow(self._joiner.sent)
@@ -266,7 +267,7 @@ class ObservedRun:
                 del self._stand_ins[name]
 
     def _news(self, source: str, message: Reader) -> bool:
-        """Whether a message is the one that is due, and no other one that came because some were lost."""
+        """Whether a message is the due one; after losses, earlier and later ones arrive, too."""
         found = message.integer("k")
         if source not in (ROUTER, SENSOR) and is_leaving(message):  # comes before the reports of the slots before it
             return not self._steering.has_left(source, found)
@@ -278,11 +279,13 @@ class ObservedRun:
         return found == due
 
     def _leave(self, name: str, message: Reader) -> None:
-        """Report for a receiver from now on, until it is back."""
+        """Report on behalf of a receiver until it is back."""
         k, left = read_leaving(message, self._extent)
         away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
         if away is None:
-            raise message.malformed(f"a leave before slot {k}", "one where an event makes the receiver leave")
+            raise message.malformed(
+                f"a leave before slot {k}", "a leave at a slot where an event makes the receiver leave"
+            )
         key = message.key
 
         def put(payload: bytes) -> None:
@@ -304,24 +307,24 @@ class ObservedRun:
 
     @property
     def _at(self) -> str:
-        """How far the run came."""
+        """How far the run has come, in words."""
         return f"slot {self._joiner.done}"
 
     def _save(self) -> None:
-        """Have on disk what was measured, from time to time. Raises RunError if it cannot be written."""
+        """Save the results so far, from time to time. Raises RunError if they cannot be written."""
         try:
-            with suppress(NoAnswer):  # which is told at the end; rows are written before figures are asked for
+            with suppress(NoAnswer):  # reported at the end; rows are written before the summary is computed
                 self._writer.checkpoint(self._at, self._so_far)
         except OSError as error:
             raise RunError(unwritten(error)) from error
 
     def _so_far(self) -> dict[str, Any]:
-        """The summary of a run that goes on."""
+        """The summary of the slots so far."""
         self._ended = time.monotonic()
         return self._summary("")
 
     def _summary(self, how: str) -> dict[str, Any]:
-        """The summary by now; a shard leaves its score for the run's."""
+        """The summary; a shard also dumps its score, for the summary of the whole run."""
         folder = self.folder
         if self._brief.part["shard"]:
             dump_score(self._keeper.totals, folder)
@@ -339,13 +342,13 @@ class ObservedRun:
         return summary_of(self._scenario, self._keeper.totals, digests, ending)
 
     def settle(self, how: str) -> None:
-        """Have all that was measured on disk, its summary too. Raises OSError if it cannot be written."""
+        """Save all results and the summary to disk. Raises OSError if they cannot be written."""
         self._digest_rows.write(self._writer)
         self._final = self._summary(how)
         self._writer.settle(self._at, self._final)
 
     def finish(self, status: int, how: str, report: Report) -> int:
-        """Close the view, write the summary, and tell the launcher; the exit status of the run.
+        """Close the view, write the summary, and tell the launcher; returns the exit status of the run.
 
         report: prints how the run ended, if it was started by hand.
         """

@@ -2,8 +2,8 @@
 
 Its news go to standard output, a JSON object a line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
 times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
-and `{"event": "ended", "status": …}`. Whatever ends the run, the results folder is whole. An observer that was started by
-hand then prints the table and the verdict that `evedrop run` prints.
+and `{"event": "ended", "status": …}`. However the run ends, the results folder is complete. An observer started by hand
+then prints the same table and verdict as `evedrop run`.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from evedrop.results.summary_file import unwritten
 from evedrop.scenario import Scenario
 from evedrop.view.viewer import WebAddress
 
-_ORPHAN_SECONDS = 30.0  # to write the results when the launcher is gone
+_ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
 
 
 def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
-    """Run the observer of a brief; the exit status of the run.
+    """Run the observer of a brief; returns the exit status of the run.
 
-    report: prints how a run ended that was started by hand. serve: HOST:PORT where browsers may see it, if anywhere.
-    Raises UsageError, BriefError, RunError or Interrupted, of one started by hand, as long as nothing has begun.
+    report: prints the end of a run that was started by hand. serve: HOST:PORT where browsers may see the run, if anywhere.
+    Raises UsageError, BriefError, RunError or Interrupted, if started by hand, as long as the run has not begun.
     """
     stand = None if serve is None else WebAddress.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
@@ -48,11 +48,11 @@ def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
-    ANSWERS.learn(brief.part["classes"])  # so that the classes themselves need not run here
+    ANSWERS.learn(brief.part["classes"])  # so that the observer need not run the classes themselves
     scenario = Scenario.model_validate(brief.part["scenario"])
     observation = ObservedRun(brief, scenario, confirmations, by_hand)
     if by_hand:
-        # Before there is anything in it: what a brief that does not fit leaves behind would be in the next one's way.
+        # Connect before writing to the folder: files left by a brief that does not fit would block the next attempt.
         new_folder(observation.folder)
         with Session(brief, meanwhile=stop.check):
             pass
@@ -71,9 +71,12 @@ def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
             observation.settle(how)
     except OSError as error:
         status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)
-    except NoAnswer as error:  # of a class that the operator's change of a link has a question for
-        status, how = RunError.exit_status, f"an eavesdropper's class could not say what theory expects of it: {error}"
-    except Exception as error:  # a mistake of ours must not cost what was measured
+    except NoAnswer as error:  # of a class that is asked again after the operator's change of a link
+        status, how = (
+            RunError.exit_status,
+            f"an eavesdropper's class could not give the covariance expected of it: {error}",
+        )
+    except Exception as error:  # a bug in the observer must not cost the results
         traceback.print_exc()
         status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
     status = observation.finish(status, how, report)
@@ -83,7 +86,7 @@ def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
 
 
 def _end_orphaned() -> None:
-    """Write what there is, and end."""
+    """Write the results so far, and exit."""
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_ORPHAN_SECONDS)
     os._exit(RunError.exit_status)

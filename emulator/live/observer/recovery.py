@@ -1,8 +1,8 @@
-"""Lost connections: who was cut off, from when to when, and what is said so that all is sent once more that was lost.
+"""Lost connections: which processes were cut off, for how long, and the commands to send the lost messages again.
 
-A process that vanishes from the network is waited for. When all are back the conductor begins a round: the sensor sends its
-packets once more from the first slot that is not joined, the router routes them once more, and everybody sends its reports
-once more; whoever has something already ignores it. Rounds go on until slots are joined again.
+The run waits for a process that vanishes from the network. When all are back, the conductor begins a round: the sensor sends
+its packets again from the first slot that is not joined, the router routes them again, and every process sends its reports
+again; a process ignores messages that it already has. Rounds are repeated until slots are joined again.
 
 Source: docs/protocol.md, lost connections.
 """
@@ -12,15 +12,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, final
 
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
 from evedrop.names import OBSERVER, RELAY, ROUTER
 
-_SOON_SECONDS = 0.5  # after which a round is repeated that had no effect, and twice as long each time
-_IDLE_SECONDS = 10.0  # for which a run may come to a stand without a reason before a round is tried
+_SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
+_IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before a round is tried
 _LONGEST_SECONDS = 30.0
 
 
@@ -29,17 +29,18 @@ class ConnectionOutage:
     """A process that was cut off."""
 
     process: str
-    """Whose connection it was; the router, if it was started anew; all connections are with it."""
+    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
     slot: int
-    """The first slot that was not joined when it was noticed."""
+    """The first slot that was not joined when the loss was noticed."""
     until: int | None
-    """The same when the run went on; None if it did not."""
+    """The first slot that was not joined when the run went on; None if it did not."""
     seconds: float
-    """From the last slot that was joined before to when the run went on: it may be noticed late."""
+    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
 
 
+@final
 class Recovery:
-    """Final. say: news to the launcher."""
+    """Notices lost connections and begins rounds of resending. say: sends news to the launcher."""
 
     def __init__(
         self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: Callable[..., None]
@@ -50,18 +51,18 @@ class Recovery:
         self._back: dict[str, tuple[int, float]] = {}
         self._done = 0
         self._target = 0
-        """Slots below were on the way when a connection was lost."""
+        """Slots below this were under way when a connection was lost."""
         self._moved = self._joined = time.monotonic()
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
         self.outages: list[ConnectionOutage] = []
-        """All so far."""
+        """All outages so far."""
 
     def look(self, done: int) -> None:
-        """See whether something is to be done now that all slots below `done` are joined.
+        """Handle lost connections, given that all slots below `done` are joined.
 
-        Raises RunError when somebody has been missing for too long.
+        Raises RunError if a process has been missing for too long.
         """
         now = time.monotonic()
         if done > self._done:
@@ -71,7 +72,7 @@ class Recovery:
         elif self._missing:
             self._all_back(now)
         elif self._steering.at is not None and done >= self._steering.at:
-            self._moved = self._joined = now  # held, and nothing is expected
+            self._moved = self._joined = now  # the run is held: no slots are expected
             self._close(done, now)
         elif now - self._moved > self._limit:
             self._round(now)
@@ -93,7 +94,7 @@ class Recovery:
         self._close(done, now)
 
     def _close(self, done: int, now: float) -> None:
-        """The run goes on: whoever was cut off is so no longer."""
+        """Record the outages that ended, now that the run goes on."""
         for name, (slot, since) in self._back.items():
             outage = ConnectionOutage(name, slot, done, now - since)
             self.outages.append(outage)
@@ -109,15 +110,15 @@ class Recovery:
             if now - self._conductor.lost.get(name, now) > self._flow.longest_outage
         ]
         if gone:
-            # Without the router nobody else can be seen either.
+            # Without the router no other process can be seen.
             gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
             self.give_up(done)
             self._conductor.despair(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
         found = self._missing
-        # All vanish with the router that we are connected to, and with our own connection to it. Behind a relay, the sensor
-        # vanishes with the router, and both with the link between them.
+        # All processes vanish with the observer's own router, or with the connection to it. Behind a relay, the sensor
+        # vanishes with the router, and both with the link between the routers.
         own = RELAY if self._conductor.relayed else ROUTER
         if own in found:
             found = {own if self._conductor.router_changed() else OBSERVER: found[own]}
@@ -131,7 +132,7 @@ class Recovery:
         self._round(now)
 
     def _round(self, now: float) -> None:
-        """Ask for all once more that may have been lost."""
+        """Ask all processes to send the messages again that may have been lost."""
         self._wait = min(2.0 * self._limit, max(_LONGEST_SECONDS, self._limit))
         self._moved = now
         self._number += 1
@@ -145,7 +146,7 @@ class Recovery:
         self._conductor.report(self._done)
 
     def give_up(self, done: int) -> None:
-        """The run has come to its end with slot `done`: whoever is cut off stays so."""
+        """Record the outages that are open when the run ends with slot `done`."""
         now = time.monotonic()
         self._close(done, now)
         found = self._missing
@@ -154,5 +155,5 @@ class Recovery:
         self._missing = {}
 
     def account(self) -> list[Mapping[str, Any]]:
-        """The outages as the summary has them."""
+        """The outages in the form of the summary."""
         return [asdict(outage) for outage in self.outages]

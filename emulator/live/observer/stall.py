@@ -1,8 +1,9 @@
-"""A run that stands still although everybody is on the network: who is silent, found out by asking all on whom they wait.
+"""Finds the silent process when a run stands still although all processes are on the network.
 
-    observer ── waits for the reports of whoever is furthest behind ── who waits for a message of … ── who waits for nobody
+    observer ── waits for reports of the process furthest behind ── waits for a message of … ── waits for no process
 
-The process at the end of such a chain is the one that the run waits for. What somebody does that nobody waits for is no excuse.
+Every process is asked what it waits for. The run waits for the process at the end of such a chain. Work that no other
+process waits for does not count as progress.
 
 Source: docs/protocol.md, silence.
 """
@@ -20,11 +21,13 @@ from evedrop.names import OBSERVER
 
 _LEAST_SECONDS = 5.0  # a busy machine may not let a process work for some seconds
 _LOOK_SECONDS = 0.25
-_STEP_SECONDS = 1.0  # time in which we did not look ourselves does not count
+_STEP_SECONDS = (
+    1.0  # the most that counts between two looks: time in which the observer itself did not run does not count
+)
 
 
 def patience_of(longest_outage: float, pace: float, batch: int) -> float:
-    """Seconds for which a process may do nothing while the run waits for it: in real time it may have nothing to do."""
+    """Seconds for which a process may do nothing while the run waits for it; with a pace, it may have nothing to do."""
     return max(_LEAST_SECONDS, longest_outage) + 2.0 * pace * batch
 
 
@@ -33,18 +36,18 @@ class Stall:
     """Notices that a run stands still, and ends it when the process that it waits for has done nothing for too long."""
 
     def __init__(self, patience: float, batch: int, ask: Callable[[], None]) -> None:
-        """patience: as in `patience_of`; batch: slots of a report; ask: asks everybody where they are."""
+        """patience: as in `patience_of`; batch: slots of a report; ask: asks every process where it is."""
         self._patience, self._batch, self._ask = patience, batch, ask
         self._looked = time.monotonic()
         self._done = 0
         self._stalled = self._asked = 0.0
-        """Seconds for which nothing was joined, and of them those after which everybody was asked last."""
+        """Seconds since slots were last joined, and the value of that count when the processes were last asked."""
         self._answers: dict[str, Whereabouts] = {}
         self._moved: dict[str, tuple[tuple[int, int], float]] = {}
-        """Process → where it is, as it says and as it has reported, and when in this stall that changed."""
+        """Process → the slot it is at by its answer and by its reports, and when in this stall that last changed."""
 
     def take(self, process: str, where: Whereabouts) -> None:
-        """A process says where it is."""
+        """Take a process's answer."""
         self._answers[process] = where
 
     def look(
@@ -56,10 +59,11 @@ class Stall:
         held: bool,
         missing: bool,
     ) -> None:
-        """See whether the run goes on; all slots below `done` are joined.
+        """Check whether the run goes on; all slots below `done` are joined. Raises Silence.
 
-        reported: process → the first slot that it has not reported; beside: those whose reports slots are joined without.
-        held: nothing is expected of anybody; missing: somebody is not on the network, which is another matter. Raises Silence.
+        reported: process → the first slot that it has not reported; beside: processes whose reports are not needed to join
+        slots. held: the run is held, and no process has anything to do; missing: some process is not on the network, which
+        is handled elsewhere.
         """
         now = time.monotonic()
         if done > self._done or held:
@@ -76,11 +80,11 @@ class Stall:
             return
         places = reported()
         for process, k in places.items():
-            # It reports at least every batch of slots: further than that, nobody believes it without a report.
+            # It reports at least once in every batch of slots: do not believe that it is further without a report.
             said = min(self._answers[process].slot, k + self._batch) if process in self._answers else -1
             place = (said, k)
             if process not in self._moved or self._moved[process][0] < place:
-                # The first answer is no move: since when it is there nobody knows.
+                # The first answer does not count as a move: it is unknown when the process reached that slot.
                 known = self._moved.get(process)
                 first = known is None or (known[0][0] == -1 and known[0][1] == k)
                 self._moved[process] = (place, 0.0 if first else self._stalled)
@@ -98,7 +102,7 @@ class Stall:
             raise Silence(
                 silent,
                 f"alive, and silent for {still:.0f} s while the run waits for slot {self._done} ({what}); look at "
-                f"{' and '.join(f'logs/{name}.log' for name in silent)}, or allow more by longest_outage",
+                f"{' and '.join(f'logs/{name}.log' for name in silent)}, or raise longest_outage",
             )
 
 
@@ -106,15 +110,15 @@ def _described(name: str, where: Whereabouts | None) -> str:
     if where is None:
         return f"{name} does not say where it is"
     if not where.waits:
-        return f"{name} is at slot {where.slot} and waits for nobody"
+        return f"{name} is at slot {where.slot} and waits for no process"
     return f"{name} says that it is at slot {where.slot} and waits on {', '.join(where.waits[:3])}"
 
 
 def silent_of(places: Mapping[str, int], answers: Mapping[str, Whereabouts], beside: Collection[str] = ()) -> list[str]:
-    """The processes that a run which stands still waits for.
+    """The processes that a run waits for when it stands still.
 
-    places: process → the first slot that it has not reported; answers: where those are who have said so; beside: processes
-    whose reports slots are joined without.
+    places: process → the first slot that it has not reported; answers: of the processes that have answered; beside:
+    processes whose reports are not needed to join slots.
     """
     joined = {name: k for name, k in places.items() if name not in beside}
     behind = [name for name, k in joined.items() if k == min(joined.values())]
@@ -135,7 +139,7 @@ def silent_of(places: Mapping[str, int], answers: Mapping[str, Whereabouts], bes
         return idle or mute
     if len(behind) < len(joined):
         return behind
-    # Everybody says to wait for another one: somebody has not sent what it says to have sent.
+    # Every process claims to wait for another: some process has not sent a message that it claims to have sent.
     owing = {
         writer
         for name in chain

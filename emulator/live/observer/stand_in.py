@@ -1,4 +1,4 @@
-"""Who reports for a receiver while it is not there, so that every slot of every receiver is accounted for.
+"""Reports on behalf of an absent receiver, so that every slot of every receiver is accounted for.
 
 Source: docs/results.md, summary.json.
 """
@@ -6,6 +6,7 @@ Source: docs/results.md, summary.json.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import final
 
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.protocol.brief import Brief
@@ -15,8 +16,9 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.timeline import Away
 
 
+@final
 class StandIn:
-    """Reports what a receiver that is away will believe, from what it believed when it left. Final.
+    """Reports the beliefs of a receiver that is away, computed from its belief when it left.
 
     brief: of the observer; put: takes the reports as if they were the receiver's own.
     """
@@ -30,7 +32,7 @@ class StandIn:
         cuts, late = scenario.cuts(receiver), scenario.window(receiver) > 0
         self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts, away.start, late)
         self.next = away.start
-        """The first slot that is not reported."""
+        """The first slot that has not been reported."""
         self._stop = min(away.stop, scenario.slots)
 
     @property

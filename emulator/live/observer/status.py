@@ -1,4 +1,4 @@
-"""How a run that goes on is doing, for its operator.
+"""The status of a run that goes on, for its operator.
 
 Source: docs/protocol.md.
 """
@@ -16,7 +16,7 @@ from evedrop.score.totals import Totals
 def status_of(
     scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, totals: Totals
 ) -> dict[str, Any]:
-    """The status of a run that has done so many slots, so many a second."""
+    """The status of a run; done: how many slots are done; rate: slots per second."""
     links = {}
     for name, tally in totals.tallies.items():
         account = tally.link

@@ -1,7 +1,7 @@
-"""Holding the run at a slot: everybody has reported all slots before it, what is due is done, and the run goes on.
+"""Holds the run before a slot: when every process has reported all earlier slots, carries out due events, and lets it go on.
 
-So an event takes effect exactly between two slots, one of the scenario's and one of the operator's alike. While the sensor
-holds, nothing is under way but what links delay.
+So an event takes effect exactly between two slots, whether it is the scenario's or the operator's. While the sensor holds,
+only packets delayed by links are under way.
 
 Source: docs/control.md.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, final
 
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.session import READY_SECONDS
@@ -26,11 +26,12 @@ from evedrop.scenario.timeline import Act, acts_of
 _PROCESS_ACTS = ("kill", "restart", "pause", "resume")
 
 
+@final
 class Steering:
-    """The holds of a run. Final.
+    """Carries out the events of the scenario and the requests of the operator while the run is held.
 
-    tell: news to the launcher, such as that it must do something to a process; it confirms with `done`.
-    keep: is given the scenario that the run is of, each time that the operator has changed it.
+    tell: sends news to the launcher, such as an act on a process, which the launcher confirms; see `done`.
+    keep: called with the amended scenario each time the operator has changed it.
     """
 
     def __init__(
@@ -57,12 +58,12 @@ class Steering:
         self._gone: dict[str, Any] | None = None
         """The last go, as the sensor was told it."""
         self.paused = False
-        """Whether the run stays held until the operator says otherwise."""
+        """Whether the run stays held until the operator resumes it."""
         self.events: list[dict[str, Any]] = []
-        """What was done, from which slot on, and by whom."""
+        """The events so far: each with its slot, and whether the scenario or the operator caused it."""
 
     def held(self, k: int) -> None:
-        """The sensor holds before slot k. It may say so once more."""
+        """The sensor holds before slot k. It may report this more than once."""
         if k <= self._last:
             return
         self.at, self._last, self._asked = k, k, False
@@ -70,22 +71,25 @@ class Steering:
         self._since = time.monotonic()
 
     def left(self, name: str, k: int) -> None:
-        """A receiver has said its last word before slot k, with which its absence begins."""
+        """A receiver has left before slot k, the first slot of its absence."""
         self._left[name] = k
 
     def has_left(self, name: str, k: int) -> bool:
-        """Whether it has said so."""
+        """Whether a receiver has left before slot k."""
         return self._left.get(name) == k
 
     def done(self, number: int) -> None:
-        """The launcher has done what it was asked for last."""
+        """The launcher confirms an act on a process; number: of the event."""
         self._confirmed = self._confirmed or number == len(self.events)
 
     def take(self, order: Order, reported: int) -> None:
-        """The operator asks for something: it is done at the next hold, for which the sensor is asked; reported as below."""
+        """Take a request of the operator, which is carried out at the next hold; ask the sensor to hold.
+
+        reported: all slots below it are joined.
+        """
         if order.request.do == "resume" and self.at is None and not self._orders:
             self._forget_step(reported, "the run was resumed")
-            order.done(reported, "the run goes on already")
+            order.done(reported, "the run is not paused")
             return
         self._orders.append(order)
         if self.at is None and not self._asked:
@@ -93,18 +97,18 @@ class Steering:
             self._conductor.command(SENSOR, "hold")
 
     def carry_on(self, reported: int) -> None:
-        """Go as far as can be gone now that all slots below `reported` are joined.
+        """Carry out as many events as possible, given that all slots below `reported` are joined.
 
-        Raises RunError for a process that does not come back in time.
+        Raises RunError if the processes do not get there in time.
         """
         if self.at is None:
             return
         if reported < self.at:
-            self._despair(f"not everybody has reported all slots below {self.at}")
+            self._despair(f"not every process has reported all slots below {self.at}")
             return
         while self._settled():
             if self._pending and not self._may(self._pending[0]):
-                self._despair(f"{self._pending[0].names[0]} has not said what it believes")
+                self._despair(f"{self._pending[0].names[0]} has not sent its final belief")
                 return
             if self._pending:
                 self._do(self.at, self._pending.pop(0))
@@ -118,7 +122,7 @@ class Steering:
                 return
 
     def over(self, reported: int, *, complete: bool) -> None:
-        """The run has ended, and nothing can be asked of it any more."""
+        """The run has ended: answer all open requests."""
         if self._step is not None:
             said = self._step.passed(reported)
             if complete:
@@ -127,14 +131,14 @@ class Steering:
                 self._step.order.refuse(f"{said}; the run was ended before the step was over")
         self._step = None
         while self._orders:
-            self._orders.popleft().refuse("the run came to its end before; nothing was done")
+            self._orders.popleft().refuse("the run ended first; nothing was done")
 
     def _settled(self) -> bool:
-        """Whether what was done last has taken effect."""
+        """Whether the last act on a process has taken effect."""
         act = self._waiting
         if act is None:
             return True
-        # Who is paused for long loses its connection, and must have it back.
+        # A process that was paused for long loses its connection, and must have it back.
         there = {"kill": False, "restart": True, "resume": True}.get(act.kind)
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
             if act.kind in ("restart", "resume"):
@@ -146,14 +150,14 @@ class Steering:
         return False
 
     def _despair(self, what: str) -> None:
-        """Raise RunError if what is waited for has been missing for too long."""
+        """Raise RunError if the run has been waiting for too long; what: the missing condition."""
         if time.monotonic() - self._since > READY_SECONDS:
             raise RunError(
                 f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {what}; look at the logs"
             )
 
     def _may(self, act: Act) -> bool:
-        """Whether who is to go has left: its reports may all have been due before the hold, which it has not seen then."""
+        """Whether an act may begin: a receiver that is to go must have left, since it may not have seen the hold yet."""
         return act.kind not in ("kill", "pause") or all(self._left.get(name) == act.at for name in act.names)
 
     def _do(self, k: int, act: Act) -> None:
@@ -165,7 +169,7 @@ class Steering:
             self._tell("act", do=act.kind, process=act.names[0], first=k, number=len(self.events))
 
     def _obey(self, k: int, order: Order) -> None:
-        """Do what the operator asks for, before slot k."""
+        """Carry out a request of the operator before slot k."""
         match order.request.do:
             case "link":
                 self._change(k, order)
@@ -182,14 +186,16 @@ class Steering:
                 self._forget_step(k, "the run was resumed")
                 order.done(k, f"the run goes on with slot {k}")
             case "step" if self._step is not None:
-                order.refuse(f"another step goes on, to slot {self._step.until - 1}; wait for its end, or pause before")
+                order.refuse(
+                    f"another step is under way, to slot {self._step.until - 1}; wait for its end, or pause first"
+                )
             case "step":
                 slots = order.request.slots or 1
                 self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
                 self._step, self.paused = OperatorStep(order, k, k + slots), False
 
     def _change(self, k: int, order: Order) -> None:
-        """Let the scenario have one more event, at slot k, and tell the router what its links do from then on."""
+        """Add an event at slot k to the scenario, and send the router the changes of its links from then on."""
         try:
             changed = with_event(self._scenario, order.request.event or {}, k)
         except ScenarioError as error:
@@ -217,7 +223,7 @@ class Steering:
         step.order.done(k, f"{step.passed(k)}; held before slot {k}")
 
     def _forget_step(self, k: int, why: str) -> None:
-        """Tell who waits for a step's end that there will be none."""
+        """Answer the request for the present step, which will not be completed."""
         if self._step is not None:
             self._step.order.done(k, f"{self._step.passed(k)}; {why} before the step was over")
         self._step = None
@@ -238,14 +244,14 @@ class Steering:
 
     @property
     def changes(self) -> dict[str, list[dict[str, Any]]]:
-        """Link → all its changes, of the links that an operator has changed."""
+        """Link that the operator has changed → all its changes."""
         timeline = self._scenario.timeline.changes
         return {name: [_plain(one) for one in timeline[name]] for name in sorted(self._changed)}
 
     def remind(self) -> None:
-        """Repeat the last go: it may have been lost with a connection. A hold may take as long as ever.
+        """Send the last commands again, which may have been lost with a connection; restart the time limit of the hold.
 
-        Also while the sensor holds again: the router may still wait at the hold before.
+        The last go is sent also while the sensor holds again: a router that was restarted may still wait at the hold before.
         """
         self._since = time.monotonic()
         self._go()
@@ -254,6 +260,6 @@ class Steering:
 
 
 def _plain(change: Change) -> dict[str, Any]:
-    """A change as the command to the router has it."""
+    """A change in the form of the command to the router."""
     optional = {"settings": change.settings, "cut": change.cut}
     return {"at": change.at, **{name: value for name, value in optional.items() if value is not None}}

@@ -1,7 +1,8 @@
-"""What receivers claim, held against what they have reported and against the router's journal.
+"""Verifies the receivers' claims against their own reports and against the router's journal.
 
-Of the recorded trials a receiver reports all that its digests are made of, so they are computed again. For all trials it says
-what it received in each slot, and so does the router. What can be checked neither way rests on the receiver's own word.
+For the recorded trials a receiver reports everything that enters its digests, so the observer computes the digests again.
+For all trials it reports whether it received a packet in each slot, and so does the router. Claims that can be checked
+neither way rest on the receiver's word alone.
 
 Source: docs/results.md, what is verified.
 """
@@ -21,7 +22,7 @@ from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
 from evedrop.score.slots import ReceiverSlots, Slots
 
-_ROUNDING = 1e-9  # sums of a thousand traces differ by less in whatever order they are added
+_ROUNDING = 1e-9  # sums of a thousand traces in different orders differ by less
 
 
 @final
@@ -29,17 +30,17 @@ class Verifier:
     """Checks the reports of all receivers of a run, in the order of their slots."""
 
     def __init__(self, blocks: Mapping[str, Blocks], recorded: int, first_trial: int) -> None:
-        """blocks: receiver → its digests' blocks; recorded: trials of which all is reported; first_trial: number of the first."""
+        """blocks: receiver → its digests' blocks; recorded: how many trials are reported in full; first_trial: their first."""
         self._blocks, self._recorded, self._first_trial = blocks, recorded, first_trial
         self._digests: dict[str, PartialDigests] = {}
         self._leaving: dict[tuple[str, int], Belief] = {}
 
     def left(self, name: str, k: int, belief: Belief) -> None:
-        """A receiver has said what it believes before slot k, with which it goes away."""
+        """Take a receiver's final belief before slot k, the first slot of its absence."""
         self._leaving[name, k] = belief
 
     def report(self, name: str, report: Report) -> None:
-        """Take a receiver's next report. Raises Contradiction if it does not fit itself."""
+        """Check a receiver's next report. Raises Contradiction if the report contradicts itself."""
         self._check_traces(name, report)
         end = report.first + report.count
         self._check_leaving(name, report, end)
@@ -67,18 +68,18 @@ class Verifier:
             )
 
     def _check_traces(self, name: str, report: Report) -> None:
-        """The sums of tr P over all trials must be possible with the recorded ones, and be theirs where all are recorded."""
+        """Check that the sums of tr P over all trials are possible given the recorded trials; equal, if all are recorded."""
         traces = trace_of(report.P.transpose(1, 2, 0, 3))
         trials, claimed = report.x_hat.shape[2], report.trace
         others = trials - traces.shape[1]
-        with np.errstate(over="ignore", invalid="ignore"):  # of numbers that a receiver may have made up
+        with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
             known = np.stack([traces.sum(axis=1), (traces * traces).sum(axis=1)], axis=1)
             size = np.stack([np.sqrt(trials * np.abs(claimed[:, 1])), np.abs(claimed[:, 1])], axis=1)
             left = claimed - known
             if others == 0:
                 wrong = (np.abs(left) > _ROUNDING * np.maximum(size, np.abs(known))).any(axis=1)
             else:
-                # Of any numbers: |sum| ≤ √(how many · sum of squares). What is left of the squares is known within rounding.
+                # For any numbers: |sum| ≤ √(count · sum of squares). The remaining sum of squares is known within rounding.
                 squares = left[:, 1] + _ROUNDING * size[:, 1]
                 room = np.sqrt(others * np.maximum(squares, 0.0)) + _ROUNDING * size[:, 0]
                 wrong = (squares < 0.0) | (np.abs(left[:, 0]) > room)
@@ -92,7 +93,7 @@ class Verifier:
             )
 
     def _check_leaving(self, name: str, report: Report, end: int) -> None:
-        """A receiver leaves with what it has reported of its last slot."""
+        """Check that a receiver's final belief is the one in its report of its last slot."""
         left = self._leaving.pop((name, end), None)
         if left is None:
             return
@@ -109,7 +110,7 @@ class Verifier:
                 )
 
     def joined(self, slots: Slots) -> None:
-        """Hold slots that all have reported against the journal. Raises Contradiction."""
+        """Check joined slots against the journal. Raises Contradiction."""
         for name, receiver in slots.receivers.items():
             self._check_received(name, slots.first, receiver)
             if slots.sent is not None:
@@ -124,8 +125,8 @@ class Verifier:
             journal = "that it was delivered" if receiver.delivered[row, r] else "that it was not delivered"
             raise Contradiction(
                 name,
-                f"of slot {first + row}, trial {self._first_trial + r}, it says {says} (action "
-                f"{int(receiver.action[row, r])}), and the journal {journal}",
+                f"in slot {first + row}, trial {self._first_trial + r}, it says {says} (action "
+                f"{int(receiver.action[row, r])}), but the journal says {journal}",
                 ROUTER,
             )
         if receiver.late is None or receiver.late_delivered is None:
@@ -135,13 +136,13 @@ class Verifier:
             row, r = (int(i) for i in np.argwhere(wrong)[0])
             raise Contradiction(
                 name,
-                f"of slot {first + row}, trial {self._first_trial + r}, it says that {int(receiver.late[row, r])} late packets "
-                f"came, and the journal {int(receiver.late_delivered[row, r])}",
+                f"in slot {first + row}, trial {self._first_trial + r}, it says that {int(receiver.late[row, r])} late packets "
+                f"arrived, but the journal says {int(receiver.late_delivered[row, r])}",
                 ROUTER,
             )
 
     def _check_sent(self, slots: Slots, receiver: ReceiverSlots) -> None:
-        """The sensor's word on what it sent against the journal's."""
+        """Check the sensor's report of the packets that it sent against the journal."""
         if slots.sent is None:
             return
         silent = np.count_nonzero(~slots.sent, axis=1)
@@ -151,14 +152,14 @@ class Verifier:
             row = int(np.argmax(wrong))
             raise Contradiction(
                 SENSOR,
-                f"of slot {slots.first + row} it says that {int(silent[row])} trials sent nothing, and the journal "
-                f"{int(np.broadcast_to(unsent, silent.shape)[row])}, or that one of them was delivered",
+                f"in slot {slots.first + row} it says that {int(silent[row])} trials sent nothing, but the journal says "
+                f"{int(np.broadcast_to(unsent, silent.shape)[row])}, or that a packet of one of them was delivered",
                 ROUTER,
             )
 
 
 def extent_of(scenario: Scenario, batch: int) -> Extent:
-    """What messages of a run are held to."""
+    """The sizes that messages of a run must have."""
     plant = scenario.driven
     return Extent(
         scenario.slots,

@@ -1,7 +1,7 @@
-"""What one process may know: written by the launcher, read by the process, and nothing else is handed to it.
+"""Briefs: everything that one process may know, written by the launcher and read by the process as its only argument.
 
-A brief is `<process>.json`, mode 0600. The keys in it are those of the streams the process owns; the scenario's seed
-is in none but the observer's.
+A brief is `<process>.json`, mode 0600. It holds the keys of the streams that the process owns; only the observer's brief
+holds the scenario's seed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from evedrop.model.process import Process, mistakes_of
 from evedrop.streams import Batch
 
 ROLES = tuple(PARTS)
-_MOST_BYTES = 2**30  # the observer's has a scenario with everything in it
+_MOST_BYTES = 2**30  # the observer's brief holds the complete scenario
 _WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
@@ -37,12 +37,12 @@ class Flow:
     longest_outage: float = 30.0
     """Seconds for which a process may be cut off before that ends the run."""
     largest_message: int = 2**30
-    """Bytes of the largest message of the run: more is not taken in."""
+    """Bytes of the largest message of the run: larger ones are not accepted."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """The public model: everybody may know it."""
+    """The public model, which every process may know."""
 
     A: list[list[float]]
     Q: list[list[float]]
@@ -50,7 +50,7 @@ class Model:
     state_probability: float
     """μ_d."""
     header: int = 0
-    """Numbers that a packet has in clear beside its payload."""
+    """How many unencrypted numbers a packet has in addition to its payload."""
     singular_noise: bool = False
     """Whether Q may be singular."""
 
@@ -62,10 +62,10 @@ class Model:
 
 @dataclass(frozen=True)
 class Identity:
-    """Who a process is where that must be shown, and who else to believe; each in PEM."""
+    """A process's certificate and key, and the authority that it trusts; each in PEM."""
 
     authority: str
-    """The certificate of the run's authority, which made everybody's."""
+    """The certificate of the run's authority, which made all certificates of the run."""
     certificate: str
     key: str
     """The private key of the certificate."""
@@ -86,7 +86,7 @@ class Brief:
     trials: int
     first_trial: int
     recorded: int
-    """The first so many trials of the run are recorded in full."""
+    """How many of the first trials are recorded in full."""
     flow: Flow
     model: Model
     keys: Mapping[str, str] = field(default_factory=dict)
@@ -94,13 +94,13 @@ class Brief:
     part: Mapping[str, Any] = field(default_factory=dict)
     """The role's part of the scenario."""
     first: int = 0
-    """The first slot that this process sees: of one that is started again, where it goes on."""
+    """The first slot that this process handles: for a restarted process, where it goes on."""
     ends_with_stdin: bool = False
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
     patience: int = 30
-    """Seconds that it waits for the others to be there."""
+    """Seconds for which it waits for the other processes."""
     identity: Identity | None = None
-    """Of a run whose router takes certificates."""
+    """Its identity, if the run's router takes certificates."""
 
     @property
     def batch(self) -> Batch:
@@ -113,7 +113,7 @@ class Brief:
         return {name: bytes.fromhex(key) for name, key in self.keys.items()}
 
     def write(self, directory: Path) -> Path:
-        """Write `<process>.json`, readable by nobody else."""
+        """Write `<process>.json`, readable by its owner only."""
         path = directory / f"{self.process}.json"
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             json.dump(asdict(self), file, indent=1)
@@ -121,7 +121,7 @@ class Brief:
 
 
 def read_brief(path: Path, role: str | None = None) -> Brief:
-    """The brief in a file. Raises BriefError if it is unreadable, readable by others, or another role's."""
+    """Read a brief. Raises BriefError if it cannot be read, is readable by others, or is another role's."""
     try:
         with opened(path) as file:
             if os.fstat(file.fileno()).st_mode & 0o077:
@@ -159,9 +159,9 @@ def _parsed(found: Any) -> Brief:
     try:
         matrices = [np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance)]
     except (ValueError, OverflowError) as error:
-        raise ValueError("model.A, model.Q or model.initial_covariance is no matrix") from error
+        raise ValueError("model.A, model.Q or model.initial_covariance is not a matrix") from error
     if wrong := mistakes_of(matrices[0], matrices[1], matrices[2], model.singular_noise):
-        raise ValueError(f"its model is no process: model.{wrong[0][0]} {wrong[0][1]}")
+        raise ValueError(f"its model is not a process: model.{wrong[0][0]} {wrong[0][1]}")
     if not 0.0 <= model.state_probability <= 1.0:
         raise ValueError(f"model.state_probability is {model.state_probability}, expected a number from 0 to 1")
     return brief

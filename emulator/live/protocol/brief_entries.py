@@ -1,4 +1,4 @@
-"""What each entry of a brief must be: its type and its range, entry by entry, before anything is made of it.
+"""Checks each entry of a brief by itself, its type and its range, before the brief is used.
 
 Source: docs/protocol.md, the brief.
 """
@@ -13,12 +13,12 @@ from typing import Any
 from evedrop.streams import KEY_BYTES
 
 Check = Callable[[str, Any], Iterator[str]]
-"""From a path and what is there to sentences about what is wrong with it."""
+"""Takes a path and the value found there; yields a sentence for each mistake."""
 
 _SHOWN = 40  # characters of a value that a message repeats
 _MOST_TOLD = 8
 _MOST_SLOTS, _MOST_TRIALS, _LAST_TRIAL = 100_000_000, 1_000_000, 2**48
-_NEVER = 2**62  # a slot that no run comes to
+_NEVER = 2**62  # a slot that no run reaches
 
 
 def _wrong(path: str, found: Any, expected: str) -> Iterator[str]:
@@ -27,25 +27,25 @@ def _wrong(path: str, found: Any, expected: str) -> Iterator[str]:
 
 
 def text(path: str, found: Any) -> Iterator[str]:
-    """A string."""
+    """Check that a value is a string."""
     if not isinstance(found, str):
         yield from _wrong(path, found, "a string")
 
 
 def flag(path: str, found: Any) -> Iterator[str]:
-    """True or false."""
+    """Check that a value is true or false."""
     if type(found) is not bool:
         yield from _wrong(path, found, "true or false")
 
 
 def anything(path: str, found: Any) -> Iterator[str]:
-    """What another check looks at."""
+    """Accept any value: another check handles it."""
     del path, found
     yield from ()
 
 
 def whole(least: int, most: int = _NEVER) -> Check:
-    """A whole number of this range."""
+    """A check for a whole number in this range."""
 
     def check(path: str, found: Any) -> Iterator[str]:
         if type(found) is not int or not least <= found <= most:
@@ -55,24 +55,24 @@ def whole(least: int, most: int = _NEVER) -> Check:
 
 
 def number(path: str, found: Any) -> Iterator[str]:
-    """A finite number."""
+    """Check that a value is a finite number."""
     if type(found) not in (int, float) or abs(found) > 1e308 or math.isnan(found):
         yield from _wrong(path, found, "a finite number")
 
 
 def positive(path: str, found: Any) -> Iterator[str]:
-    """A finite number of 0 or more."""
+    """Check that a value is a finite number of 0 or more."""
     wrong = list(number(path, found))
     yield from wrong or (_wrong(path, found, "a number of 0 or more") if found < 0 else ())
 
 
 def maybe(check: Check) -> Check:
-    """Null, or what another check wants."""
+    """A check for null, or a value that passes another check."""
     return lambda path, found: iter(()) if found is None else check(path, found)
 
 
 def listed(check: Check, least: int = 0) -> Check:
-    """A list of what another check wants."""
+    """A check for a list of values that pass another check."""
 
     def all_of(path: str, found: Any) -> Iterator[str]:
         if not isinstance(found, list) or len(found) < least:
@@ -85,7 +85,7 @@ def listed(check: Check, least: int = 0) -> Check:
 
 
 def named(check: Check) -> Check:
-    """A table of any names, each with what another check wants."""
+    """A check for a table of any names, with values that pass another check."""
 
     def all_of(path: str, found: Any) -> Iterator[str]:
         if not isinstance(found, dict):
@@ -98,7 +98,7 @@ def named(check: Check) -> Check:
 
 
 def table(needed: Mapping[str, Check], optional: Mapping[str, Check] | None = None, strict: bool = True) -> Check:
-    """A table of these entries; of no others if it is strict."""
+    """A check for a table of these entries; strict: other entries are mistakes."""
     known = {**needed, **(optional or {})}
 
     def each(path: str, found: Any) -> Iterator[str]:
@@ -123,12 +123,12 @@ def _key(path: str, found: Any) -> Iterator[str]:
         size = len(bytes.fromhex(found)) if isinstance(found, str) else 0
     except ValueError:
         size = 0
-    if size != KEY_BYTES:  # what is there may be a secret, and is not repeated
-        yield f"{path} is no key, expected {KEY_BYTES} bytes in hexadecimal"
+    if size != KEY_BYTES:  # the value may be a secret, so the message does not repeat it
+        yield f"{path} is not a key, expected {KEY_BYTES} bytes in hexadecimal"
 
 
 KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
-"""Of the keys of a run, as they come after its name."""
+"""The kinds of a run's keys, as they follow the run's name."""
 _MATRIX = listed(listed(number))
 _NUMBERS = listed(number)
 _LIMITS = listed(maybe(number))
@@ -167,7 +167,7 @@ ENTRIES = table(
     },
     {"first": whole(0, _MOST_SLOTS), "patience": whole(1), "identity": maybe(_IDENTITY)},
 )
-"""Of every brief."""
+"""Checks the entries that every brief has."""
 
 _COURSE = table(
     {
@@ -276,11 +276,11 @@ PARTS: Mapping[str, Check] = {
         strict=False,
     ),
 }
-"""Role → its part of the scenario."""
+"""Role → the check for its part of the scenario."""
 
 
 def mistakes_in(found: Any) -> list[str]:
-    """What is wrong with a brief, the first of it; nothing if each entry by itself is right."""
+    """The first mistakes in a brief; empty if each entry by itself is right."""
     mistakes = list(islice(ENTRIES("", found), _MOST_TOLD))
     if mistakes:
         return mistakes

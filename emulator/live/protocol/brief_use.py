@@ -1,4 +1,4 @@
-"""Whether a brief can be used: what its process makes of it, made once before the process takes part in a run.
+"""Checks that a brief can be used, by making the objects of its process once before the process takes part in a run.
 
 Source: docs/protocol.md, the brief.
 """
@@ -26,12 +26,12 @@ _WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
 def expect_usable(brief: Brief) -> None:
-    """Raise BriefError where a process cannot work with what its brief says: a key, a class or a number that is not there."""
+    """Raise BriefError if a process cannot work with its brief: a key, a class or a number is missing or unusable."""
     try:
         _expect_usable(brief)
     except NotRegistered as error:
         name = str(error.name).encode("unicode_escape").decode()
-        raise BriefError(f"it names {name}{error.why or ', which is no class here'}") from error
+        raise BriefError(f"it names {name}{error.why or ', which is not a class here'}") from error
 
 
 def _expect_usable(brief: Brief) -> None:
@@ -71,7 +71,7 @@ def _scheme(brief: Brief) -> Any:
     kind = SCHEMES[brief.part["scheme"]["scheme"]]
     given = set(brief.part["scheme"]) - {"scheme"}
     for name in sorted(set(kind.parameters) ^ given):
-        what = "missing" if name in kind.parameters else "no parameter of the scheme"
+        what = "missing" if name in kind.parameters else "not a parameter of the scheme"
         raise BriefError(f"part.scheme.{name} is {what}; {_WRITE_AGAIN}")
     with _using("part.scheme"):
         return scheme_of(brief.model.process, brief.part["scheme"])
@@ -84,7 +84,7 @@ def _expect_plant(brief: Brief, spec: Mapping[str, Any] | None) -> None:
     with _using("part.plant"):
         plant = Plant.of({name: value for name, value in spec.items() if name != "disturbances"})
         if plant.noise.shape != (n, n) or plant.start.shape != (n,):
-            raise ValueError(f"it has not {n} states, as the model has")
+            raise ValueError(f"it does not have {n} states, as the model does")
         if "disturbances" in spec:
             _expect_disturbances(brief, spec["disturbances"], plant)
 
@@ -92,7 +92,7 @@ def _expect_plant(brief: Brief, spec: Mapping[str, Any] | None) -> None:
 def _expect_disturbances(brief: Brief, text: str, plant: Plant) -> None:
     found = np.frombuffer(b64decode(text), "<f8").reshape(brief.slots, -1)
     if found.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(found).all():
-        raise ValueError(f"the disturbances are {found.shape[1]} a slot, or not finite")
+        raise ValueError(f"it has {found.shape[1]} disturbances in each slot, or they are not finite")
 
 
 def _expect_controller(brief: Brief) -> None:
@@ -125,7 +125,7 @@ def _expect_links(brief: Brief) -> None:
 
 @contextmanager
 def _using(path: str) -> Iterator[None]:
-    """Make what cannot be used a BriefError that says which part of the brief it is."""
+    """Turn any error in the block into a BriefError that names the part of the brief."""
     try:
         yield
     except (BriefError, NotRegistered):

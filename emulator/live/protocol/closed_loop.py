@@ -1,4 +1,4 @@
-"""Messages of a closed loop: what the controller acts on, what it decides, and what it reports.
+"""Messages of a closed loop: the controller's data, its decisions, and its reports.
 
 Source: docs/protocol.md, closed loop.
 """
@@ -17,18 +17,18 @@ from evedrop.model.receiver import Flags
 
 
 def known(name: str, k: int, x: Floats) -> bytes:
-    """What the controller acts on in slot k, (n, R): `x_hat`, an estimate, or `x`, the true state, as `name` says."""
+    """Encode what the controller acts on in slot k, (n, R); name: `x_hat` for an estimate, `x` for the true state."""
     return pack({"k": k, name: x.tobytes()})
 
 
 def read_known(message: Reader, name: str, k: int, shape: tuple[int, int]) -> Floats:
-    """The same, which must be of slot k."""
+    """Decode what the controller acts on, which must be of slot k."""
     message.slot(k)
     return message.finite(name, shape)
 
 
 def decided(k: int, u: Floats, failed: Flags) -> bytes:
-    """The inputs (m, R) from slot k on, and where they are those before, because the decision failed, (R,)."""
+    """Encode the inputs (m, R) from slot k on, and where the decision failed, (R,), so that the previous inputs stay."""
     fields = {"k": k, "u": u.tobytes()}
     if failed.any():
         fields["failed"] = packed_flags(failed).tobytes()
@@ -36,7 +36,7 @@ def decided(k: int, u: Floats, failed: Flags) -> bytes:
 
 
 def read_decided(message: Reader, k: int, shape: tuple[int, int]) -> tuple[Floats, Flags]:
-    """The inputs (m, R) that must be from slot k on, and where their decision failed."""
+    """Decode the inputs (m, R), which must be from slot k on, and where the decision failed."""
     message.slot(k)
     return message.finite("u", shape), read_failed(message, (shape[1],))
 
@@ -48,18 +48,18 @@ class Decisions:
     first: int
     count: int
     seconds: Floats
-    """What each decision took."""
+    """Duration of each decision."""
     digests: Mapping[int, Digests]
     """As in `Report`."""
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         digests = {block: digests.tobytes() for block, digests in self.digests.items()}
         return pack({"k": self.first, "c": self.count, "seconds": self.seconds.tobytes(), "digests": digests})
 
 
 def read_decisions(message: Reader, first: int, extent: Extent, blocks: Blocks, period: int) -> Decisions:
-    """The controller's telemetry that must begin at slot `first`, with a decision every period slots."""
+    """Decode the controller's telemetry, which must begin at slot `first`, with a decision every `period` slots."""
     c = message.span(first, extent.slots, extent.batch + period)
     made = len(range(-(-first // period) * period, first + c, period))
     seconds = message.finite("seconds", (made,))

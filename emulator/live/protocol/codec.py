@@ -1,4 +1,4 @@
-"""Messages: msgpack maps whose arrays are little-endian bytes. What does not fit is refused with its sender named.
+"""Messages: msgpack maps whose arrays are little-endian bytes. The error for a malformed message names its sender.
 
 Source: docs/protocol.md, messages.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from reprlib import Repr
-from typing import Any
+from typing import Any, final
 
 import msgpack
 import numpy as np
@@ -19,20 +19,21 @@ from evedrop.model.flag_bits import flags_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
-_LARGEST = 2**62  # of an integer that nothing else bounds: slots can be added to it without leaving 64 bits
-_SMALL_BYTES = 1 << 16  # whatever msgpack makes of so few bytes takes some megabytes at most
+_LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
+_SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most
 _WHY_CHARACTERS = 1000
-_PARTS = 4096  # lists and maps in a message, of more than a handful of processes
+_PARTS = 4096  # lists and maps in a message; enough for many processes
 
 
 def pack(fields: Mapping[str, Any]) -> bytes:
-    """A message of these fields."""
+    """Encode a message with these fields."""
     message: bytes = msgpack.packb(fields, use_bin_type=True)
     return message
 
 
+@final
 class Reader:
-    """Reads one message's fields with their types, sizes and ranges checked. Final."""
+    """Reads the fields of one message, and checks their types, sizes and ranges."""
 
     def __init__(self, key: str, payload: bytes, fields: Mapping[Any, Any] | None = None, parts: int = _PARTS) -> None:
         """parts: how many lists and maps a large message may have."""
@@ -54,11 +55,11 @@ class Reader:
         return found
 
     def malformed(self, found: str, expected: str) -> MalformedMessage:
-        """The error that says what was found in this message and what was expected."""
+        """The error for this message, with what was found in it and what was expected."""
         return MalformedMessage(self.key, found, expected, self._payload, writer_of(self.key))
 
     def has(self, name: str) -> bool:
-        """Whether an optional field is there."""
+        """Whether an optional field is present."""
         return name in self._fields
 
     def integer(self, name: str, least: int = 0, most: int | None = None) -> int:
@@ -110,7 +111,7 @@ class Reader:
         return np.frombuffer(value, kind).reshape(shape)
 
     def flags(self, name: str, shape: tuple[int, ...]) -> Flags:
-        """A binary field of bit masks, a bit a trial: flags of the shape (…, R)."""
+        """A binary field of bit masks, one bit for each trial: flags of the shape (…, R)."""
         trials = shape[-1]
         masks = self.array(name, "u1", (*shape[:-1], (trials + 7) // 8))
         if trials % 8 and (masks[..., -1] >> trials % 8).any():
@@ -125,9 +126,9 @@ class Reader:
         return array
 
     def span(self, first: int, slots: int, most: int) -> int:
-        """Field c of a message that must begin at slot `first`: how many slots it covers, all of a run of so many.
+        """Field c of a message that must begin at slot `first`: how many slots it covers.
 
-        most: slots that one message may cover. Raises Gap if it begins at another slot.
+        slots: of the run; most: how many slots one message may cover. Raises Gap if the message begins at another slot.
         """
         self.slot(first)
         return self.integer("c", 1, max(1, min(most, slots - first)))
@@ -151,7 +152,7 @@ class Reader:
         return Reader(self.key, self._payload, self.map(name))
 
     def slot(self, expected: int) -> int:
-        """Field k, which must be the slot that is due. Raises Gap otherwise."""
+        """Field k, which must be the expected slot. Raises Gap otherwise."""
         k = self.integer("k")
         if k != expected:
             raise Gap(self.key, expected, k, writer_of(self.key))
@@ -166,14 +167,14 @@ class Reader:
 
 
 def shown(value: object) -> str:
-    """A field's value as an error shows it: short, however large it is."""
+    """A field's value in the short form of error messages, however large it is."""
     short = Repr()
     short.maxlevel, short.maxdict, short.maxlist, short.maxstring = 2, 4, 4, 40
     return f"{len(value)} bytes" if isinstance(value, bytes) else short.repr(value)
 
 
 def _counter(most: int) -> Callable[[Any], Any]:
-    """Called with each list and map of a message as it is unpacked: ends that when there are too many."""
+    """A hook for each list and map of a message while it is unpacked, which raises ValueError when there are too many."""
     left = most
 
     def count(part: Any) -> Any:
@@ -187,37 +188,37 @@ def _counter(most: int) -> Callable[[Any], Any]:
 
 
 def progress(k: int) -> bytes:
-    """All slots below k are done."""
+    """Encode the report that all slots below k are done."""
     return pack({"k": k})
 
 
 def read_progress(key: str, payload: bytes, sent: int) -> int:
-    """The first slot that is not done; all slots below `sent` were sent."""
+    """Decode a progress report: the first slot that is not done; all slots below `sent` were sent."""
     return Reader(key, payload).integer("k", 0, sent)
 
 
 def control(command: str, **fields: Any) -> bytes:
-    """A command of the conductor: `start`, `end`, `hold`, `change`, `go` or `again`, and what goes with it."""
+    """Encode a command of the conductor, such as `start`, `end`, `hold`, `change`, `go` or `again`, with its fields."""
     return pack({"do": command, **fields})
 
 
 def over(dropped: int) -> bytes:
-    """A process's last message: it ends because it was told to. dropped: messages that it dropped, which named another key."""
+    """Encode a process's last message: it ends on command. dropped: how many messages it dropped that named another key."""
     return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
 
 
 def refusal(key: str, why: str) -> bytes:
-    """A process ends because it cannot read a message on a key, and why."""
+    """Encode the message that a process ends because it cannot read a message on a key, with the reason."""
     return pack({"refuses": key, "why": why[:_WHY_CHARACTERS]})
 
 
 def is_refusal(message: Reader) -> bool:
-    """Whether a process says that it refuses a message."""
+    """Whether a message reports a refused message."""
     return message.has("refuses")
 
 
 def read_refusal(message: Reader, process: str) -> Refusal:
-    """The error of a process that refuses a message on a key, which must be one that it reads."""
+    """Decode a refusal into an error; the key of the refused message must be one that the process reads."""
     key, why = message.text("refuses"), message.text("why")
     if key.split("/")[:2] != message.key.split("/")[:2] or not writer_of(key) or reader_of(key) != process:
         raise message.malformed(f"refuses = {shown(key)}", f"a key that {process} reads")
@@ -231,5 +232,5 @@ def is_over(message: Reader) -> bool:
 
 
 def read_over(message: Reader) -> int:
-    """How many messages the process dropped."""
+    """Decode how many messages the process dropped."""
     return message.integer("misdelivered", 1) if message.has("misdelivered") else 0

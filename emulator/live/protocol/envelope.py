@@ -1,7 +1,7 @@
-"""The envelope: every message begins with the full key it was put on, and a reader drops what names another key.
+"""The envelope: every message begins with the full key it was put on, and a reader drops messages that name another key.
 
-Zenoh may deliver one key's messages to another key's subscriber after connections flap (docs/upstream.md). Nothing but the
-message itself can tell: the sample shows the key of the subscriber.
+Zenoh may deliver one key's messages to another key's subscriber after connections flap (docs/upstream.md). Only the message
+itself shows this: the sample shows the key of the subscriber.
 
 Source: docs/protocol.md, envelope.
 """
@@ -19,7 +19,7 @@ _SHOWN_BYTES = 600  # more than any key of a run has
 
 
 def head_of(key: str) -> bytes:
-    """What a message on a key begins with: the key as a msgpack string."""
+    """The beginning of every message on a key: the key as a msgpack string."""
     head: bytes = msgpack.packb(key)
     return head
 
@@ -30,27 +30,27 @@ def enclosed(key: str, payload: bytes) -> bytes:
 
 
 def payload_of(key: str, message: bytes) -> bytes | None:
-    """The payload of a message that came on a key; None if it names another key."""
+    """The payload of a message that arrived on a key; None if it names another key."""
     head = head_of(key)
     return message[len(head) :] if message.startswith(head) else None
 
 
 def named_in(message: bytes) -> str | None:
-    """The key that a message names; None if it names none."""
+    """The key that a message names, or None."""
     unpacker = msgpack.Unpacker()
     unpacker.feed(message[:_SHOWN_BYTES])
     try:
         found = unpacker.unpack()
-    except Exception:  # whatever msgpack makes of bytes that are no message
+    except Exception:  # msgpack raises various errors for bytes that are not a message
         return None
     return found if isinstance(found, str) else None
 
 
 @final
 class Dropped:
-    """Counts the messages that a process dropped because they name another key than the one they came on; for several threads.
+    """Counts the messages that a process dropped because they name another key than they arrived on; thread-safe.
 
-    mistaken: called when a message names another key at all: then the connection takes one key for another.
+    mistaken: called when a message names another key: then the connection confuses keys.
     """
 
     def __init__(self, process: str, mistaken: Callable[[], None] = lambda: None) -> None:
@@ -59,7 +59,7 @@ class Dropped:
         self.count = 0
 
     def add(self, key: str, message: bytes) -> None:
-        """Count a message that came on a key, and say so on standard error: of the first, the tenth, the hundredth and so on."""
+        """Count a dropped message; report the first, the tenth, the hundredth and so on, on standard error."""
         with self._lock:
             self.count += 1
             number = self.count
@@ -75,7 +75,7 @@ class Dropped:
             self._mistaken()
 
     def contents(self, key: str, head: bytes, message: bytes) -> bytes | None:
-        """The payload of a message that came on a key with that head; None if it names another key and was dropped."""
+        """The payload of a message that arrived on a key with that head; None if it names another key and was dropped."""
         if message.startswith(head):
             return message[len(head) :]
         self.add(key, message)

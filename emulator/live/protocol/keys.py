@@ -1,4 +1,4 @@
-"""The keys of a run: who reads each, and who alone may write it.
+"""The keys of a run: the reader of each, and the only process that may write it.
 
 Source: docs/protocol.md, keys.
 """
@@ -36,22 +36,22 @@ class RunKeys:
 
     @property
     def acknowledgements(self) -> str:
-        """Acknowledgements that were neither lost nor blocked, and those that are forged: router to sensor."""
+        """Acknowledgements that were neither lost nor blocked, and forged ones: router to sensor."""
         return self._under("ack/delivered")
 
     @property
     def estimate(self) -> str:
-        """What the legitimate estimator believes, to the controller."""
+        """Estimates, legitimate estimator to controller."""
         return self._under("estimate")
 
     @property
     def state(self) -> str:
-        """The true state, sensor to controller, where that acts on the truth."""
+        """The true state, sensor to controller, if the controller acts on the truth."""
         return self._under("state")
 
     @property
     def input(self) -> str:
-        """What the controller decides, to the sensor, and to a legitimate estimator that is told it."""
+        """Inputs, controller to sensor, and to a legitimate estimator that knows the inputs."""
         return self._under("input")
 
     def downlink(self, receiver: str) -> str:
@@ -59,11 +59,11 @@ class RunKeys:
         return self._under(f"downlink/{receiver}")
 
     def telemetry(self, process: str) -> str:
-        """What a process reports to the observer."""
+        """Reports, one process to observer."""
         return self._under(f"telemetry/{process}")
 
     def progress(self, process: str) -> str:
-        """How far a receiver or the observer is, to the sensor."""
+        """Progress, a receiver or the observer to the sensor."""
         return self._under(f"progress/{process}")
 
     def control(self, process: str) -> str:
@@ -76,7 +76,7 @@ class RunKeys:
 
 
 def reader_of(key: str) -> str:
-    """The process that reads a key; of inputs, which the legitimate estimator may read too, the one that always does."""
+    """The process that reads a key; for inputs, which the legitimate estimator may read, too, the sensor."""
     kind, _, name = "/".join(key.split("/")[2:]).partition("/")
     if kind == "ack":
         return ROUTER if name == "sent" else SENSOR
@@ -93,7 +93,7 @@ def reader_of(key: str) -> str:
 
 
 def writer_of(key: str) -> str:
-    """The only process that may write a key; empty for what is no key of a run."""
+    """The only process that may write a key; empty if it is not a key of a run."""
     kind, _, name = "/".join(key.split("/")[2:]).partition("/")
     if kind == "ack":
         return LEGITIMATE if name == "sent" else ROUTER

@@ -1,4 +1,4 @@
-"""How large the messages of a run can be, by kind: a router drops larger ones, and nobody takes in more at a time.
+"""The largest sizes of a run's messages, by kind: a router drops larger ones, and no process accepts them.
 
 Source: docs/protocol.md, limits.
 """
@@ -15,23 +15,23 @@ from evedrop.model.links.link import REASONS
 from evedrop.model.slot.account import COUNTED_BURSTS
 
 _FRAME_BYTES = 4096
-"""What a message has besides its arrays: its key, field names, and what a later version may add."""
-_COMMAND_BYTES = 32 * 2**20  # changes of links bring their settings: recorded losses among them
+"""Room for the other parts of a message: its key, field names, and additions of later versions."""
+_COMMAND_BYTES = 32 * 2**20  # changes of links contain their settings, such as recorded losses
 _QUESTION_BYTES = 2**20
 _NAME_BYTES = 128  # of a key in a list
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What the sizes of a run's messages follow from."""
+    """The dimensions that determine the sizes of a run's messages."""
 
     n: int
     trials: int
     recorded: int
     batch: int
-    """Slots of a report at most."""
+    """The most slots of a report."""
     window: int
-    """The longest of the receivers', in slots."""
+    """The longest window of the receivers, in slots."""
     receivers: int
     header: int = 0
     inputs: int = 0
@@ -40,11 +40,11 @@ class Sizes:
 
     @property
     def of_kinds(self) -> dict[str, int]:
-        """Kind of key, as it comes after the run's name → bytes of its largest message."""
+        """Kind of key, the part after the run's name → bytes of its largest message."""
         n, R, c = self.n, self.trials, self.batch
         mask, state = (R + 7) // 8, 8 * n * R
         packet = state + 8 * self.header * R + mask + _NAME_BYTES
-        # Digests of two blocks: one may be of a single slot, before an outage.
+        # Digests of two blocks: one may have a single slot, before an outage.
         report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + 2 * DIGEST_BYTES * R
         truth = c * (2 * state + 8 * self.inputs * R + 4 * mask)
         leaving = state + 8 * n * n * R
@@ -67,7 +67,7 @@ class Sizes:
 
 
 def low_pass(run: str, kinds: Mapping[str, int]) -> list[dict[str, Any]]:
-    """The `low_pass_filter` section of a router's Zenoh configuration: whatever a process puts that is larger is dropped."""
+    """The `low_pass_filter` section of a router's Zenoh configuration, which drops larger messages."""
 
     def rule(name: str, keys: list[str], size: int, messages: list[str]) -> dict[str, Any]:
         return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": keys, "size_limit": size}

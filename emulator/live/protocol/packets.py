@@ -1,4 +1,4 @@
-"""Messages that carry packets: uplink, deliveries, acknowledgements, and the marks between them.
+"""Messages that carry packets: uplink, deliveries, acknowledgements, and the barriers between them.
 
 Source: docs/protocol.md, messages.
 """
@@ -20,25 +20,25 @@ Headers = NDArray[np.int64]
 
 
 class PacketExtras(NamedTuple):
-    """What a packet has beside its slot and payload; None where a scheme, or a slot, has no such thing."""
+    """Parts of a packet other than its slot and payload; None if the scheme, or the slot, does not have them."""
 
     header: Headers | None = None
-    """(h, R)."""
+    """The header, (h, R)."""
     sent: Flags | None = None
-    """Whether there is a packet at all, (R,); None is everywhere."""
+    """Whether a packet was sent, (R,); None means in all trials."""
     truth: Floats | None = None
-    """x_k (n, R), for the one receiver that it is betrayed to."""
+    """x_k (n, R), for the one receiver that learns the true state."""
 
     @property
     def given(self) -> dict[str, NDArray[Any]]:
-        """What there is."""
+        """The parts that are not None."""
         return {name: value for name, value in self._asdict().items() if value is not None}
 
 
 def uplink(
     k: int, z: Floats, header: Headers | None = None, sent: Flags | None = None, truth: Floats | None = None
 ) -> bytes:
-    """A packet: slot k, z (n, R), and what is beside it, as in `PacketExtras`."""
+    """Encode a packet: slot k, z (n, R), and the parts of `PacketExtras`."""
     fields = {"k": k, "z": (z if sent is None else np.where(sent, z, 0.0)).tobytes()}
     if header is not None:
         fields["header"] = header.astype("<i8").tobytes()
@@ -50,13 +50,13 @@ def uplink(
 
 
 def read_uplink(message: Reader, k: int, shape: tuple[int, int]) -> Floats:
-    """Z (n, R) of the packet that must be of slot k."""
+    """Decode z (n, R) of a packet, which must be of slot k."""
     message.slot(k)
     return message.finite("z", shape)
 
 
 def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> PacketExtras:
-    """What a packet has beside z; header: rows that the scheme's packets have."""
+    """Decode the parts of a packet other than z; header: how many rows the header of the scheme's packets has."""
     n, trials = shape
     return PacketExtras(
         message.array("header", "<i8", (header, trials)) if header else None,
@@ -66,41 +66,41 @@ def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> Pac
 
 
 def acknowledgement(k: int, acknowledged: Flags) -> bytes:
-    """The acknowledgements of slot k, (R,): from the legitimate estimator, and as they reach the sensor."""
+    """Encode the acknowledgements of slot k, (R,), either from the legitimate estimator or as they reach the sensor."""
     return pack({"k": k, "gamma": packed_flags(acknowledged).tobytes()})
 
 
 def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
-    """The acknowledgements (R,) that must be of slot k."""
+    """Decode acknowledgements (R,), which must be of slot k."""
     message.slot(k)
     return message.flags("gamma", (trials,))
 
 
 def barrier(k: int) -> bytes:
-    """A mark between slots k − 1 and k, on uplink and downlinks: everybody reports all slots below k."""
+    """Encode a barrier between slots k − 1 and k, on uplink and downlinks: its readers report all slots below k."""
     return pack({"k": k, "hold": True})
 
 
 def is_barrier(message: Reader) -> bool:
-    """Whether a message of uplink or downlink is such a mark."""
+    """Whether a message of uplink or downlink is a barrier."""
     return message.has("hold")
 
 
 def resend(number: int, done: int, first: int) -> bytes:
-    """What goes before packets that are sent once more, in the conductor's round of that number: from slot `first` on.
+    """Encode the announcement that packets are sent again from slot `first` on, in the conductor's round `number`.
 
-    done: every slot below this one is done.
+    done: all slots below it are done.
     """
     return pack({"k": first, "again": done, "n": number})
 
 
 def is_resend(message: Reader) -> bool:
-    """Whether a message of the uplink says that packets are sent once more."""
+    """Whether a message of the uplink announces that packets are sent again."""
     return message.has("again")
 
 
 def read_resend(message: Reader, slots: int) -> tuple[int, int, int]:
-    """Number of the round, first slot that is not done, and first slot that follows, of a run of so many."""
+    """Decode the number of the round, the first slot that is not done, and the first resent slot; slots: of the run."""
     done = message.integer("again", 0, slots)
     return message.integer("n", 1), done, message.integer("k", 0, done)
 
@@ -108,9 +108,9 @@ def read_resend(message: Reader, slots: int) -> tuple[int, int, int]:
 def delivery(
     k: int, mask: bytes, z: bytes, late: tuple[Late, ...] = (), header: bytes = b"", truth: bytes = b""
 ) -> bytes:
-    """A delivery: slot k, γ as a bit mask, z (n, received) and header (h, received) of the trials that received, late ones.
+    """Encode a delivery: slot k, γ as a bit mask, z (n, received) and header (h, received) of the trials that received.
 
-    truth: x_k (n, R), of all trials, where it is betrayed to this receiver.
+    late: late packets that arrive in this slot. truth: x_k (n, R), of all trials, if this receiver learns it.
     """
     fields: dict[str, Any] = {"k": k, "gamma": mask}
     if z:
@@ -133,23 +133,23 @@ def _packets(k: int, heard: Reception) -> dict[str, Any]:
 
 
 def packed_header(header: Headers, received: Flags) -> bytes:
-    """The headers (h, received) of the trials that received."""
+    """The headers (h, received) of the trials that received, as bytes."""
     return np.compress(received, header, axis=1).astype("<i8").tobytes()
 
 
 def read_delivery(
     message: Reader, k: int, shape: tuple[int, int], header: int = 0, window: int | None = None
 ) -> Arrival:
-    """What arrives in slot k, of which the delivery must be; z (n, R) and header (h, R) are 0 where nothing was received.
+    """Decode a delivery, which must be of slot k; z (n, R) and header (h, R) are 0 where nothing was received.
 
-    window: how many slots late a packet may be at most; None is any number.
+    window: by how many slots a packet may be late at most; None: any number.
     """
     message.slot(k)
     oldest = 0 if window is None else max(0, k - window)
     late: list[Late] = []
     parts = message.maps("late") if message.has("late") else []
-    if len(parts) > 2 * (k - oldest + 1):  # of each slot its packets and second copies
-        raise message.malformed(f"{len(parts)} times late packets", f"two times a slot from {oldest} to {k} at most")
+    if len(parts) > 2 * (k - oldest + 1):  # for each slot, its packets and their second copies
+        raise message.malformed(f"{len(parts)} entries in late", f"at most two for each slot from {oldest} to {k}")
     for one in parts:
         slot = one.integer("k")
         if not oldest <= slot <= k:
@@ -175,7 +175,7 @@ def _heard(message: Reader, shape: tuple[int, int], rows: int) -> Reception:
         return Reception(gamma, message.finite("z", shape), header)
     z = np.zeros(shape)
     if received:
-        # Row by row, which numpy does three times as fast as the rows at once.
+        # Row by row: three times as fast in numpy as all rows at once.
         for row, values in zip(z, message.finite("z", (n, received)), strict=True):
             row[gamma] = values
     elif message.has("z"):

@@ -1,4 +1,4 @@
-"""Messages to the observer: the true state, what a receiver believes, and the journal of every packet's fate.
+"""Messages to the observer: the true states, the receivers' beliefs, and the journal of every packet's fate.
 
 Source: docs/protocol.md, messages.
 """
@@ -23,28 +23,28 @@ from evedrop.model.slot.account import COUNTED_BURSTS, Account
 
 @dataclass(frozen=True)
 class Extent:
-    """What a run has, to which the numbers in messages are held."""
+    """The dimensions of a run, against which messages are checked."""
 
     slots: int
     batch: int
-    """Slots that one report may cover."""
+    """How many slots one report may cover."""
     n: int
     trials: int
     recorded: int = 1
-    """Trials whose covariances are reported."""
+    """How many trials' covariances are reported."""
     inputs: int = 0
-    """Inputs that a controller decides; 0 without one."""
+    """How many inputs a controller decides; 0 without one."""
     measures: bool = False
-    """Whether the sensor filters what it measures."""
+    """Whether the sensor filters its measurements."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of the states of a slot, (n, R)."""
+        """Shape of the states of a slot, (n, R)."""
         return self.n, self.trials
 
 
 def held(k: int) -> bytes:
-    """The sensor's telemetry when it holds before slot k."""
+    """Encode the sensor's telemetry that it holds before slot k."""
     return pack({"k": k, "held": True})
 
 
@@ -63,15 +63,15 @@ class Truth:
     nu: Flags
     """(c, R)."""
     sent: Flags | None = None
-    """Whether there was a packet, (c, R); None of a scheme that sends in every slot."""
+    """Whether a packet was sent, (c, R); None if the scheme sends in every slot."""
     alarms: Flags | None = None
-    """Whether the sensor has become sure that its acknowledgements are attacked, (c, R); None where it does not watch them."""
+    """Whether the sensor raised an alarm that its acknowledgements are attacked, (c, R); None if it does not watch them."""
     u: Floats | None = None
     """The inputs as they were decided, (c, m, R); None without a controller."""
     failed: Flags | None = None
-    """Where their decision failed, (c, R)."""
+    """Where the decision failed, (c, R)."""
     true: Floats | None = None
-    """The true states, (c, n, R), of a sensor that filters: x is what it makes of them; None where they are x."""
+    """The true states, (c, n, R), if the sensor filters, so that x is its estimate; None if x is the true state."""
 
     @property
     def count(self) -> int:
@@ -79,7 +79,7 @@ class Truth:
         return len(self.x)
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         fields = {"k": self.first, "c": self.count, "x": self.x.tobytes(), "nu": packed_flags(self.nu).tobytes()}
         if self.sent is not None:
             fields["sent"] = packed_flags(self.sent).tobytes()
@@ -95,7 +95,7 @@ class Truth:
 
 
 def read_truth(message: Reader, first: int, extent: Extent) -> Truth:
-    """The sensor's telemetry that must begin at slot `first`."""
+    """Decode the sensor's telemetry, which must begin at slot `first`."""
     c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
     return Truth(
         first,
@@ -110,14 +110,14 @@ def read_truth(message: Reader, first: int, extent: Extent) -> Truth:
 
 
 def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
-    """Where decisions failed, (…, R): nowhere, unless it is said."""
+    """Decode where decisions failed, (…, R); nowhere if the field is absent."""
     if not message.has("failed"):
         return np.zeros(shape, np.bool_)
     return message.flags("failed", shape)
 
 
 def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, Digests]:
-    """Block, by its first slot → digests, (R, 32); blocks: those that end in the slots of the message."""
+    """Decode digests: block, by its first slot → digests, (R, 32); blocks: those that end in the slots of the message."""
     digests: dict[int, Digests] = {}
     found = message.map("digests")
     for block, value in found.items():
@@ -148,11 +148,11 @@ class Report:
     trace: Floats
     """Sum over all trials of tr P and of its square, (c, 2)."""
     late: NDArray[np.uint16] | None
-    """Packets of earlier slots that arrived within the window, (c, R); None of who has none."""
+    """How many packets of earlier slots arrived within the window, (c, R); None for a receiver without a window."""
     digests: Mapping[int, Digests]
     """Block, by its first slot → digests, (R, 32), of the blocks that ended in these slots."""
     late_used: NDArray[np.uint16] | None = None
-    """Those of `late` that were used, and not discarded, (c, R)."""
+    """How many of the late packets were used, and not discarded, (c, R)."""
 
     @property
     def count(self) -> int:
@@ -160,7 +160,7 @@ class Report:
         return len(self.x_hat)
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         return pack(
             {
                 "k": self.first,
@@ -177,7 +177,10 @@ class Report:
 
 
 def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, window: int = 0) -> Report:
-    """A receiver's telemetry that must begin at slot `first`; blocks: its digests'; window: how late its packets may be."""
+    """Decode a receiver's telemetry, which must begin at slot `first`.
+
+    blocks: of its digests; window: by how many slots its packets may be late.
+    """
     c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
     action = message.array("action", "u1", (c, trials))
     if action.size and int(action.max()) > max(Action):
@@ -187,7 +190,7 @@ def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, win
         for name in ("late", "late_used")
     )
     if used is not None and (late is None or (used > late).any()):
-        raise message.malformed("more in late_used than in late", "late packets that were used among those that came")
+        raise message.malformed("more in late_used than in late", "at most as many late packets used as arrived")
     return Report(
         first,
         message.finite("x_hat", (c, n, trials)),
@@ -201,17 +204,17 @@ def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, win
 
 
 def leaving(k: int, belief: Belief) -> bytes:
-    """A receiver's last word before an outage that begins with slot k: what it believes."""
+    """Encode a receiver's final belief before an outage that begins with slot k."""
     return pack({"k": k, "leaves": True, "x_hat": belief.x_hat.tobytes(), "P": belief.P.tobytes()})
 
 
 def is_leaving(message: Reader) -> bool:
-    """Whether a receiver's telemetry is such a word."""
+    """Whether a receiver's telemetry is its final belief before an outage."""
     return message.has("leaves")
 
 
 def read_leaving(message: Reader, extent: Extent) -> tuple[int, Belief]:
-    """The slot before which a receiver leaves, and what it believes."""
+    """Decode the slot before which a receiver leaves, and its belief."""
     n, trials = extent.shape
     x_hat, P = message.finite("x_hat", extent.shape), message.finite("P", (n, n, trials))
     return message.integer("k", 0, extent.slots), Belief(x_hat, P, np.zeros(trials, np.uint8))
@@ -226,7 +229,7 @@ class Journal:
     links: Mapping[str, Account]
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         links = {name: _account(link) for name, link in self.links.items()}
         return pack({"k": self.first, "c": self.count, "links": links})
 
@@ -243,7 +246,7 @@ def _account(link: Account) -> dict[str, Any]:
 
 
 def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent: Extent) -> Journal:
-    """The journal that must begin at slot `first`, with every receiver in it; windows: receiver → its window."""
+    """Decode a journal, which must begin at slot `first` and have every receiver in it; windows: receiver → its window."""
     c, trials = message.span(first, extent.slots, extent.batch), extent.trials
     links: dict[str, Account] = {}
     for name, window in windows.items():
@@ -266,7 +269,7 @@ def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent
 
 
 def _check_account(message: Reader, name: str, link: Account, window: int) -> None:
-    """Every packet of a slot has one fate: delivered in the slot, lost, not sent, or, where it may be late, under way."""
+    """Check that every packet has one fate: delivered in its slot, lost, not sent, or, if packets may be late, under way."""
     trials = link.delivered.shape[1]
     fates = np.count_nonzero(link.delivered, axis=1) + sum(counts.astype(np.int64) for counts in link.lost.values())
     fates += 0 if link.unsent is None else link.unsent.astype(np.int64)
@@ -274,7 +277,7 @@ def _check_account(message: Reader, name: str, link: Account, window: int) -> No
     if wrong.any():
         row = int(np.argmax(wrong))
         raise message.malformed(
-            f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} of them"
+            f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} fates"
         )
     if int(link.delays.sum(dtype=np.int64)) > link.delivered.size:
         raise message.malformed(f"more delays than packets of {name}", f"at most {link.delivered.size}")

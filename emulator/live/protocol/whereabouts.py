@@ -1,6 +1,6 @@
-"""Where a process is: at which slot, and on whose messages it waits. It says so when the observer asks, and not before.
+"""The slot that a process is at and the keys on which it waits for messages, reported when the observer asks.
 
-A process that is connected and does nothing cannot be told from one that waits for it but by asking all of them.
+Only by asking all processes can a connected process that does nothing be told from processes that wait for it.
 
 Source: docs/protocol.md, silence.
 """
@@ -21,25 +21,25 @@ _MOST_KEYS = 4096
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """What a process says of itself."""
+    """A process's report of where it is."""
 
     slot: int
     """The slot that it is at."""
     waits: tuple[str, ...]
-    """The keys on which it waits for a message; none while it does not wait."""
+    """The keys on which it waits for a message; empty if it does not wait."""
 
     def pack(self) -> bytes:
-        """As a message."""
+        """Encode it as a message."""
         return pack({"k": self.slot, "waits": list(self.waits)})
 
 
 def is_whereabouts(message: Reader) -> bool:
-    """Whether telemetry, or the journal, says where a process is."""
+    """Whether a message on telemetry or journal is a process's whereabouts."""
     return message.has("waits")
 
 
 def read_whereabouts(message: Reader, slots: int) -> Whereabouts:
-    """Where a process of a run of so many slots is."""
+    """Decode a process's whereabouts; slots: of the run."""
     waits = message.names("waits")
     if len(waits) > _MOST_KEYS:
         raise message.malformed(f"{len(waits)} keys in waits", f"{_MOST_KEYS} at most")
@@ -48,7 +48,7 @@ def read_whereabouts(message: Reader, slots: int) -> Whereabouts:
 
 @final
 class Place:
-    """Kept by a process as it works, and read by the thread that answers."""
+    """Where a process is: updated by the working thread, read by the answering thread."""
 
     def __init__(self) -> None:
         self.slot = 0
@@ -59,7 +59,7 @@ class Place:
 
     @contextmanager
     def waiting(self, *keys: str) -> Iterator[None]:
-        """While the process waits on these keys."""
+        """Record that the process waits on these keys during the block."""
         self.waits = keys
         try:
             yield
@@ -67,11 +67,11 @@ class Place:
             self.waits = ()
 
     def ask(self) -> None:
-        """The observer asks."""
+        """Take a question of the observer."""
         self._asked.put(None)
 
     def answer(self, put: Callable[[bytes], None]) -> None:
-        """Answer from now on, on a thread of its own."""
+        """Start to answer questions, on a thread of its own."""
 
         def go_on() -> None:
             while True:

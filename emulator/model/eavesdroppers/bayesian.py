@@ -38,7 +38,7 @@ class Bayesian(PacketReader):
     `Belief.memory` is its `Mixture`.
     """
 
-    only_against = ("innovation", "weighs states against innovations, and there are none: it is naive here")
+    only_against = ("innovation", "weighs states against innovations, and there are none: it is the same as naive here")
     inverts_noise = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:

@@ -25,7 +25,7 @@ class Likelihood(PacketReader):
     `Belief.memory` is P's factors, (n (n−1)/2, R) and (n, R).
     """
 
-    only_against = ("innovation", "tests states against innovations, and there are none: it is naive here")
+    only_against = ("innovation", "tests states against innovations, and there are none: it is the same as naive here")
     inverts_noise = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:

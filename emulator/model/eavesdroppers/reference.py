@@ -19,7 +19,7 @@ class Reference(PacketReader):
     Source: docs/mathematics.md, acknowledged references.
     """
 
-    only_against = ("acknowledged", "follows references, and there are none: it is naive here")
+    only_against = ("acknowledged", "follows references, and there are none: it is the same as naive here")
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)

@@ -19,7 +19,7 @@ class Selective(PacketReader):
 
     only_against = (
         "encrypted-schedule",
-        "heeds a header that says what is encrypted, and there is none: it is naive here",
+        "reads a header that says which packets are encrypted, and there is none: it is the same as naive here",
     )
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:

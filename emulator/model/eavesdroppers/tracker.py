@@ -63,7 +63,7 @@ class Tracker(PacketReader):
     while the two are further apart than the noise between packets. `Belief.memory`: its `FollowedTracks`, 2R columns as (2, R).
     """
 
-    only_against = ("twin-track", "goes half-way between two tracks, and there is one")
+    only_against = ("twin-track", "takes the mean of two tracks, and there is only one")
     inverts_noise = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:

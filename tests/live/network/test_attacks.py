@@ -52,8 +52,8 @@ LIES = {
         "        action[77 - self.first, 2] = 0 if action[77 - self.first, 2] else 3\n"
         "    return dict(action=action)\n"
         "change(one)",
-        r"smart contradicts router: of slot 77, trial 2, it says that it received (nothing|the packet) [(]action [03][)], and "
-        r"the journal that it was (not )?delivered; look at logs/smart.log and logs/router.log",
+        r"smart contradicts router: in slot 77, trial 2, it says that it received (nothing|the packet) [(]action [03][)], but "
+        r"the journal says that it was (not )?delivered; look at logs/smart.log and logs/router.log",
     ),
     "a wrong digest at the end": (
         "change(lambda self: dict(digests={block: one + (block > 256) for block, one in self.digests.items()}))",

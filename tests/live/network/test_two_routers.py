@@ -211,14 +211,14 @@ def test_a_run_of_two_routers_takes_certificates_unless_it_is_told_otherwise() -
         (("tls/a:1", None, "tls/b:1"), False, "has one router; leave it out, or add --set network.routers=2"),
         (("tls/a:1", None, "tcp/127.0.0.1:1"), True, "both routers take certificates or none does"),
         (("tls/a:1", None, "tls/a:1"), True, "is where the first router is; give another port"),
-        (("tls/a:1", None, None, "tls/b:1"), True, "--relay-connect is of a second router; add --relay"),
+        (("tls/a:1", None, None, "tls/b:1"), True, "--relay-connect belongs to a second router; add --relay"),
         (
             ("tls/a:1", None, "tls/0.0.0.0:1"),
             True,
-            "--relay tls/0.0.0.0:1 is every address.*add --relay-connect tls/HOST:1",
+            "--relay tls/0.0.0.0:1 means every address.*add --relay-connect tls/HOST:1",
         ),
-        (("tls/a:1", None, "tcp/b:1"), True, "--relay tcp/b:1 is in clear"),
-        (("tls/a:1", None, "b"), True, "--relay b is no endpoint"),
+        (("tls/a:1", None, "tcp/b:1"), True, "--relay tcp/b:1 is not encrypted"),
+        (("tls/a:1", None, "b"), True, "--relay b is not an endpoint"),
     ],
 )
 def test_places_that_do_not_fit_are_refused(options: tuple[str | None, ...], relayed: bool, said: str) -> None:
