@@ -29,6 +29,7 @@ _UNWRITTEN = (
     "results of the shards cannot be merged",
     "cannot be written",
     "cannot be started",
+    "was removed while the run went on",
 )
 _NETWORK = ("flap", "cut", "silence")
 

@@ -94,7 +94,7 @@ class Connection:
         self._losses.put(None)
         if self._keeper is not None and self._keeper is not threading.current_thread():
             self._keeper.join()
-        self.session.close()  # type: ignore[no-untyped-call]
+        _close(self.session)
         for one in self._declared:
             if isinstance(one, Inbox):
                 one.close()
@@ -130,7 +130,7 @@ class Connection:
         for one in list(self._declared):
             if isinstance(one, Watch):
                 one.lose()
-        lost.close()  # type: ignore[no-untyped-call]
+        _close(lost)
         pause, longest = _AGAIN_SECONDS
         while not self._over.is_set() and self._again is not None:
             try:
@@ -171,3 +171,9 @@ class Connection:
                 and any(answer.ok is not None for answer in session.liveliness().get(key, timeout=_ANSWER_SECONDS))
             ):
                 time.sleep(_POLL_SECONDS)
+
+
+def _close(session: zenoh.Session) -> None:
+    """Close a session. Zenoh gives up after ten seconds, such as when a router is stopped; the session is of no use then either."""
+    with suppress(zenoh.ZError):
+        session.close()  # type: ignore[no-untyped-call]
