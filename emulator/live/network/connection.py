@@ -174,6 +174,6 @@ class Connection:
 
 
 def _close(session: zenoh.Session) -> None:
-    """Close a session. Zenoh gives up after ten seconds, such as when a router is stopped; the session is of no use then either."""
+    """Close a session. If its router is stopped, Zenoh gives up after ten seconds; the session is of no use then either."""
     with suppress(zenoh.ZError):
         session.close()  # type: ignore[no-untyped-call]
