@@ -242,7 +242,7 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
         "replay-informed": {"link": {"quality": 0.5}, "reads_as": "smart", "learns_at": 3},
     }.get(strategy, {"link": {"quality": 0.5}})
     of = scenario(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
-    said = rf"--mode {plan.mode.value} follows .* the actions of eve \(strategy {strategy}\).*; give --mode exact, or remove eve from"
+    said = rf"--mode {plan.mode.value} follows .* the actions of eve \(strategy {strategy}\).*; give --mode exact, or remove eve"
     with pytest.raises(UsageError, match=said):
         montecarlo(of, trials=2, plan=plan, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
