@@ -141,7 +141,7 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     done = evedrop("design", str(every_model))
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
-    assert "the link of legitimate has others" in line
+    assert "the link of legitimate is different" in line
     assert "--set 'legitimate.link={quality = 0.9}'" in line
     quality = {"quality": 0.9}
     with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.distance\.link="):

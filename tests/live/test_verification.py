@@ -245,9 +245,9 @@ def test_nothing_follows_the_last_slot(first: int) -> None:
 
 JOURNALS = {
     "more fates than packets": ({"lost": {**dict.fromkeys(REASONS, np.zeros(1, np.uint32)), "cut": np.ones(1, np.uint32)}},
-                                r"5 fates of eve's packets of slot 7; expected 4 of them"),
+                                r"5 fates of eve's packets of slot 7; expected 4 fates"),
     "fewer fates than packets": ({"delivered": np.array([[True, True, False, True]])},
-                                 r"3 fates of eve's packets of slot 7; expected 4 of them"),
+                                 r"3 fates of eve's packets of slot 7; expected 4 fates"),
     "more bursts than packets": ({"bursts": np.full(COUNTED_BURSTS, 5, np.uint32)}, "bursts of 5; expected numbers from 0 to 4"),
     "more delays than packets": ({"delays": np.full(2, 3, np.uint32)}, "more delays than packets of eve; expected at most 4"),
 }  # fmt: skip

@@ -1,1 +1,1 @@
-"""The observer: conducts a live run, joins what the processes report, and hands it on to be scored and recorded."""
+"""The observer: conducts a live run, joins the reports of all processes, and hands them on to be scored and recorded."""
