@@ -35,7 +35,7 @@ def started(evedrop: Evedrop, workers: int) -> tuple[Live, list[int]]:
 
 def crew_of(live: Live) -> list[int]:
     """Its worker processes."""
-    return [pid for pid, command in with_mark(str(live.temporary)).items() if "runs.workers import work" in command]
+    return [pid for pid, command in with_mark(str(live.temporary)).items() if "memory.workers import work" in command]
 
 
 def no_process_left(live: Live) -> None:
