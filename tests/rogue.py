@@ -9,7 +9,7 @@ from tests.conftest import Evedrop
 ROGUE = """
 import dataclasses
 import evedrop.peers.sensor
-from evedrop.network import reporting
+from evedrop.live.network import reporting
 from evedrop.live.protocol.packets import uplink
 from evedrop.live.protocol.telemetry import Journal, Report
 from evedrop.live.protocol.codec import pack

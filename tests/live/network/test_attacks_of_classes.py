@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,21 @@ from tests.conftest import Evedrop, Live, wait_until
 SEED = 7318529640182736451
 """That no process knows but the launcher and the observer, and that nothing holds by chance."""
 
+OURS = tuple(
+    f"evedrop.{room}"
+    for room in (
+        "live.launch",
+        "live.observer",
+        "live.network.router",
+        "memory",
+        "results",
+        "scenario",
+        "score",
+        "peers.sensor",
+    )
+)
+"""What only other processes of a run need."""
+
 SPY = f'''
 import gc, json, os, sys
 from pathlib import Path
@@ -31,8 +47,7 @@ from pathlib import Path
 from evedrop.model.eavesdroppers.naive import Naive
 
 SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its constants are no find
-RUNS = tuple(f"evedrop.runs.{{name}}" for name in ("briefs", "children", "launcher", "observer", "results", "scorekeeper"))
-OURS = (*RUNS, "evedrop.scenario", "evedrop.live.network.router", "evedrop.peers.sensor", "evedrop.peers.legitimate")
+OURS = {OURS!r}
 
 
 def held(value):
@@ -122,12 +137,13 @@ def written(folder: Path) -> None:
     """A scenario with the class, and beside it modules that are called like some of ours and of a library."""
     (folder / "spy.py").write_text(SPY)
     (folder / "spy.toml").write_text(SCENARIO)
-    for name in ("zenoh", "rerun", "pyarrow", "emulator", "peers", "tomli_w"):
+    for name in ("zenoh", "rerun", "pyarrow", "evedrop", "tomli_w"):
         (folder / f"{name}.py").write_text('import spy\nspy.report("shadow")\nraise SystemExit("taken")\n')
 
 
 def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) -> None:
     """Of a run's processes only the eavesdropper's imports it, and whoever asks it about itself knows neither seed nor brief."""
+    assert all(find_spec(name) for name in OURS)
     written(evedrop.folder)
     command = ["-P", "-m", "evedrop"]  # as the script `evedrop` does, not looking for modules where it was typed
     typed = ("run", "spy.toml", "--view", "off", "--pace", "0.005", "--out", "run")
