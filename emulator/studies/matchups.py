@@ -139,10 +139,11 @@ def _chosen(
             found.append(
                 f"{name} and {other} would both be called {receiver} in a scenario; compare them one after the other"
             )
+    entries = {one: SCHEMES[one].parameters for one in (*SCHEMES, *chosen[0]) if one in SCHEMES}
     for key in parameters:
         scheme, _, name = key.rpartition(".")
-        if scheme not in chosen[0] or name not in getattr(SCHEMES.get(scheme), "parameters", ()):
-            parts = [f"{one}.{entry}" for one in chosen[0] if one in SCHEMES for entry in SCHEMES[one].parameters]
+        if name not in entries.get(scheme, ()):
+            parts = [f"{one}.{entry}" for one, known in entries.items() for entry in known]
             found.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
     if found:
         raise UsageError("\n  ".join(["nothing was compared:", *found]))

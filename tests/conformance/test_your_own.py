@@ -193,7 +193,7 @@ MISTAKES = {
     "pair": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return x, None",
              "slot 0: encode() returned tuple; expected a Packet"),
     "raises": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return 1 / 0",
-               "slot 0: encode() raised ZeroDivisionError: division by zero, case_raises.py line 20"),
+               "slot 0: encode() raised ZeroDivisionError: division by zero, case_raises.py line 16"),
     "changes": ("scheme", "Mine(Sends):\n    def packet(self, k, x):\n        x += 1.0",
                 "changes in place what it is given"),
     "header": ("scheme", "Mine(Plain):\n    header = ('one',)", "`header` names 1 numbers"),
@@ -216,7 +216,7 @@ MISTAKES = {
                  "Mine(Naive):\n    def step(self, k, belief, heard): return belief._replace(x_hat=heard.z / 0.0 * 0.0)",
                  "x_hat, trial 0, is nan; expected finite numbers"),
     "streams": ("eavesdropper", "Mine(Naive):\n    @classmethod\n    def streams(cls, parameters): return ('schedule',)",
-                "knows of the schedule, and the scheme plain has none"),
+                "knowledge of the schedule, and the scheme plain has none"),
     "fate": ("link", "Mine(Bernoulli):\n    parameters = {}\n    def __init__(self): super().__init__(0.9)\n"
              "    def fates(self, first, uniforms): return uniforms[:, 0] < 0.9", "has type bool; expected uint8"),
     "quality": ("link", "Mine(Bernoulli):\n    parameters = {}\n    quality = 1.5\n    def __init__(self): super().__init__(0.9)",

@@ -248,7 +248,7 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
         ({"loss": {**CHAIN, "transitions": [[0.5, 0.5]]}}, "link.loss.transitions: is not square"),
         ({"loss": {**CHAIN, "transitions": [[0.9, 0.2], [0.5, 0.5]]}}, "link.loss.transitions: row 0 sums to 1.1; expe"),
         ({"loss": {**CHAIN, "transitions": [[1.5, -0.5], [0.5, 0.5]]}}, "link.loss.transitions: row 0 is [1.5, -0.5]; e"),
-        ({"loss": {**CHAIN, "transitions": [[1, 0], [0, 1]]}}, "link.loss.transitions: falls apart into states"),
+        ({"loss": {**CHAIN, "transitions": [[1, 0], [0, 1]]}}, "link.loss.transitions: has several recurrent classes"),
         ({"loss": {**CHAIN, "loss": [0.0]}}, "link.loss.loss: is [0.0]; expected 2 numbers from 0 to 1, one for each"),
         ({"loss": {**CHAIN, "loss": [0.0, 2.0]}}, "link.loss.loss: is [0.0, 2.0]; expected 2 numbers"),
         ({"loss": {"model": "pattern", "outcomes": "11x1"}}, 'link.loss.outcomes: is "11x1"; expected a word of 0'),

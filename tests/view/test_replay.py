@@ -80,7 +80,7 @@ def one_action(table: pa.Table) -> pa.Table:
 
 OTHER: dict[str, tuple[str, Callable[[pa.Table], pa.Table], str]] = {
     "other columns": ("trials", lambda table: table.drop_columns(["x_hat"]), "differs in x_hat"),
-    "slots cut short": ("slots", lambda table: table.slice(0, 40), "not the same slots of"),
+    "slots cut short": ("slots", lambda table: table.slice(0, 40), "do not have the same slots of"),
     "an unknown action": ("trials", one_action, "unknown action guessed"),
 }
 
