@@ -43,6 +43,7 @@ READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
 _LEASE_SECONDS = 4.0  # a connection on which nothing arrives for this long is lost
 _HEARD_SECONDS = 2.0  # to find the readers again when a connection is back
+_SENT_BYTES = 1 << 20  # under way to one reader: a full buffer would keep Zenoh from noticing that the reader is lost
 _NEVER_MS = 86_400_000
 _ANSWER_BYTES = 64 * 2**20  # for the operator
 _WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
@@ -59,7 +60,9 @@ def _transport(identity: Identity | None, largest: int, listens: bool = False) -
     if identity is not None:
         from evedrop.live.network.certificates import tls_section  # noqa: PLC0415 - saves most runs 50 ms
 
-        link |= {"protocols": ["tls"], "tls": tls_section(identity, listens)}
+        link |= {"protocols": ["tls"], "tls": {**tls_section(identity, listens), "so_sndbuf": _SENT_BYTES}}
+    else:
+        link["tcp"] = {"so_sndbuf": _SENT_BYTES}
     # Shared memory would expose the router's messages for one receiver to all.
     return {"link": link, "shared_memory": {"enabled": False}}
 
