@@ -36,8 +36,9 @@ def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
 def inputs_schema_in(path: Path) -> pa.Schema:
     """The schema that a file should have; for a file that is not such a table, one with which reading it reports that."""
     try:
-        with opened(path) as file:
-            schema = pq.read_schema(file)
+        with opened(path):  # a pipe would be waited for
+            pass
+        schema = pq.read_schema(path)
         u, d = (int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d"))
     except Exception:  # pyarrow raises many kinds of errors for a damaged file, and the table's reader reports them
         u = d = 0

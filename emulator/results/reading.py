@@ -43,8 +43,10 @@ class Results:
         schema = None if path.exists() else schema_of(self.folder, name)
         try:
             if schema is None:
-                with opened(path) as file:  # does not wait if it is a pipe
-                    table = pq.read_table(file)
+                with opened(path):  # a pipe would be waited for
+                    pass
+                # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
+                table = pq.read_table(path)
             else:
                 table = pa.Table.from_batches(batches_of(self.folder, name), schema)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
