@@ -121,7 +121,7 @@ def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
         encoding = tables.get("encoding")
         name = str(encoding.get("scheme")) if isinstance(encoding, Mapping) else ""
         scheme = SCHEMES.get(name)
-        if scheme is not None and scheme.decides_initial_state:
+        if scheme is not None and scheme.decides_initial_state():
             yield f"plant.output_matrix: is given, but the scheme {name} decides x_0 itself; expected another scheme"
     if process.get("singular_noise") is True:
         eavesdroppers = tables.get("eavesdroppers")

@@ -449,6 +449,12 @@ def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:
     done = tutorial("design", "three.toml")
     assert done.status == 2
     assert "no closed form is known for flipped:Flipped" in done.err
+    (tutorial.folder / "louder.py").write_text(
+        "from evedrop.extend import Plain\n\n\nclass Louder(Plain):\n    'Other packets, maybe.'\n"
+    )
+    done = tutorial("design", "three.toml", "--set", 'encoding={scheme = "louder:Louder"}')
+    assert done.status == 2
+    assert "no closed form is known for louder:Louder" in done.err
     paper = ("--set", 'encoding={scheme = "innovation", state_probability = 0.5}')
     done = tutorial("design", "three.toml", *paper, "--set", "eavesdroppers.tracker.link={quality = 0.9}", "--json")
     assert json.loads(done.out)["left_out"] == {"tracker": "tracker:Tracker"}

@@ -122,15 +122,25 @@ class Scheme(ABC):
     """The strategy that, without the secret, reads its packets best. `evedrop compare` has attackers read with it."""
     sends_states_and_innovations: ClassVar[bool] = False
     """Whether every packet is a state or an innovation, so that no eavesdropper without the secret does better than the genie."""
-    decides_initial_state: ClassVar[bool] = False
-    """Whether the secret decides x_0 (`initial_state`), so that no filter at the sensor can."""
     closed_forms: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """Receiver (a strategy, or `legitimate`) → the closed form in `evedrop.expected.closed_forms` for slots that differ."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Reset the theory of the packets: a subclass may send others, and has to state again what holds of them."""
+        super().__init_subclass__(**options)
+        for name in ("sends_states_and_innovations", "closed_forms", "error_floor"):
+            if name not in vars(cls):
+                setattr(cls, name, getattr(Scheme, name))
 
     def __init__(self, process: Process, state_probability: float = 1.0) -> None:
         self.process = process
         self.state_probability = state_probability
         """Probability that the packet of a slot k ≥ 1 contains the state, which is public: μ_d; 1 without such a parameter."""
+
+    @classmethod
+    def decides_initial_state(cls) -> bool:
+        """Whether the secret decides x_0, so that no filter at the sensor can."""
+        return cls.initial_state is not Scheme.initial_state
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:

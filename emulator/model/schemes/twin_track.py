@@ -108,7 +108,6 @@ class TwinTrack(Scheme):
     """
 
     best_reader = "tracker"
-    decides_initial_state = True
     secret_streams = ("start", "track")
     estimator_streams = ("start", "track")
     secret_words = (1, 0)
@@ -129,7 +128,7 @@ class TwinTrack(Scheme):
         return TwinTracks(self.process, keys, batch).initial
 
     def error_floor(self, slots: int) -> tuple[Floats, bool]:
-        """Half the error of who knows nothing of x_0, (slots,): it grows with the powers of A.
+        """Half the error of a receiver that knows nothing of x_0, (slots,); it grows with the powers of A.
 
         Source: docs/mathematics.md, twin track.
         """

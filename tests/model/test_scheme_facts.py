@@ -1,0 +1,50 @@
+"""What a scheme's class says of its packets, and what a subclass may not take over unsaid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evedrop.model.process import Process
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.schemes.cipher import Cipher
+from evedrop.model.schemes.plain import Plain
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.schemes.twin_track import TwinTrack
+
+PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))
+
+
+@pytest.mark.parametrize("base", [SCHEMES[name] for name in SCHEMES])
+def test_theory_of_packets_is_not_inherited(base: type[Scheme]) -> None:
+    """A subclass may send other packets: no bound, closed form or floor is claimed for it unless it claims it itself."""
+    other = type("Other", (base,), {})
+    assert not other.sends_states_and_innovations
+    assert other.closed_forms == {}
+    assert other.error_floor is Scheme.error_floor
+    again = type("Again", (other,), {"sends_states_and_innovations": True, "closed_forms": {"naive": "scheduled"}})
+    assert again.sends_states_and_innovations
+    assert again.closed_forms == {"naive": "scheduled"}
+
+
+def test_the_built_in_classes_say_what_theory_knows() -> None:
+    """The facts are those of docs/mathematics.md: packets of states and innovations, closed forms, floors."""
+    assert {name for name in SCHEMES if SCHEMES[name].sends_states_and_innovations} == {"innovation", "plain"}
+    assert {name for name in SCHEMES if SCHEMES[name].closed_forms} == {
+        "acknowledged",
+        "encrypted-schedule",
+        "scheduled",
+    }
+    assert {name for name in SCHEMES if SCHEMES[name].error_floor is not Scheme.error_floor} == {"cipher", "twin-track"}
+    assert Acknowledged.closed_forms["legitimate"] == "reference"
+    assert Plain(PROCESS).error_floor(3) is None
+    floor, grows = Cipher(PROCESS).error_floor(3)
+    np.testing.assert_array_equal(floor, [2.0, 4.0, 6.0])  # tr Σ_k, Σ_k = Σ_{k−1} + Q
+    assert grows
+
+
+def test_a_scheme_with_its_own_start_is_known_by_its_method() -> None:
+    """Also a subclass, and without a word of its author."""
+    assert {name for name in SCHEMES if SCHEMES[name].decides_initial_state()} == {"twin-track"}
+    assert type("Other", (TwinTrack,), {}).decides_initial_state()
