@@ -22,7 +22,7 @@ from evedrop.scenario.words import listed
 if TYPE_CHECKING:
     from evedrop.memory.montecarlo import Plan
     from evedrop.model.theory.design import Design
-    from evedrop.studies.compare import Comparison
+    from evedrop.results.comparison import Comparison
 
 Tell = Callable[[Mapping[str, Any]], None]
 

@@ -29,7 +29,7 @@ def floors() -> list[list[str]]:
 
 def arrows(rooms: list[str]) -> set[tuple[str, str]]:
     """Pairs of rooms, the first of which imports the second."""
-    graph = grimp.build_graph(PACKAGE, cache_dir=None, exclude_type_checking_imports=True)
+    graph = grimp.build_graph(PACKAGE, cache_dir=None)
     found = set()
     for module in graph.modules:
         for imported in graph.find_modules_directly_imported_by(module):

@@ -13,7 +13,7 @@ from evedrop.cli.report import terminal
 from evedrop.score.kept import MARKS, SecrecyKept
 
 if TYPE_CHECKING:
-    from evedrop.studies.compare import Cell, Comparison, SimulatedError
+    from evedrop.results.comparison import Cell, Comparison, SimulatedError
 
 WORDS = {
     SecrecyKept.PERFECT: "perfect",

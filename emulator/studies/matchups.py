@@ -8,7 +8,6 @@ Source: docs/compare.md.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,36 +16,20 @@ from evedrop.errors import NotRegistered, ScenarioError, UsageError
 from evedrop.loading import checked
 from evedrop.loading.mistakes import lacking_streams
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.readers import RESERVED
 from evedrop.model.registry import Registry
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
+from evedrop.results.comparison import Match, receiver_name
 from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed, near
 
 ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}
 """Adversary → its attack on acknowledgements."""
 
-_NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
 _WAY_BACK = {"link": {"quality": 1.0}}
 
 Tables = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Match:
-    """An adversary against a scheme: its strategy in the scenario of its group, or the reason why it is not defined."""
-
-    scheme: str
-    adversary: str
-    strategy: str | None = None
-    """Its strategy; None if the match is not defined."""
-    attack: str = "none"
-    not_defined: str | None = None
-
-    @property
-    def receiver(self) -> str:
-        """Its name in the scenario: that of its strategy, so that it has the same losses under any attack."""
-        return receiver_name(str(self.strategy))
 
 
 @dataclass(frozen=True)
@@ -78,11 +61,6 @@ class Matchups:
     groups: tuple[Group, ...]
     """In order of schemes; for each scheme, the group without an attack comes first."""
     undefined: tuple[Match, ...]
-
-
-def receiver_name(strategy: str) -> str:
-    """The name of a receiver with this strategy in a scenario."""
-    return _NOT_IN_NAMES.sub("-", strategy.lower())[:_LONGEST_NAME]
 
 
 def adversaries_of() -> tuple[str, ...]:
@@ -234,11 +212,7 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
         made.setdefault("link", link)
     if "reads_as" in kind.parameters:
         # The best strategy against this scheme: the scenario's own choice is for the scenario's own scheme.
-        made = {
-            name: value
-            for name, value in made.items()
-            if name in {*kind.parameters, "strategy", "window", "link", "links"}
-        }
+        made = {name: value for name, value in made.items() if name in {*kind.parameters, *RESERVED}}
         made["reads_as"] = SCHEMES[scheme].best_reader
     if "learns_at" in kind.parameters:
         made.setdefault("learns_at", scenario.slots // 2)

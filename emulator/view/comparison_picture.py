@@ -13,7 +13,7 @@ from evedrop.view.figure_style import panels
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from evedrop.studies.compare import Cell, Comparison, SchemeResult
+    from evedrop.results.comparison import Cell, Comparison, SchemeResult
 
 # Blue for secrecy kept and orange for secrecy broken, darker where more certain: distinct with any colour-blindness, and in grey.
 _GROUND = {

@@ -15,7 +15,8 @@ import pytest
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
-from evedrop.live.launch.shards import OneProgress, shards_of
+from evedrop.live.launch.shard import shards_of
+from evedrop.live.launch.shards import OneProgress
 from evedrop.loading import load
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results

@@ -15,8 +15,8 @@ from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
+from evedrop.results.comparison import Comparison
 from evedrop.score.kept import SecrecyKept
-from evedrop.studies.compare import Comparison
 from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
 from tests.conftest import Evedrop
 
@@ -125,7 +125,7 @@ def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) ->
 
 
 def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> None:
-    """Whoever reads what is sent in clear, of whatever scheme, has the error that `plain` has."""
+    """An eavesdropper that reads what any scheme sends in clear has the error that it has against `plain`."""
     found, _ = everything
     user = found.schemes["plain"].legitimate.mean
     assert found.schemes["cipher"].legitimate.mean == pytest.approx(user, rel=1e-9)
@@ -201,7 +201,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
 
 
 def test_blocking_critical_acknowledgements_undoes_the_state_secrecy_code(literature: Comparison) -> None:
-    """At k = 40 whoever blocks them has the user's own 2.284e-4, and 4.91e7 with acknowledgements that are honest."""
+    """At k = 40 an attacker that blocks them has the user's own 2.284e-4, and 4.91e7 with honest acknowledgements."""
     for attacker in ("blocks-critical", "blocks-all"):
         jammer, user = last(literature, "acknowledged", attacker)
         assert jammer == pytest.approx(user, rel=1e-9)

@@ -193,7 +193,7 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
     assert case.get("name") == "a"
 
 
-def test_tests_end_with_whoever_started_them(evedrop: Evedrop) -> None:
+def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:
     """Kill -9 of `evedrop test` while two run: their processes end too."""
     written(evedrop.folder / "cases", a=HOLDS.replace("slots = 60", "slots = 200000"), b=HOLDS)
     process = subprocess.Popen(

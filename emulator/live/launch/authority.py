@@ -23,7 +23,7 @@ _VALID = datetime.timedelta(days=30)
 
 
 def authority_name(run: str) -> str:
-    """The name of a run's authority; a process that rejects a certificate tells from it which run the certificate is of."""
+    """The name of a run's authority, from which a process that rejects a certificate tells the run."""
     return f"evedrop {run}"
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
+from evedrop.live.launch.shard import Shard
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
@@ -33,9 +34,6 @@ from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.totals import Totals
-
-if TYPE_CHECKING:
-    from evedrop.live.launch.shards import Shard
 
 _RECORDING = "recording.rrd"
 

@@ -8,7 +8,6 @@ Source: docs/scale.md.
 
 from __future__ import annotations
 
-import re
 import shutil
 import threading
 import time
@@ -21,58 +20,11 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.children import News
 from evedrop.live.launch.ports import RouterEndpoints, loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
 from evedrop.view.viewer import Viewer
-
-_FOLDER = "shards"  # in the results folder, until the shards are merged
-
-
-@dataclass(frozen=True)
-class Shard:
-    """A range of the trials of a run."""
-
-    number: int
-    """Number of the shard, from 1 on, in order of trials."""
-    scenario: Scenario
-    """The run's scenario, with only these trials."""
-    folder: Path
-    """Its own results folder."""
-
-    @property
-    def name(self) -> str:
-        """Name of the folder of its logs, in the run's log folder."""
-        return f"shard-{self.number}"
-
-    @property
-    def trials(self) -> range:
-        """The shard's trials, by their numbers in the scenario."""
-        first = self.scenario.first_trial
-        return range(first, first + self.scenario.trials)
-
-    def of_run(self, said: object) -> str:
-        """A message of the shard as a message of the run: names the shard, and its logs by their place in the run's folder."""
-        trials = self.trials
-        which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
-        return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(said))
-
-
-def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:
-    """The shards of a run, as equal as possible; a shard without a recorded trial records its first trial nevertheless."""
-    trials, recorded, count = scenario.trials, scenario.record_trials, scenario.shards
-    bounds = [trials * i // count for i in range(count + 1)]
-    tables = scenario.model_dump(mode="json")
-    made = []
-    for number, start in enumerate(bounds[:-1], 1):
-        own = {
-            "trials": bounds[number] - start,
-            "first_trial": scenario.first_trial + start,
-            "record_trials": max(1, min(recorded - start, bounds[number] - start)),
-            "shards": 1,
-        }
-        made.append(Shard(number, Scenario.model_validate({**tables, **own}), folder / _FOLDER / str(number)))
-    return made
 
 
 @final
@@ -181,7 +133,7 @@ def launch_shards(
         now = held.now
         if now != folder:
             tell({"event": "moved", "folder": str(now)})
-            shards = [replace(shard, folder=now / _FOLDER / str(shard.number)) for shard in shards]
+            shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
         return Ended(_made_one(scenario, now, shards, course, progress.started), course.viewer, now)
     except BaseException as error:
         if course.viewer is not None:
@@ -224,7 +176,7 @@ def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course:
         summary = gather(scenario, folder, shards, started, how)
     except OSError as error:
         raise RunError(
-            f"the results of the shards cannot be merged ({error}); those of each are in {folder / _FOLDER}; free some "
+            f"the results of the shards cannot be merged ({error}); those of each are in {folder / SHARDS_FOLDER}; free some "
             "space, and run again"
         ) from error
     if fault is not None:

@@ -1,0 +1,282 @@
+"""The result of a comparison: for every scheme and adversary the errors, theory, and the verdict.
+
+Source: docs/compare.md.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import pyarrow as pa
+
+from evedrop.results.writer import plain
+from evedrop.score.kept import SecrecyKept
+from evedrop.score.verdict import Secrecy, Verdict
+
+_NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
+_ALIKE = 1e-6  # relative difference of two errors of theory that count as equal: allows for rounding only
+
+
+def receiver_name(strategy: str) -> str:
+    """The name of a receiver with this strategy in a scenario."""
+    return _NOT_IN_NAMES.sub("-", strategy.lower())[:_LONGEST_NAME]
+
+
+@dataclass(frozen=True)
+class Match:
+    """An adversary against a scheme: its strategy in the scenario of its group, or the reason why it is not defined."""
+
+    scheme: str
+    adversary: str
+    strategy: str | None = None
+    """Its strategy; None if the match is not defined."""
+    attack: str = "none"
+    not_defined: str | None = None
+
+    @property
+    def receiver(self) -> str:
+        """Its name in the scenario: that of its strategy, so that it has the same losses under any attack."""
+        return receiver_name(str(self.strategy))
+
+
+@dataclass(frozen=True)
+class Theory:
+    """The trace of a receiver's expected error covariance."""
+
+    mean: float
+    """Mean over the slots of the run."""
+    last: float
+    """In the last slot of the run."""
+    limit: float | None
+    """In the long run; inf if it is unbounded; None if a bound is known only for the run."""
+    bound: bool
+    """Whether these are only lower bounds of its error."""
+
+
+@dataclass(frozen=True)
+class SimulatedError:
+    """A receiver's squared error in simulation, over all slots, with the theory for it."""
+
+    mean: float
+    """Mean over trials."""
+    standard_error: float | None
+    """Standard error of the mean; None for one trial, and if the variance is infinite, so that it would mean nothing."""
+    quantiles: Mapping[str, float]
+    """Level → quantile over trials of a trial's mean error."""
+    infinite_variance: bool
+    theory: Theory | None
+
+    @property
+    def typical(self) -> float:
+        """The figure to compare by: the mean over trials, or the median if the variance is infinite."""
+        return self.quantiles["0.5"] if self.infinite_variance else self.mean
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One adversary against one scheme."""
+
+    match: Match
+    legitimate: SimulatedError | None = None
+    """The legitimate estimator in the same simulation: an attack may affect it, too."""
+    eavesdropper: SimulatedError | None = None
+    secrecy: Secrecy | None = None
+
+    @property
+    def betrayed(self) -> bool:
+        """Whether the adversary learns a true state, against which no scheme can protect."""
+        return self.match.strategy == "replay-informed"
+
+    @property
+    def ratio(self) -> float | None:
+        """Eavesdropper's over legitimate error; of medians if either variance is infinite. None if the pair is not defined."""
+        if self.legitimate is None or self.eavesdropper is None:
+            return None
+        one, two = self.legitimate, self.eavesdropper
+        medians = one.infinite_variance or two.infinite_variance
+        user, other = (each.quantiles["0.5"] if medians else each.mean for each in (one, two))
+        return other / user if user else math.inf
+
+    @property
+    def verdict(self) -> SecrecyKept | None:
+        """The verdict of the run; theory also decides whether an error is unbounded, and whether two are equal."""
+        secrecy, other, user = self.secrecy, self.eavesdropper, self.legitimate
+        if secrecy is None or other is None or user is None:
+            return None
+        if secrecy.relative is Verdict.FAILED:
+            return SecrecyKept.BROKEN
+        unbounded = _limit(other) == math.inf and _limit(user) < math.inf
+        if secrecy.perfect is Verdict.HELD and unbounded:
+            return SecrecyKept.PERFECT
+        if secrecy.relative is Verdict.HELD:
+            return SecrecyKept.RELATIVE
+        denied = secrecy.relative_by_theory is False and secrecy.relative_from is None and not unbounded
+        return SecrecyKept.BROKEN if denied else SecrecyKept.UNDECIDED
+
+    def as_dict(self) -> dict[str, Any]:
+        """The cell in the form of compare.json."""
+        verdict = self.verdict
+        if verdict is None or self.secrecy is None or self.legitimate is None or self.eavesdropper is None:
+            return {"not_defined": self.match.not_defined}
+        return {
+            "reads_as": self.match.strategy,
+            "attack": self.match.attack,
+            "eavesdropper": asdict(self.eavesdropper),
+            "legitimate": asdict(self.legitimate),
+            "ratio": self.ratio,
+            "verdict": verdict.value,
+            "secrecy": self.secrecy.as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class Needs:
+    """The cost of a scheme."""
+
+    acknowledgements: bool
+    payload_bits: int
+    """Bits of a packet's payload on the wire: float64 numbers."""
+    header_bits: int
+    """Bits of a packet's header on the wire: int64 numbers."""
+    sent_fraction: float
+    """Fraction of slots with a packet, measured without an attack."""
+    secret_bits_per_slot: int
+    """The most bits in a slot from the streams that both sides draw."""
+    initial_secret_bits: int
+    """Bits that a trial uses once."""
+
+    @property
+    def packet_bits(self) -> int:
+        """Bits of payload and header."""
+        return self.payload_bits + self.header_bits
+
+
+@dataclass(frozen=True)
+class SchemeResult:
+    """One scheme against all adversaries."""
+
+    name: str
+    parameters: Mapping[str, Any]
+    needs: Needs
+    legitimate: SimulatedError
+    """The legitimate estimator without an attack."""
+    cells: Mapping[str, Cell]
+    """Adversary → its cell, for all adversaries."""
+
+    @property
+    def closest(self) -> Cell | None:
+        """The adversary with the least error, except those that learn a true state; None if there is none."""
+        played = [cell for cell in self.cells.values() if cell.eavesdropper is not None and not cell.betrayed]
+        return min(played, key=lambda cell: _error(cell.eavesdropper), default=None)
+
+    @property
+    def kept(self) -> float:
+        """The error of the closest adversary, by theory if it is known."""
+        return math.nan if self.closest is None else _error(self.closest.eavesdropper)
+
+    @property
+    def price(self) -> float:
+        """The largest error of the legitimate estimator under any attack: the limit of theory, if it is known."""
+        users = [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
+        return max(_lasting(one) for one in users)
+
+
+def _limit(of: SimulatedError) -> float:
+    known = None if of.theory is None else of.theory.limit
+    return math.nan if known is None else known
+
+
+def _error(of: SimulatedError | None) -> float:
+    assert of is not None  # noqa: S101 - the caller has checked it
+    return of.typical if of.theory is None or of.theory.bound else of.theory.mean
+
+
+def _lasting(of: SimulatedError) -> float:
+    known = _limit(of)
+    return of.typical if math.isnan(known) else known
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of `evedrop compare`; `table` has a row for each pair, for pandas or polars."""
+
+    title: str
+    slots: int
+    trials: int
+    seed: int
+    first_trial: int
+    adversaries: tuple[str, ...]
+    schemes: Mapping[str, SchemeResult] = field(default_factory=dict)
+
+    @property
+    def dominant(self) -> tuple[str, ...]:
+        """Schemes that no other beats: none has a smaller legitimate error, or a larger error of the closest adversary."""
+        known = [one for one in self.schemes.values() if not math.isnan(one.kept)]
+        return tuple(
+            one.name
+            for one in known
+            if all(
+                one.price <= other.price * (1.0 + _ALIKE) and one.kept >= other.kept * (1.0 - _ALIKE) for other in known
+            )
+        )
+
+    def cell(self, scheme: str, adversary: str) -> Cell:
+        """The cell of one pair."""
+        return self.schemes[scheme].cells[adversary]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The comparison in the form of compare.json, except for infinite numbers."""
+        return {
+            "scenario": self.title,
+            "slots": self.slots,
+            "trials": self.trials,
+            "seed": self.seed,
+            "first_trial": self.first_trial,
+            "adversaries": list(self.adversaries),
+            "dominant": list(self.dominant),
+            "schemes": {
+                name: {
+                    "parameters": dict(one.parameters),
+                    "needs": {**asdict(one.needs), "packet_bits": one.needs.packet_bits},
+                    "legitimate": asdict(one.legitimate),
+                    "closest": None if one.closest is None else one.closest.match.adversary,
+                    "against": {adversary: cell.as_dict() for adversary, cell in one.cells.items()},
+                }
+                for name, one in self.schemes.items()
+            },
+        }
+
+    def as_json(self, indent: int | None = 1) -> str:
+        """Strict JSON; infinite and undefined numbers as strings."""
+        return json.dumps(plain(self.as_dict()), indent=indent, ensure_ascii=False)
+
+    @property
+    def table(self) -> pa.Table:
+        """A row for each pair of scheme and adversary."""
+        return pa.Table.from_pylist([row for one in self.schemes.values() for row in _rows(one)])
+
+
+def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
+    for adversary, cell in one.cells.items():
+        user, other = cell.legitimate, cell.eavesdropper
+        yield {
+            "scheme": one.name,
+            "adversary": adversary,
+            "not_defined": cell.match.not_defined,
+            "eavesdropper_error": None if other is None else other.mean,
+            "eavesdropper_median": None if other is None else other.quantiles["0.5"],
+            "eavesdropper_theory": None if other is None or other.theory is None else other.theory.mean,
+            "legitimate_error": None if user is None else user.mean,
+            "legitimate_median": None if user is None else user.quantiles["0.5"],
+            "legitimate_theory": None if user is None or user.theory is None else user.theory.mean,
+            "ratio": cell.ratio,
+            "verdict": None if cell.verdict is None else cell.verdict.value,
+            "packet_bits": one.needs.packet_bits,
+            "secret_bits_per_slot": one.needs.secret_bits_per_slot,
+            "acknowledgements": one.needs.acknowledgements,
+        }
