@@ -67,7 +67,7 @@ def prepare(packages: Mapping[str, str]) -> None:
     if sys.platform != "linux" or os.getuid() != 0:
         raise CannotRun("it takes Linux and root")
     with Path(__file__).open() as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # whoever comes second finds the commands there
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the second process finds the commands installed
         _install(sorted({package for command, package in packages.items() if shutil.which(command) is None}))
     tried("unshare", "--net", "--mount", "--pid", "--fork", "true", what="namespaces cannot be made")
 

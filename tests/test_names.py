@@ -1,4 +1,4 @@
-"""Names in the code: one public class for each name, and no name that was replaced."""
+"""Names in the code: one public class for each name."""
 
 from __future__ import annotations
 
@@ -9,25 +9,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(path for folder in ("emulator", "peers") for path in (ROOT / folder).rglob("*.py"))
-REPLACED = {
-    "Anew",
-    "Attendance",
-    "Beside",
-    "Course",
-    "Door",
-    "Due",
-    "Heard",
-    "Informed",
-    "Kept",
-    "Meeting",
-    "Places",
-    "Postman",
-    "Stand",
-    "WayBack",
-    "once_more",
-    "said_of",
-}
-"""Identifiers that had a better name; see docs/glossary.md."""
 
 
 def trees() -> list[tuple[Path, ast.Module]]:
@@ -45,17 +26,6 @@ def test_no_two_public_classes_have_one_name() -> None:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places[node.name].append(str(path.relative_to(ROOT)))
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
-
-
-def test_replaced_names_are_gone() -> None:
-    """No class, function or parameter has a name that was replaced by a better one."""
-    for path, tree in trees():
-        defined = {
-            node.name
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        }
-        assert not defined & REPLACED, path
 
 
 def test_classes_say_that_they_are_final_by_the_decorator() -> None:

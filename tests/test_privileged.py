@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.mark.parametrize(("mark", "folder"), [("hosts", "tests/hosts"), ("containers", "tests/containers")])
 def test_what_cannot_be_tested_is_said_loudly(mark: str, folder: str, tmp_path: Path) -> None:
-    """Whoever is not root is told so; whoever is, that there are no commands, and no apt-get to install them."""
+    """The reason is that the user is not root or, for root, that the commands and apt-get are missing."""
     command = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", mark, folder)
     where = {"PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, **where}, capture_output=True, text=True, check=False)

@@ -114,7 +114,7 @@ def _listened(one: _Named, beside: _Named) -> list[RuleVerdict]:
     try:
         return eavesdropper_verdicts(listening)
     except Broken as error:
-        return [RuleVerdict("what it says of itself", str(error))]
+        return [RuleVerdict("facts on the class", str(error))]
 
 
 def _streams(one: _Named) -> list[str]:

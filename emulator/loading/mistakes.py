@@ -199,7 +199,7 @@ def _links(tables: Mapping[str, Any]) -> dict[str, LinkTable]:
 
 
 def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) -> str | None:
-    """Why there is no theory for a receiver, as far as it is valid; None if there is a theory.
+    """Why there is no theory for a receiver; None if there is one, or if the receiver has mistakes of its own.
 
     sound: the scenario, if it has no other mistakes: its events are then considered too.
     """

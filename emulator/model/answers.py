@@ -51,7 +51,7 @@ class Answers:
     def ask(self, name: str, do: str, *given: Any) -> Any:
         """The answer of the class `name` to one question, as decoded JSON.
 
-        Raises NotRegistered if there is no class of this name, NoAnswer if it gives no valid answer.
+        Raises NotRegistered if no class has this name, NoAnswer if the class does not give a valid answer.
         """
         from evedrop.errors import NotRegistered  # noqa: PLC0415 - the registries ask us
 

@@ -200,7 +200,7 @@ def test_a_sweep_over_a_house_has_its_figures(evedrop: Evedrop) -> None:
 
 
 def test_the_closing_report_says_what_became_of_the_house(evedrop: Evedrop) -> None:
-    """What it buys and sells, and by how much that differs; without active windows nothing of who can tell them."""
+    """What it buys and sells, and by how much that differs; without active windows nothing on which receiver detects them."""
     done = evedrop("montecarlo", "microgrid", "--slots", "200", "--trials", "1", "--out", "x")
     assert "the house buys 0.0" in done.out
     assert "slot by slot" in done.out

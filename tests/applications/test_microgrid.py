@@ -20,7 +20,7 @@ TABLE = {0.1: (1.333e-4, 3.133e-4), 0.5: (2.667e-5, 4.667e-5), 0.9: (1.481e-5, 1
 WIDE = [[2500.0, 0.0], [0.0, 2500.0]]
 COVARIANCES = Plan(Mode.COVARIANCE_ONLY, workers=1)
 NO_PACKETS = {"eavesdroppers__bayesian__strategy": "smart"}
-"""Whoever reads packets, and not their fates alone, has no place in a study of covariances."""
+"""A study of covariances excludes receivers that read packets, and not only their fates."""
 
 
 def part_of_day(name: str, first: int, slots: int, **changes: Any) -> Any:

@@ -333,7 +333,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
 
 
 @pytest.mark.parametrize("reader", ["/dev/full", "gone"])
-def test_an_interrupt_stays_one_whoever_reads(evedrop: Evedrop, reader: str) -> None:
+def test_an_interrupt_stays_one_for_every_reader(evedrop: Evedrop, reader: str) -> None:
     """Ctrl-C also ends who stands behind the pipe; that our closing table cannot be written changes nothing."""
     ends = os.pipe()
     os.close(ends[0])

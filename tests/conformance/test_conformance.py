@@ -209,7 +209,7 @@ def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
 
 
 class Forgetful(Suspicious):
-    """Tosses its coin anew for every slot that it is asked for, by how often it was asked."""
+    """Tosses a new coin for every slot that it is asked for, by how often it was asked."""
 
     tosses = 0
 

@@ -1,7 +1,7 @@
 """The file system that the image is built upon: Debian's own packages with Python, made where nothing can be harmed.
 
-debootstrap runs as root and mounts /proc and /sys in what it makes. Killed half-way it leaves them mounted, and whoever then
-removes the folder removes from the machine's own /proc. So here it has mounts and processes of its own, and writes to
+debootstrap runs as root and mounts /proc and /sys in what it makes. If it is killed half-way, they stay mounted, and removing
+the folder then removes from the machine's own /proc. So here it has mounts and processes of its own, and writes to
 memory: when its first process ends, however it ends, the kernel ends all others, and mounts and files are gone.
 """
 

@@ -103,7 +103,7 @@ def test_of_a_scenario_that_does_not_fit_nothing_is_started(project: Make) -> No
 
 
 def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Make) -> None:
-    """It is named, what was measured is on disk, everybody leaves; and `up` once more makes a whole run."""
+    """It is named, what was measured is on disk, everybody leaves; and another `up` makes a whole run."""
     one = project(EVEDROP_OPTIONS=ENDLESS)
     one.compose("up", "--detach")
     one.running()

@@ -1,4 +1,4 @@
-"""Who can reach what while docker-compose.yml is up, and what is left when it is taken down in the middle."""
+"""What each container can reach while docker-compose.yml is up, and what is left when it is taken down in the middle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The processes of a run as the system knows them: all that descend from the campaign, whoever their parent is by now."""
+"""The processes of a run as the system knows them: all descendants of the campaign, whatever their parents are now."""
 
 from __future__ import annotations
 

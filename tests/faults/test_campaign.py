@@ -139,6 +139,11 @@ def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: SimpleNamesp
     """A private folder, and a table that is cut off; of a run with which nothing is wrong it says nothing."""
     before = frozenset(one.pid for one in ours.descendants())
     assert judge.misses(ended, [], PATIENT_SECONDS, reference, before) == []
+    slots = pq.read_table(ended.out / "slots.parquet")
+    pq.write_table(slots.slice(0, slots.num_rows - 1), ended.out / "slots.parquet")
+    lines = judge.misses(ended, [], PATIENT_SECONDS, reference, before)
+    assert [line for line in lines if "the table of slots has" in line]
+    pq.write_table(slots, ended.out / "slots.parquet")
     (ended.temporary / "evedrop-x").mkdir()
     whole = (ended.out / "slots.parquet").read_bytes()
     (ended.out / "slots.parquet").write_bytes(whole[: len(whole) // 2])

@@ -112,7 +112,7 @@ def _as_parquet(mutator: Mutator, data: bytes) -> bytes:
 
 
 def _lines(mutator: Mutator, data: bytes) -> bytes:
-    """Lines of JSON, of which some say something else."""
+    """Lines of JSON, some of them changed."""
     lines = [
         mutator.tree(json.loads(line)) if mutator.random.random() < 0.5 else json.loads(line)
         for line in data.splitlines()

@@ -246,7 +246,7 @@ def test_an_address_of_another_host_is_said(evedrop: Evedrop) -> None:
 
 
 def test_a_host_that_is_not_known_is_said(evedrop: Evedrop) -> None:
-    """A name that does not resolve, for those who connect and for who listens."""
+    """A name that does not resolve, for processes that connect and for the one that listens."""
     briefs = written(evedrop, "--listen", "tls/nowhere.invalid:7447")
     for name in ("sensor", "observer", "router"):
         told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", "nowhere.invalid", "/etc/hosts")

@@ -88,7 +88,7 @@ def ended(network: Network, patience: float = 30.0) -> tuple[Conductor, float]:
 
 
 def test_everybody_is_told_once(network: Network) -> None:
-    """Who confirms the end is not told again, and says how many messages it dropped."""
+    """A process that confirms the end is not told again, and reports how many messages it dropped."""
     network.does["smart"] = lambda _: network.ends("smart", 3)
     one, _ = ended(network)
     assert network.told == dict.fromkeys(NAMES, 1)

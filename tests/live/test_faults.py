@@ -74,7 +74,7 @@ ROGUES = {
 
 @pytest.mark.parametrize("what", ROGUES)
 def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, what: str) -> None:
-    """Whoever notices, the sender is named, with what was wrong and the last lines of its log."""
+    """Whichever process notices it, the sender is named, with the mistake and the last lines of its log."""
     name, does, said = ROGUES[what]
     rogue = with_rogue(evedrop, name, does)
     live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "longest_outage=1", env=rogue)

@@ -198,7 +198,7 @@ def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
 
 
 def test_a_router_that_is_started_again_by_hand(tmp_path: Path) -> None:
-    """The same command once more, some seconds later, and the run goes on; all end with status 0."""
+    """The same command again, some seconds later: the run goes on, and all end with status 0."""
     _, scenario = scenario_in(tmp_path, slots=2000, pace=0.001)
     with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
         run.write()
@@ -251,7 +251,7 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: 
 
 @pytest.mark.parametrize("name", [pytest.param("controller", marks=long), "legitimate"])
 def test_a_loop_is_taken_up_where_it_was_cut(name: str, tmp_path: Path) -> None:
-    """Estimates and inputs that were lost on the way are said once more: nobody waits for ever, and no input changes."""
+    """Estimates and inputs that were lost on the way are sent again: no process waits for ever, and no input changes."""
     _, scenario = scenario_in(
         tmp_path, slots=800, pace=0.002, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true"
     )

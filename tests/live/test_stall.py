@@ -1,4 +1,4 @@
-"""Who a run that stands still waits for, and when that ends it; no clock but the test's own."""
+"""The process that a stalled run waits for, and when that ends the run; no clock but the test's own."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ RUNS = {
 
 @pytest.mark.parametrize("what", RUNS)
 def test_who_is_silent(what: str) -> None:
-    """The process at the end of the chain of those who wait for each other, whoever else is idle."""
+    """The process at the end of the chain of waiting processes, whichever others are idle."""
     places, answers, silent = RUNS[what]
     if "controller" in answers:
         places = {**places, "controller": 64}
@@ -201,7 +201,7 @@ def test_a_slow_process_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_slots_beyond_the_next_report_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who says to go on and on but never reports is silent all the same."""
+    """A process that says again and again that it goes on, but never reports, is silent all the same."""
     run = Run(20.0, monkeypatch)
     slot = 50
 

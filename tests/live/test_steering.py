@@ -260,7 +260,7 @@ def test_a_step_within_a_step_is_refused() -> None:
 
 
 def test_a_pause_ends_a_step() -> None:
-    """Who stepped is told how far it came; a hold where the step would have ended is passed over."""
+    """The operator who stepped is told how far the run came; a hold where the step would have ended is passed over."""
     run = Run()
     stepped = run.asks("step", slots=10)
     run.holds(20)
@@ -293,7 +293,7 @@ def test_a_step_beyond_the_end_ends_with_the_run() -> None:
 
 @pytest.mark.parametrize("do", ["pause", "link", "step"])
 def test_what_comes_after_the_last_slot_is_refused(do: str) -> None:
-    """The sensor has sent all slots and holds no more: whoever asked is told, and nothing has changed."""
+    """The sensor has sent all slots and does not hold again: the operator is told, and nothing has changed."""
     run = Run()
     asked = run.asks(do, reported=SLOTS - 3, event=SET, slots=2)
     run.steering.over(SLOTS, complete=True)

@@ -401,7 +401,7 @@ def test_names_that_are_not_utf_8_are_refused(evedrop: Evedrop) -> None:
 
 
 def test_two_runs_of_one_second_have_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever comes second gets a number; neither finds the other's folder."""
+    """The second one gets a number; neither finds the other's folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("time.strftime", lambda _: "20250101-000000")
     found = [claimed(default_folder("vehicle")) for _ in range(3)]

@@ -25,7 +25,7 @@ def closed_form(rho: float, p_r: float) -> bool:
 
 @pytest.mark.parametrize("mu_d", [0.56, 0.7, 0.8115, 0.8117, 0.9, 1.0])
 def test_infinite_variance_is_flagged_where_theory_says(mu_d: float, tmp_path: Path) -> None:
-    """In the paper's example up to μ_d = 0.8116 for μ = 0.9; for each link its own; never for who is misled."""
+    """In the paper's example up to μ_d = 0.8116 for μ = 0.9; for each link its own; never for a misled receiver."""
     plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
     summary = montecarlo(
         "numerical", slots=40, trials=20, encoding__state_probability=mu_d, plan=plan, out=tmp_path / "run"

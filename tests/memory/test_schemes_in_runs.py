@@ -119,7 +119,7 @@ def test_who_is_given_what(scheme: str) -> None:
 @pytest.mark.parametrize("scheme", RUNS)
 @pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
 def test_studies_of_events_refuse_what_they_cannot_follow(scheme: str, mode: Mode) -> None:
-    """Packets that are read, acknowledged or not sent, and whoever takes a masked or shifted packet for the state."""
+    """Packets that are read, acknowledged or not sent, and receivers that take a masked or shifted packet for the state."""
     alone = {"naive": {"strategy": "naive", "link": {"quality": 0.7}}}
     scenario = scenario_of(scheme, eavesdroppers=alone, event=[], **_unattacked(scheme))
     with pytest.raises(UsageError, match="follows events, not packets"):
@@ -204,7 +204,7 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
     ],
 )
 def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, attack: str) -> None:
-    """At no time the mean error of 3000 trials is 5 standard errors off, whoever jams."""
+    """At no time the mean error of 3000 trials is 5 standard errors off, whichever receiver jams."""
     jam = {"attack": attack, **({"jammer": "ref"} if attack == "critical" else {})}
     table = {"acknowledgements": {"link": {"quality": 0.9}, **jam}} if scheme in NEEDS else {}
     eavesdroppers = tables_of(scheme)["eavesdroppers"]
@@ -219,7 +219,7 @@ def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, 
 
 
 def test_whose_reference_is_kept_and_whose_is_lost() -> None:
-    """Who blocks the critical acknowledgements is expected to do as the legitimate estimator; who only listens is lost."""
+    """Blocking the critical acknowledgements is expected to be as good as being the legitimate estimator; listening is not."""
     eavesdroppers = {name: {"strategy": "reference", "link": {"quality": 0.8}} for name in ("ref", "listener")}
     scenario = scenario_of("acknowledged", event=[], eavesdroppers=eavesdroppers)
     found = expectations_of(scenario)
@@ -233,7 +233,7 @@ def test_whose_reference_is_kept_and_whose_is_lost() -> None:
 
 
 def test_a_betrayed_state_opens_twin_tracks(tmp_path: Path) -> None:
-    """Live as in memory: slots after it the spy errs by less than a millionth of who reads alike and is told nothing.
+    """Live as in memory: slots after it the spy's error is below a millionth of that of the same reader without the leak.
 
     Before it the two err alike, each behind a link of its own.
     """

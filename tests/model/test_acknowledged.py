@@ -179,7 +179,7 @@ def test_a_stable_code_makes_packets_independent_of_the_state() -> None:
 
 
 def test_information_on_a_stable_state_decays_at_the_open_loop_rate() -> None:
-    """Who knows J of x_t beyond Σ⁻¹ knows Bᵏᵀ J Bᵏ of x_{t+k}, B = Σ Aᵀ Σ⁻¹, even if it hears all packets since."""
+    """Information J on x_t beyond Σ⁻¹ is Bᵏᵀ J Bᵏ on x_{t+k}, B = Σ Aᵀ Σ⁻¹, even for a receiver of all packets since."""
     sigma, code = stationary_covariance(STABLE), ReferenceCode(STABLE)
     J = np.array([[40.0, 3.0], [3.0, 25.0]])
     n, steps = 2, 5

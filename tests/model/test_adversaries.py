@@ -138,9 +138,9 @@ def test_a_state_that_was_not_betrayed_is_missed() -> None:
 
 @pytest.mark.parametrize("reads_as", ["bayesian", "likelihood"])
 def test_one_betrayed_state_breaks_twin_tracks(reads_as: str) -> None:
-    """A fair coin sends x_k or its twin y_k of the same noise; whoever learns one state tells the tracks apart.
+    """A fair coin sends x_k or its twin y_k of the same noise; an eavesdropper that learns one state tells the tracks apart.
 
-    Who lacks coin and twin errs by half of tr A^k Σ0 Aᵏᵀ at least; who has learnt a state by less than a hundredth of it.
+    Without coin and twin its error is at least half of tr A^k Σ0 Aᵏᵀ; with one state known it is below a hundredth of that.
     """
     process, batch, learns_at = Process(np.eye(2), 1e-5 * np.eye(2), np.eye(2)), Batch(60, 400), 10
     trajectory, random = Trajectory(process, keys(1)["process"], batch), np.random.default_rng(3)

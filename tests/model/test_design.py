@@ -118,7 +118,7 @@ def test_perfect_secrecy_is_where_one_is_bounded_and_the_other_not(growth: float
         assert math.isfinite(limit_trace(process, smart(mu_e).outcomes(high + 1e-6)))
 
 
-def test_whoever_is_misled_is_kept_out_perfectly() -> None:
+def test_a_misled_receiver_is_kept_out_perfectly() -> None:
     """Naive and suspicious are unbounded on the whole admissible range; a suspicious one never misled is as smart."""
     for adversary in (NAIVE, Adversary("suspicious", 0.95, 0.8, 0.3)):
         found = design(EXAMPLE, 0.9, 0.6, [adversary], slots=80).eavesdroppers[adversary.name]

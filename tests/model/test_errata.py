@@ -181,7 +181,7 @@ def test_item_6_successive_packets_tell_types_apart() -> None:
 
 
 def test_item_6_size_of_the_leak() -> None:
-    """Whoever knows the schedule and uses the leak does better than smart, and not better than the user."""
+    """An eavesdropper that knows the schedule and uses the leak does better than smart, and not better than the user."""
     process = Process(A, Q, Q)
     for mu_d, values in ((0.9, (2.672e-4, 4.462e-4, 5.077e-4)), (0.7, (4.756e-4, 1.545e-3, 1.760e-3))):
         information, genie = np.linalg.inv(process.initial_covariance), (1 - MU) * process.initial_covariance

@@ -161,7 +161,7 @@ def test_bursts_that_last_too_long_have_no_limit(r: float) -> None:
 
 
 def test_a_perfect_link_has_no_error() -> None:
-    """Whoever gets every packet is exact for ever, however unstable the process; and has no tail."""
+    """A receiver of every packet is exact for ever, however unstable the process is, and has no tail."""
     chain = bursts(0.1, 0.3, 0.0, 0.0)
 
     def rarely(quality: float) -> Outcomes:

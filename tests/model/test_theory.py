@@ -240,7 +240,7 @@ def test_limits_are_where_long_runs_end(process: Process, mu: float, mu_d: float
 
 @given(processes(), st.floats(0.0, 1.0), st.floats(0.0, 0.999))
 @settings(deadline=None, max_examples=40)
-def test_whoever_is_misled_is_unbounded(process: Process, mu_d: float, loss: float) -> None:
+def test_a_misled_receiver_is_unbounded(process: Process, mu_d: float, loss: float) -> None:
     """Corollaries V.3 and V.4: with any chance of using an innovation the error diverges."""
     outcomes = Outcomes.eavesdropper(1.0 - loss, min(mu_d, 0.999), 1.0, 0.5)
     assert math.isinf(limit_trace(process, outcomes))
@@ -337,7 +337,7 @@ def test_misled_error_grows_in_proportion_to_the_state(b0: float, b1: float) -> 
 
 
 def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
-    """Why whoever is misled has no heavy tail: no sequence of events gives more than a fixed multiple of E tr P_k."""
+    """Why a misled receiver has no heavy tail: no sequence of events gives more than a fixed multiple of E tr P_k."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, 1, 1)
     expected = expected_traces(EXAMPLE, outcomes, 200)
     sigma = np.trace(state_covariances(EXAMPLE, 200), axis1=1, axis2=2)

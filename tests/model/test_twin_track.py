@@ -117,7 +117,7 @@ def test_the_bound_is_met_by_who_sees_both_tracks() -> None:
 
 
 def test_one_state_that_leaks_breaks_it() -> None:
-    """Who learns a single x_k tells the tracks apart in that slot, and by their distance in every other."""
+    """An eavesdropper that learns a single x_k tells the tracks apart in that slot, and by their distance in every other."""
     batch = Batch(10, 500)
     played = play(TwinTrack(UNSTABLE), batch, {"legitimate": np.ones((10, 500), bool)})
     on_twin = TwinTracks(UNSTABLE, KEYS, batch).on_twin(4)

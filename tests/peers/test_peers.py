@@ -140,7 +140,7 @@ class FakeSession:
         return lambda payload: self._stage.put.put((key, payload))
 
     def kept(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
-        """The same, kept to be sent once more."""
+        """The same, kept to be sent again."""
         self._stage.kept[key] = kept = ReplayBuffer(self.outlet(key), *how, **more)
         return kept
 
@@ -263,7 +263,7 @@ def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
 
 @pytest.mark.parametrize("name", ["legitimate", "smart"])
 def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
-    """Slots that come once more, marks too, and slots that come before the one that is due change nothing of its reports."""
+    """Slots that arrive again, barriers too, and slots before the one that is due do not change its reports."""
     brief = replace(briefs()[name], run="r")
     found = []
     good = deliveries()
@@ -309,7 +309,7 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
 
 @pytest.mark.parametrize("name", ["legitimate", "smart"])
 def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
-    """What the observer may not have joined yet can be sent once more, and nothing that is older; the last progress too."""
+    """Reports that the observer may not have joined yet can be sent again, and no older ones; the last progress too."""
     brief = replace(briefs()[name], run="r")
     stage.fill(RunKeys("r").downlink(name), deliveries())
     stage.commands.put(wire.control("end"))

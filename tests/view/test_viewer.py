@@ -98,7 +98,7 @@ def data_of(viewer: Viewer) -> str:
 
 
 def test_the_recording_is_at_a_secret_address_alone(viewer: Viewer, tmp_path: Path) -> None:
-    """Who has the address gets the file as it grows, to its end; who knows no more than the port gets nothing of it."""
+    """A reader with the address gets the file as it grows, to its end; one that knows only the port gets nothing of it."""
     data = data_of(viewer)
     with urllib.request.urlopen(data, timeout=LIMIT) as reply:  # noqa: S310 - the same; and there is no file yet
         assert reply.headers["Access-Control-Allow-Origin"] == "*"
@@ -313,7 +313,7 @@ def test_a_browser_gets_the_run(simulated: Callable[..., Simulated], viewer: Vie
 
 
 def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
-    """The page at the port that was asked for, the data at the next; whoever asks for the same place is refused."""
+    """The page at the port that was asked for, the data at the next; a second request for the same port is refused."""
     stand = WebAddress("127.0.0.1", free_port())
     viewer = Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
     try:

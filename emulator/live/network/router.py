@@ -345,11 +345,11 @@ class Routing:
     def _resend(self, message: Reader) -> None:
         """Begin a resend, which the conductor and the sensor announce in either order; wait for the conductor if need be."""
         number, done, start = read_resend(message, self._brief.slots)
-        anew = self._commands.anew(number)
-        if anew is None:  # the conductor has asked again since
+        command = self._commands.resend_of(number)
+        if command is None:  # the conductor has asked again since
             self._stale = True
             return
-        for name, changes in read_links(anew, self._courses, self._brief.slots).items():
+        for name, changes in read_links(command, self._courses, self._brief.slots).items():
             self._courses[name] = replace(self._courses[name], changes=changes)
         self._begin(start, done)
 

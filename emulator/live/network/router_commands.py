@@ -90,7 +90,7 @@ class Commands:
             if order is not None and order[0] == self._heeded:
                 return order[1]
 
-    def anew(self, number: int) -> Reader | None:
+    def resend_of(self, number: int) -> Reader | None:
         """Wait for the conductor's command for this round; None if the conductor has asked for a later one.
 
         Also None if it has ended the run meanwhile, or if no such command arrives within the patience.

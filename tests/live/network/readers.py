@@ -43,8 +43,8 @@ def _changed(command: Reader) -> Any:
 
 READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "packet": _on("uplink", lambda m: (packets.read_uplink(m, K, SHAPE), packets.read_beside(m, SHAPE, 1))),
-    "once more": _on("uplink", lambda m: packets.is_resend(m) and packets.read_resend(m, SLOTS)),
-    "mark": _on("uplink", lambda m: packets.is_barrier(m) and m.slot(K)),
+    "resend": _on("uplink", lambda m: packets.is_resend(m) and packets.read_resend(m, SLOTS)),
+    "barrier": _on("uplink", lambda m: packets.is_barrier(m) and m.slot(K)),
     "delivery": _on("downlink/eve", lambda m: packets.read_delivery(m, K, SHAPE, 1, WINDOW)),
     "acknowledgement": _on("ack/sent", lambda m: packets.read_acknowledgement(m, K, TRIALS)),
     "estimate": _on("estimate", lambda m: loop_wire.read_known(m, "x_hat", K, SHAPE)),
@@ -86,8 +86,8 @@ _late = (Late(3, Reception(_flags, _z, _header)),)
 _digests = {0: np.zeros((TRIALS, 32), np.uint8)}
 EXAMPLES: Mapping[str, bytes] = {
     "packet": packets.uplink(K, _z, _header, _flags, _z),
-    "once more": packets.resend(2, 6, 4),
-    "mark": packets.barrier(K),
+    "resend": packets.resend(2, 6, 4),
+    "barrier": packets.barrier(K),
     "delivery": packets.delivery(K, b"\5", _z[:, _flags].tobytes(), _late, packets.packed_header(_header, _flags), _z.tobytes()),
     "acknowledgement": packets.acknowledgement(K, _flags),
     "estimate": loop_wire.known("x_hat", K, _z),

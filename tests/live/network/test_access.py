@@ -65,7 +65,7 @@ def all_keys(stage: Bench) -> dict[str, str]:
 
 
 def wildcards(stage: Bench) -> list[str]:
-    """What an attacker would ask for who does not know the keys."""
+    """What an attacker would ask for without knowing the keys."""
     under = f"evedrop/{stage.keys.run}"
     kinds = ("downlink", "telemetry", "progress", "control", "alive")
     asked = ["**", "evedrop/**", "evedrop/*/uplink", "*/*/*", "*/*/*/*", f"{under}/**", f"{under}/*", f"{under}/*/*"]

@@ -158,7 +158,7 @@ SILENT = {
     "the router": ("eavesdroppers", "router", ROUTER.replace("SLOT", "300")),
     "the controller": ("microgrid", "controller", CONTROLLER.replace("SLOT", "120")),
 }  # fmt: skip
-"""Who is silent → in which scenario, its name, and how."""
+"""The silent process → its scenario, its name, and how it is silent."""
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def written(folder: Path) -> None:
 
 
 def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) -> None:
-    """Of a run's processes only the eavesdropper's imports it, and whoever asks it about itself knows neither seed nor brief."""
+    """Only the eavesdropper's process of a run imports it; the process that it is asked in knows neither seed nor brief."""
     assert all(find_spec(name) for name in OURS)
     written(evedrop.folder)
     command = ["-P", "-m", "evedrop"]  # as the script `evedrop` does, not looking for modules where it was typed

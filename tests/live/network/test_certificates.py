@@ -76,7 +76,7 @@ STRANGERS = {
 
 @pytest.mark.parametrize("who", STRANGERS)
 def test_a_certificate_that_is_not_of_this_run_opens_nothing(who: str, stage: Bench) -> None:
-    """With Eve's user and password but another certificate there is no session, even for who believes every router."""
+    """With Eve's user and password but another certificate there is no session, even for a client that trusts every router."""
     brief = stage.briefs[EVE]
     stranger = STRANGERS[who](brief)
     config = client_config(replace(brief, identity=stranger))
@@ -109,7 +109,7 @@ def test_without_a_certificate_there_is_no_session(protocol: str, stage: Bench) 
 
 @pytest.mark.parametrize(("user", "shown"), [(MALLORY, EVE), (EVE, MALLORY), ("observer", EVE)])
 def test_a_certificate_opens_nothing_under_another_user(user: str, shown: str, stage: Bench) -> None:
-    """Who has another's user and password, but the own certificate, hears nothing of theirs and puts nothing for them."""
+    """A process with another's user and password, but its own certificate, cannot read or write the other's keys."""
     thief = replace(stage.briefs[user], identity=stage.briefs[shown].identity)
     telemetry = stage.keys.telemetry(user if user != "observer" else EVE)
     with connect(thief) as attacker, connect(stage.briefs[user]) as rightful:

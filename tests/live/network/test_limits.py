@@ -99,7 +99,7 @@ def test_whatever_a_run_sends_fits(sizes: Sizes) -> None:
 
 
 def test_what_waits_is_bounded_by_sender() -> None:
-    """Who sends more than is ever under way is named when the reader comes to it; what others sent is not lost before."""
+    """A sender of more than a run can have under way is named when the reader comes to it; earlier messages are not lost."""
     mailbox = Mailbox({"eve": "evedrop/r/telemetry/eve", "sensor": "evedrop/r/telemetry/sensor"}, 10_000)
     for _ in range(3):
         mailbox.put("eve", bytes(2000))

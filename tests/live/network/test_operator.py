@@ -1,4 +1,4 @@
-"""Who may ask the observer and who may answer for it, with real sessions: the operator, and nobody but the observer.
+"""Questions to the observer, with real sessions: the operator alone may ask, and the observer alone may answer.
 
 As in test_access.py nothing waits for silence: a question that is answered proves that what came before it was dealt with.
 """
@@ -117,7 +117,7 @@ def test_a_stranger_gets_no_session(wrong: dict[str, str], stage: Bench) -> None
 
 
 def test_nobody_else_may_answer(stage: Bench) -> None:
-    """Whoever else offers to answer is never asked: neither beside the observer nor in its absence."""
+    """No other process that offers to answer is asked, with or without the observer."""
     feigned: list[str] = []
     sessions = [connect(stage.briefs[who]) for who in OTHERS] + [connect(operator(stage))]
     try:

@@ -227,7 +227,7 @@ def decode_leaving(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
     return {"k": k, "x_hat": belief.x_hat.tolist(), "P": belief.P.tolist()}
 
 
-def decode_mark(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+def decode_barrier(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As router and receivers read it."""
     message = wire.Reader(KEY, raw)
     assert packets.is_barrier(message)
@@ -322,8 +322,8 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw, SLOTS)},
     ),
     "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
-    "once more": (lambda _shape, value: packets.resend(value["n"], value["again"], value["k"]), decode_resend),
-    "mark": (lambda _shape, value: packets.barrier(value["k"]), decode_mark),
+    "resend": (lambda _shape, value: packets.resend(value["n"], value["again"], value["k"]), decode_resend),
+    "barrier": (lambda _shape, value: packets.barrier(value["k"]), decode_barrier),
     "held": (lambda _shape, value: telemetry.held(value["k"]), decode_held),
     "leaving": (encode_leaving, decode_leaving),
     "request": (lambda _shape, value: operator.Request(**value).pack(), decode_request),
@@ -456,7 +456,7 @@ def test_digest() -> None:
 
 
 def test_table_of_keys_is_the_access_table() -> None:
-    """Who writes and reads which key, as the document's table says it and as the router grants it."""
+    """The writer and the reader of each key, as the document's table has them and as the router grants them."""
     receivers = ("legitimate", "eve")
     prefix = f"evedrop/{'r'}/"
     documented: dict[tuple[str, str], set[str]] = {}

@@ -62,7 +62,7 @@ def test_a_late_round_does_not_announce_what_is_forgotten() -> None:
 
 @pytest.mark.parametrize("k", [0, 5])
 def test_the_last_message_is_sent_in_any_case(k: int) -> None:
-    """Who has all of them hears that the sender is there."""
+    """A reader that has all of them hears that the sender is there."""
     sent: list[bytes] = []
     kept = ReplayBuffer(sent.append)
     kept(k, slot_message(k))

@@ -49,7 +49,7 @@ def flow(stage: Bench) -> None:
 
 
 def test_everything_that_is_granted_crosses(stage: Bench) -> None:
-    """Packets and deliveries, progress back to the sensor, commands to both sites, telemetry of both: whoever is where."""
+    """Packets and deliveries, progress back to the sensor, commands to both sites, telemetry of both."""
     for _ in range(8):
         flow(stage)
     assert wire.Reader(*stage.journal.hear()).integer("c") == 8
@@ -125,7 +125,7 @@ def test_who_belongs_to_the_relay_is_not_let_in_at_the_router(who: str, stage: B
 
 
 def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
-    """Who connects to the relay with the router's Zenoh id, which it may have learnt, is not taken for it."""
+    """A process that connects to the relay with the router's Zenoh id, which it may have learnt, is not taken for the router."""
     eve: Brief = stage.briefs[EVE]
     config = {**client_config(eve), "id": stage.briefs["router"].part["zid"], "mode": "router"}
     stolen = Ear()

@@ -169,7 +169,7 @@ def test_without_secret_nobody_has_its_keys() -> None:
 
 
 def test_keys_agree_between_those_who_share_them() -> None:
-    """Whoever holds a stream holds the same key; different streams have different keys."""
+    """All processes with a stream have the same key; different streams have different keys."""
     briefs = made(scenario_of())
     for stream in ("schedule", "noise"):
         assert len({brief.keys[stream] for brief in briefs.values() if stream in brief.keys}) == 1
@@ -236,7 +236,7 @@ OPTIONAL = {
 }
 """Entries that a brief may leave out, or whose meaning another one gives."""
 WITHIN = ("part.scenario", "part.assignment.parameters", "part.parameters", "part.scheme", "model.A", "model.Q")
-"""Tables whose entries are those of the scenario, looked at by whoever makes something of them, and matrices."""
+"""Tables with entries of the scenario, which their readers check, and matrices."""
 KINDS = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart")
 
 
