@@ -1,7 +1,11 @@
-"""Handles Ctrl-C, SIGTERM and SIGHUP in a command that has begun its work: by an event, an exception, or at once."""
+"""Handles Ctrl-C, SIGTERM and SIGHUP in a command that has begun its work: by an event, an exception, or at once.
+
+The first signal counts: while the block that it ends is left in order, further ones are ignored.
+"""
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import threading
@@ -11,14 +15,12 @@ from types import FrameType
 
 from evedrop.interrupts import INTERRUPTED, SIGNALS, heeded, leave
 
-_Handler = Callable[[int, FrameType | None], object]
-
-
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread."""
     stop = threading.Event()
-    with _handled(lambda *_: stop.set()):
+    # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
+    with _handled(lambda: _thread.start_new_thread(stop.set, ())):
         yield stop
 
 
@@ -26,7 +28,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 def raise_on_signals() -> Iterator[None]:
     """Make Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt while the block runs, so that its files are removed."""
 
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
+    def interrupt() -> None:
         raise KeyboardInterrupt
 
     with _handled(interrupt):
@@ -47,12 +49,20 @@ def held_back() -> Iterator[None]:
 
 
 @contextmanager
-def _handled(handler: _Handler) -> Iterator[None]:
+def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
+        interrupt()
+
     # Signals ignored from the start stay ignored: by nohup, and the interrupts of a background job.
-    before = {number: signal.signal(number, handler) for number in heeded()}
+    before = {number: signal.getsignal(number) for number in heeded()}
+    for number in before:
+        signal.signal(number, handler)
     try:
         yield
     finally:

@@ -169,7 +169,7 @@ from evedrop.interrupts import heed_signals
 heed_signals()
 import resource, sys
 from pathlib import Path
-from evedrop.cli.main import main
+from evedrop.__main__ import program
 from evedrop.cli.report import ProgressLine
 
 show, news, largest = ProgressLine.tell, Path(sys.argv[1]), int(sys.argv[2])
@@ -182,7 +182,8 @@ def tell(line, told):
     show(line, told)
 
 ProgressLine.tell = tell
-raise SystemExit(main(sys.argv[3:]))
+sys.argv[1:] = sys.argv[3:]
+program()
 """
 """The command as it is, which besides writes what its progress line would show; and whose files may be limited in size."""
 

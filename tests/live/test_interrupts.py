@@ -80,7 +80,7 @@ REST = [
     if (command, moment, number) not in QUICK
     and (moment != "finish" or command == "short run")
     and (moment not in {"child", "disk"} or command in {"run", "short run"})
-    and (moment != "folder" or command not in {"test"})
+    and (moment not in {"folder", "done"} or command != "test")  # it has neither results nor a progress line
 ]
 
 

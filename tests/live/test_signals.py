@@ -16,17 +16,28 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         with stop_on_signals() as stop:
             signal.raise_signal(number)
-            assert stop.is_set()
+            assert stop.wait(60)
     code = (
         "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "from evedrop.signals import stop_on_signals\n"
         "with stop_on_signals() as stop:\n"
-        "    signal.raise_signal(signal.SIGHUP)\n    print(stop.is_set())\n"
-        "    signal.raise_signal(signal.SIGTERM)\n    print(stop.is_set())\n"
+        "    signal.raise_signal(signal.SIGHUP)\n    print(stop.wait(0.5))\n"
+        "    signal.raise_signal(signal.SIGTERM)\n    print(stop.wait(60))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.split() == ["False", "True"]
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_signal_may_come_while_the_lock_of_the_event_is_held() -> None:
+    """The main thread is stopped inside `Event.wait`: it must not wait for itself, and a hundred signals are as good as one."""
+    before = signal.getsignal(signal.SIGINT)
+    with stop_on_signals() as stop:
+        with stop._cond:  # type: ignore[attr-defined]
+            for _ in range(100):
+                signal.raise_signal(signal.SIGINT)
+        assert stop.wait(60)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:

@@ -42,9 +42,13 @@ def kill_all(live: Live) -> None:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process holds nothing any more: on its way out its memory goes first, then its files, then it is a zombie."""
+    """Whether a process holds nothing any more.
+
+    A thread that ends lets go of its files before it is a zombie; the first thread may be one while others still hold them.
+    """
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in {"Z", "X"}
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return state in {"Z", "X"} and len(os.listdir(f"/proc/{pid}/task")) <= 1
     except OSError:
         return True
 
