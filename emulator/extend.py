@@ -1,4 +1,4 @@
-"""The names that authors of schemes, eavesdroppers, loss models, delay models and controllers import.
+"""The names that authors of schemes, eavesdroppers, loss models, delay models, controllers and applications import.
 
 A plug-in needs nothing else of Evedrop. Whatever is here keeps its name and its meaning within a major version.
 
@@ -6,6 +6,9 @@ Source: docs/your-own.md.
 """
 
 from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from evedrop.kernels import elementary
 from evedrop.model import update
@@ -25,8 +28,21 @@ from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme,
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.streams import Batch, BlockReader
 
+if TYPE_CHECKING:
+    from evedrop.scenario.application import (
+        Application,
+        ApplicationTally,
+        ControlledPlant,
+        Panel,
+        PanelCurve,
+        PanelFeed,
+    )
+    from evedrop.scenario.table import Table
+
 __all__ = [
     "Action",
+    "Application",
+    "ApplicationTally",
     "Batch",
     "Belief",
     "Bernoulli",
@@ -34,6 +50,7 @@ __all__ = [
     "Chain",
     "Codes",
     "ConstantDelay",
+    "ControlledPlant",
     "Controller",
     "DelayModel",
     "Eavesdropper",
@@ -51,6 +68,9 @@ __all__ = [
     "Packet",
     "PacketReader",
     "PacketTaker",
+    "Panel",
+    "PanelCurve",
+    "PanelFeed",
     "Plain",
     "PlainEncoder",
     "PlainEstimator",
@@ -59,6 +79,7 @@ __all__ = [
     "Reception",
     "Scheme",
     "Shared",
+    "Table",
     "elementary",
     "fates_of",
     "prior",
@@ -66,3 +87,15 @@ __all__ = [
     "trace_of",
     "update",
 ]
+
+_LATER = dict.fromkeys(
+    ("Application", "ApplicationTally", "ControlledPlant", "Panel", "PanelCurve", "PanelFeed"),
+    "evedrop.scenario.application",
+) | {"Table": "evedrop.scenario.table"}
+"""Imported when used: pydantic, which checks tables, would slow down a receiver that uses a class of its own."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LATER[name]), name)

@@ -24,6 +24,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from evedrop.scenario.application import applications_in
 from evedrop.score.expectations_held import format_expectation
 
 if TYPE_CHECKING:
@@ -185,8 +186,9 @@ def print_summary(summary: News, folder: str, replay: str | None = None) -> None
                 f"{name}: its error has infinite variance, so the mean over trials says nothing; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
-    for line in household_lines(summary["household"]):
-        console.print(line)
+    for name, application in applications_in(summary).items():
+        for line in application.lines(summary[name]):
+            console.print(line)
     for expectation in summary["expectations"]:
         console.print(format_expectation(expectation))
         if "replay" in expectation:
@@ -211,29 +213,6 @@ def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
                 f"the link of {name} let {link['rate']:.5g} of its packets through; its model predicts "
                 f"{link['expected_rate']:.5g}, and for this run an interval of {low:.5g} to {high:.5g}"
             )
-
-
-def household_lines(house: Mapping[str, Any] | None) -> list[str]:
-    """The lines about a house: energy bought and sold, the cost of secrecy and losses, and what activity receivers detect."""
-    if house is None:
-        return []
-    seen = house["knowing_truth"]
-    lines = [
-        f"the house buys {_figure(house['bought_energy'], '.3f')} kWh and sells {_figure(house['sold_energy'], '.3f')} kWh; a "
-        f"controller that sees the truth, {_figure(seen['bought_energy'], '.3f')} and {_figure(seen['sold_energy'], '.3f')} kWh"
-    ]
-    shares = [house[f"{name}_difference"] for name in ("net", "total", "summed")]
-    if None not in shares:
-        net, total, summed = (f"{100 * share:.2g} %" for share in shares)
-        lines.append(
-            f"grid power differs from that controller's by {net} in net energy, {total} in total, {summed} summed slot by slot"
-        )
-    areas = {name: one["activity_area"] for name, one in house["receivers"].items()}
-    if None not in areas.values():
-        told = ", ".join(f"{name} {area:.3f}" for name, area in areas.items())
-        windows = f"{house['active_windows']} active windows of {house['windows']}"
-        lines.append(f"detection of the {windows} (1 is certainty, 0.5 is guessing): {told}")
-    return lines
 
 
 def _loop_line(controller: News) -> str:

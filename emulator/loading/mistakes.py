@@ -25,11 +25,11 @@ from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.across import acknowledgement_mistakes, away_in, event_mistakes, link_mistakes
+from evedrop.scenario.application import APPLICATIONS, application_mistakes, applications_in
 from evedrop.scenario.closed_loop import loop_mistakes
 from evedrop.scenario.events import EventTable
 from evedrop.scenario.expect import Around, ExpectTable
 from evedrop.scenario.filter_noise import filter_mistakes
-from evedrop.scenario.household import HOUSEHOLD, HouseholdTable, household_mistakes
 from evedrop.scenario.link_table import CorrelationTable, LinkTable
 from evedrop.scenario.nemesis import NEMESIS, NemesisTable, nemesis_mistakes
 from evedrop.scenario.plant import ControllerTable, PlantTable
@@ -85,6 +85,8 @@ def _sentence(detail: ErrorDetails, root: type[BaseModel]) -> str:
     if kind == "extra_forbidden":
         fields = table.model_fields if table is not None else {}
         known = [field.alias or known for known, field in fields.items() if known != "made_with"]
+        if table is Scenario:
+            known += APPLICATIONS.names
         return no_entry(name, known)
     if kind == "expected":
         said = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
@@ -119,7 +121,6 @@ def _field(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[B
         "acknowledgements": AcknowledgementsTable,
         "plant": PlantTable,
         "controller": ControllerTable,
-        "household": HouseholdTable,
         NEMESIS: NemesisTable,
     }
     for i, part in enumerate(location):
@@ -127,6 +128,8 @@ def _field(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[B
             field = table.model_fields[str(part)]
             if part in inner and i < len(location) - 1:
                 table, field = inner[str(part)], None
+        elif table is Scenario and i < len(location) - 1 and part in APPLICATIONS:
+            table = APPLICATIONS[str(part)].table
         elif i == len(location) - 1:
             field = None
     return table, field
@@ -154,7 +157,8 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         found += _strategy_mistakes(tables, slots)
     found += acknowledgement_mistakes(tables)
     found += loop_mistakes(tables)
-    found += household_mistakes(tables)
+    applications = applications_in(tables, Scenario.model_fields)
+    found += application_mistakes(applications, tables)
     found += filter_mistakes(tables)
     links = _links(tables)
     found += link_mistakes(tables, links)
@@ -179,7 +183,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
             lambda name: _no_theory(
                 name, tables.get(LEGITIMATE) if name == LEGITIMATE else eavesdroppers[name], encoding, sound
             ),
-            isinstance(tables.get(HOUSEHOLD), dict),
+            applications,
         )
         for i, expectation in enumerate(expectations):
             if isinstance(expectation, dict):

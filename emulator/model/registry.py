@@ -135,7 +135,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
                 f"{said}, which lacks {', '.join(lacking)}; expected a class with "
                 f"{'these methods' if len(lacking) > 1 else 'this method'}, as {self.base.__name__} describes them",
             )
-        parameters = getattr(found, "parameters", None)
+        parameters = getattr(found, "parameters", {})
         if not isinstance(parameters, Mapping) or not all(isinstance(one, str) for one in parameters):
             raise NotRegistered(
                 name,

@@ -9,14 +9,12 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from evedrop.scenario.household import FIGURES as HOUSE_FIGURES
-from evedrop.scenario.household import HOUSEHOLD
-from evedrop.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
+from evedrop.scenario.application import APPLICATIONS, Application
 from evedrop.scenario.table import Found, Number, Table, expected, one_of
 from evedrop.scenario.words import as_toml, listed
 
@@ -163,10 +161,6 @@ def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
     return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
 
 
-def _of_house(figure: str) -> bool:
-    return figure.startswith(f"{HOUSEHOLD}.")
-
-
 def _nothing(table: Mapping[str, Any]) -> list[Found]:
     del table
     return []
@@ -195,16 +189,11 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
         return found
     link = link_figure(figure)
     for name in ("slots", "quantile"):
-        if _of_house(figure) and table.get(name) is not None:
-            found.append(
-                (name, "is set, but a house's figures are means over trials of the whole run; remove the line")
-            )
         if link is not None and table.get(name) is not None:
             instead = f"expected none, or the figure {link[0]}.received_fraction"
             found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
     if (
         link is None
-        and not _of_house(figure)
         and table.get("quantile") is not None
         and figure.rpartition(".")[2] in set(FIGURES) - set(TRIAL_FIGURES)
     ):
@@ -244,8 +233,8 @@ class Around:
     trials: int | None
     no_theory: Callable[[str], str | None]
     """Why there is no theory for a receiver; None if there is."""
-    house: bool = False
-    """Whether the plant is a house."""
+    applications: Mapping[str, type[Application]] = field(default_factory=dict)
+    """Those whose tables the scenario has."""
 
     def mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
         """Unknown receivers and figures, slots beyond the run, and quantiles of too few trials."""
@@ -253,6 +242,12 @@ class Around:
         figure = expectation.get("figure")
         if isinstance(figure, str):
             found += self._figure_mistakes(figure)
+            application = figure.partition(".")[0]
+            if application in self.applications:
+                mean = (
+                    f"is set, but the {application}'s figures are means over trials of the whole run; remove the line"
+                )
+                found += [(name, mean) for name in ("slots", "quantile") if expectation.get(name) is not None]
         names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
         for entry, known in names.items():
             name = expectation.get(entry)
@@ -267,28 +262,32 @@ class Around:
             return []
         own = [f"{receiver}.{name}" for receiver in self.receivers for name in FIGURES]
         links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
-        of_house = [
-            *(f"{HOUSEHOLD}.{name}" for name in HOUSE_FIGURES),
-            *(f"{HOUSEHOLD}.{receiver}.{name}" for receiver in self.receivers for name in HOUSE_RECEIVER_FIGURES),
-        ]
-        if figure in links or (self.house and figure in of_house):
-            return []
-        if _of_house(figure):
-            known = f"expected {HOUSEHOLD}.FIGURE ({', '.join(HOUSE_FIGURES)}) or {HOUSEHOLD}.RECEIVER.FIGURE"
-            what = f"{known} ({', '.join(HOUSE_RECEIVER_FIGURES)}){_near(figure, of_house)}"
-            if not self.house:
-                what = f"but there is no house; expected a table [{HOUSEHOLD}], or another figure"
-            return [("figure", f"is {as_toml(figure)}; {what}" if self.house else f"is {as_toml(figure)}, {what}")]
-        if figure not in own:
+        first = figure.partition(".")[0]
+        if first not in self.receivers and first in APPLICATIONS:
+            return self._application_mistakes(figure, APPLICATIONS[first])
+        if figure not in [*own, *links]:
             names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(FIGURES)})"
             of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
             hint = _near(figure, [*own, *links])
             return [("figure", f"is {as_toml(figure)}; expected {names} or {of_links}{hint}")]
-        receiver, _, name = figure.partition(".")
-        why = self.no_theory(receiver) if name == "expected_trace_covariance" else None
+        name = figure.rpartition(".")[2]
+        why = self.no_theory(first) if name == "expected_trace_covariance" else None
         if why is not None:
             return [("figure", f"is {as_toml(figure)}, but {why}; expected another figure")]
         return []
+
+    def _application_mistakes(self, figure: str, application: type[Application]) -> list[Found]:
+        name, own, of_receivers = application.name, application.figures, application.receiver_figures
+        if name not in self.applications:
+            wanted = f"expected a table [{name}], or another figure"
+            return [("figure", f"is {as_toml(figure)}, but there is no {name}; {wanted}")]
+        known = [f"{name}.{one}" for one in own]
+        known += [f"{name}.{receiver}.{one}" for receiver in self.receivers for one in of_receivers]
+        if figure in known:
+            return []
+        choice = [f"{name}.FIGURE ({', '.join(own)})"] if own else []
+        choice += [f"{name}.RECEIVER.FIGURE ({', '.join(of_receivers)})"] if of_receivers else []
+        return [("figure", f"is {as_toml(figure)}; expected {' or '.join(choice)}{_near(figure, known)}")]
 
     def _slot_mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
         if self.slots is None:

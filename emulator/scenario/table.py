@@ -108,7 +108,7 @@ class Table(BaseModel):
         except ValidationError as error:
             if not together:
                 raise
-            lines = [_again(detail) for detail in error.errors(include_url=False)]
+            lines = [again(detail) for detail in error.errors(include_url=False)]
             lines.append(InitErrorDetails(type=mistakes, input=found))
             raise ValidationError.from_exception_data(cls.__name__, lines) from None
         if together:
@@ -116,11 +116,11 @@ class Table(BaseModel):
         return table
 
 
-def _again(detail: ErrorDetails) -> InitErrorDetails:
-    """An error that was reported already, made ready to be reported with others."""
+def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:
+    """An error that was reported already, made ready to be reported with others; above: the entries that contain its table."""
     kind, context = detail["type"], detail.get("ctx", {})
     own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
-    return InitErrorDetails(type=own, loc=detail["loc"], input=detail["input"], ctx=context)
+    return InitErrorDetails(type=own, loc=(*above, *detail["loc"]), input=detail["input"], ctx=context)
 
 
 def numbers(rows: Any) -> bool:

@@ -8,9 +8,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails
 
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import Assignment
@@ -21,14 +33,14 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
+from evedrop.scenario.application import applications_in
 from evedrop.scenario.events import EventTable
 from evedrop.scenario.expect import ExpectTable
-from evedrop.scenario.household import HouseholdTable
 from evedrop.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
 from evedrop.scenario.nemesis import NemesisTable
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.table import Found, Probability, ProcessName, Table, one_of, registered
+from evedrop.scenario.table import Found, Probability, ProcessName, Table, again, one_of, registered
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.words import as_toml, listed, no_entry
@@ -226,9 +238,6 @@ class Scenario(Table):
     ] = Field(default_factory=dict)
     plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
-    household: Annotated[
-        HouseholdTable | None, Field(examples=[{"grid": "P_grid", "load": "P_load", "battery": "SOC"}])
-    ] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
     network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
     event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
@@ -241,6 +250,45 @@ class Scenario(Table):
         list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
     ] = Field(default_factory=list)
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
+    _applications: dict[str, Table] = PrivateAttr(default_factory=dict)
+
+    @property
+    def applications(self) -> Mapping[str, Table]:
+        """Application → its table, for those that the scenario uses."""
+        return self._applications
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _with_applications(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        """Check the tables of applications beside the fields, so that a mistake in either hides none in the other."""
+        if not isinstance(found, Mapping):
+            return check(found)
+        applications = applications_in(found, cls.model_fields)
+        made: dict[str, Table] = {}
+        mistakes: list[InitErrorDetails] = []
+        for name, application in applications.items():
+            try:
+                made[name] = application.table.model_validate(found[name])
+            except ValidationError as error:
+                mistakes += [again(detail, name) for detail in error.errors(include_url=False)]
+        scenario = None
+        try:
+            scenario = check({name: value for name, value in found.items() if name not in applications})
+        except ValidationError as error:
+            mistakes = [again(detail) for detail in error.errors(include_url=False)] + mistakes
+        if scenario is None or mistakes:
+            raise ValidationError.from_exception_data(cls.__name__, mistakes)
+        scenario._applications = made
+        return scenario
+
+    @model_serializer(mode="wrap")
+    def _beside_applications(self, handler: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
+        tables: dict[str, Any] = handler(self)
+        for name, table in self._applications.items():
+            tables[name] = table.model_dump(
+                mode=info.mode, exclude_none=info.exclude_none, exclude_unset=info.exclude_unset
+            )
+        return tables
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:

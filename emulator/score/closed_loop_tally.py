@@ -18,7 +18,8 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
-from evedrop.score.household_tally import HouseholdTally
+from evedrop.scenario.application import APPLICATIONS, ApplicationTally
+from evedrop.scenario.controlled import controlled_plant
 from evedrop.score.slots import InputSlots
 
 ESTIMATORS = ("ignoring_input", "knowing_input")
@@ -89,25 +90,27 @@ class LoopTally:
         self.clipped = 0
         """Trial-slots in which the plant clipped an input."""
         self.other_error = 0.0
-        self.household: HouseholdTally | None = None
-        """For a plant that is a house."""
+        self.applications: dict[str, ApplicationTally] = {}
+        """Application → its totals, for those that the scenario uses."""
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> LoopTally | None:
         """The totals of some trials of a scenario; None without a controller."""
-        if scenario.driven is None or scenario.controller is None:
+        loop = controlled_plant(scenario)
+        if loop is None:
             return None
         comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
-        process = scenario.process.process
-        tally = cls(process, scenario.driven, trials, scenario.legitimate.knows_input, comparable)
-        tally.household = HouseholdTally.of(scenario, trials)
+        tally = cls(loop.process, loop.plant, trials, scenario.legitimate.knows_input, comparable)
+        tally.applications = {
+            name: APPLICATIONS[name].tally(loop, table, trials) for name, table in scenario.applications.items()
+        }
         return tally
 
     def add(self, acted: Acted) -> None:
         """Add the next slots."""
         inputs = acted.inputs
-        if self.household is not None:
-            self.household.add(acted.true, inputs.u, acted.estimates)
+        for application in self.applications.values():
+            application.add(acted.true, inputs.u, acted.estimates)
         self.slots += inputs.failed.size
         self.failed += int(np.count_nonzero(inputs.failed))
         self.clipped += int(np.count_nonzero(self._plant.clips(inputs.u)))
@@ -131,7 +134,10 @@ class LoopTally:
             whole.failed += part.failed
             whole.clipped += part.clipped
             whole.other_error += part.other_error
-        whole.household = HouseholdTally.merged([part.household for part in known])
+        whole.applications = {
+            name: type(one).merged([part.applications[name] for part in known])
+            for name, one in known[0].applications.items()
+        }
         return whole
 
     def summary(

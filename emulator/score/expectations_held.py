@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from evedrop.expected.expectations import Expectation
 from evedrop.scenario import ExpectTable, Scenario, link_figure
-from evedrop.scenario.household import HOUSEHOLD
+from evedrop.scenario.application import APPLICATIONS
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched import watch_of
@@ -59,8 +59,8 @@ class Evidence:
     tallies: Mapping[str, Tally]
     theory: Mapping[str, Expectation]
     secrecy: Mapping[str, Secrecy]
-    household: Mapping[str, Any] | None = None
-    """As in the summary."""
+    applications: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Application → its entry of the summary."""
 
     def judged(self, replay: str | None) -> list[dict[str, Any]]:
         """Every expectation of the scenario as in the summary; `replay` is the command that reproduces a failure."""
@@ -75,8 +75,10 @@ class Evidence:
     def _figure(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         name = str(expect.figure)
         link = link_figure(name)
-        if name.startswith(f"{HOUSEHOLD}."):
-            found = self._of_household(*name.split(".")[1:])
+        application, *path = name.split(".")
+        if application in self.scenario.applications:
+            summary = self.applications.get(application)
+            found = None if summary is None else APPLICATIONS[application].figure(summary, path)
         else:
             found = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
         return found, None if found is None else expect.holds(found)
@@ -86,15 +88,6 @@ class Evidence:
         for part in path:
             inner = inner.get(part) if isinstance(inner, Mapping) else None
         return inner if isinstance(inner, (int, float)) else None
-
-    def _of_household(self, figure: str, of_receiver: str | None = None) -> float | None:
-        """A figure of the house, or of what a receiver can infer about it (the first of two parts); None if there is none."""
-        if self.household is None:
-            return None
-        found: float | None = (
-            self.household[figure] if of_receiver is None else self.household["receivers"][figure][of_receiver]
-        )
-        return found
 
     def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:
         """A figure of the whole run or of some slots, or a quantile of it over trials."""

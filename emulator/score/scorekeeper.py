@@ -128,11 +128,11 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     if ending.mode == "covariance-only":
         for peer in peers.values():
             peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
-    household = None if loop is None or loop.household is None else loop.household.summary()
+    applications = {} if loop is None else {name: one.summary() for name, one in loop.applications.items()}
     user = tallies[LEGITIMATE]
     links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
-    evidence = Evidence(scenario, peers, links, tallies, expected, secret, household)
+    evidence = Evidence(scenario, peers, links, tallies, expected, secret, applications)
     return {
         "scenario": scenario.title,
         "mode": ending.mode,
@@ -155,7 +155,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         if loop is None
         else loop.summary(scenario, peers[LEGITIMATE], totals.solve_times, digests[CONTROLLER]),
         "filter": None if totals.filter is None else totals.filter.summary(scenario),
-        "household": household,
+        **applications,
         "surprising": _surprising(scenario, tallies),
         "expectations": evidence.judged(ending.replay),
     }

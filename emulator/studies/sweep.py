@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,7 @@ from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
 from evedrop.scenario import FIGURES, Scenario
-from evedrop.scenario.household import FIGURES as HOUSE_FIGURES
-from evedrop.scenario.household import RECEIVER_FIGURES as HOUSE_RECEIVER_FIGURES
+from evedrop.scenario.application import APPLICATIONS
 from evedrop.score.scorekeeper import Ending
 from evedrop.signals import stop_on_signals
 
@@ -125,7 +124,8 @@ def sweep_over(
                 shutil.rmtree(folder)
                 raise failure or Interrupted("interrupted before a point was done; nothing was kept")
             table = _write_table(folder, rows)
-            _draw(folder, table, grid)
+            used = dict.fromkeys(name for _, scenario in scenarios for name in scenario.applications)
+            _draw(folder, table, grid, used)
     if failure is not None:
         raise failure
     if done < len(scenarios):
@@ -142,14 +142,12 @@ def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
     return table
 
 
-def _draw(folder: Path, table: pa.Table, grid: Grid) -> None:
+def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]) -> None:
     from evedrop.view.sweep_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
 
     draw(private_pictures(folder / "sweep"), table, tuple(grid))
-    if HOUSE_FIGURES[0] in table.column_names:
-        from evedrop.view.household_sweep_picture import draw as draw_household  # noqa: PLC0415 - as above
-
-        draw_household(private_pictures(folder / "household"), table, next(iter(grid)))
+    for name in applications:
+        APPLICATIONS[name].draw_sweep(private_pictures(folder / name), table, next(iter(grid)))
 
 
 def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:
@@ -179,14 +177,6 @@ def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: P
     return found
 
 
-def _of_household(house: Mapping[str, Any] | None, name: str) -> dict[str, float | None]:
-    """The figures of a house, and those of one receiver's detection of activity, if the plant is a house."""
-    if house is None:
-        return {}
-    told = house["receivers"][name]
-    return {**{figure: house[figure] for figure in HOUSE_FIGURES}, **{one: told[one] for one in HOUSE_RECEIVER_FIGURES}}
-
-
 def _rows(point: Point, scenario: Scenario, summary: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """A row for each peer: the point, the figures, the verdict."""
     for name, peer in summary["peers"].items():
@@ -200,7 +190,11 @@ def _rows(point: Point, scenario: Scenario, summary: Mapping[str, Any]) -> Itera
             "mean_actual_trace_covariance": peer.get("mean_actual_trace_covariance"),
             **{f"error_quantile_{level}": value for level, value in (peer["error_quantiles"] or {}).items()},
             "infinite_variance": peer["infinite_variance"],
-            **_of_household(summary["household"], name),
+            **{
+                column: value
+                for application in scenario.applications
+                for column, value in APPLICATIONS[application].sweep_columns(summary[application], name).items()
+            },
             "relative_secrecy": verdict.get("relative"),
             "perfect_secrecy": verdict.get("perfect"),
             "digest": peer["digest"],

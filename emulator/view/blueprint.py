@@ -43,14 +43,14 @@ def _driven(scene: Scene) -> rrb.Container:
         ),
         zoom_lock=True,
     )
-    found, guessed = driven.panels(scene, whole), driven.guessed(scene, whole)
+    found, beliefs = driven.panels(scene, whole), driven.beliefs(scene, whole)
     left = rrb.Vertical(*found, row_shares=[1.3, *[1.0] * (len(found) - 1)])
     right = rrb.Vertical(
-        *guessed,
-        _curves("Squared error |x − x̂|²   log10", [paths.ERROR], whole, legend=not guessed),
+        *beliefs,
+        _curves("Squared error |x − x̂|²   log10", [paths.ERROR], whole, legend=not beliefs),
         rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=paths.PACKETS, time_view=_axis(scene)),
         _events(),
-        row_shares=[*[1.2] * len(guessed), 1.0, 0.4 + 0.22 * len(scene.receivers), 0.7],
+        row_shares=[*[1.2] * len(beliefs), 1.0, 0.4 + 0.22 * len(scene.receivers), 0.7],
     )
     return rrb.Horizontal(left, right, column_shares=[1.2, 1.0])
 

@@ -1,4 +1,4 @@
-"""A plant with a controller in the view: inputs and disturbances, true and estimated levels, and a house's energies.
+"""A plant with a controller in the view: inputs and disturbances, true and estimated levels, and the panels of applications.
 
 Source: docs/view.md.
 """
@@ -15,6 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from evedrop.scenario.application import Panel
 from evedrop.view import paths
 from evedrop.view.column import Column, scalars
 from evedrop.view.palette import TRUTH_CURVE, Colour, colour
@@ -22,20 +23,19 @@ from evedrop.view.scene import Moved, Scene, SceneSlots
 
 _MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
 _MOVING: tuple[Colour, ...] = (
-    (226, 178, 40),  # the first disturbance, of a house the sun
+    (226, 178, 40),
     (222, 92, 82),
     (80, 150, 235),
     (60, 180, 120),
     (170, 120, 230),
     (140, 140, 140),
 )
-BOUGHT: Colour = (222, 92, 82)
-SOLD: Colour = (60, 180, 120)
 
 
 def columns(scene: Scene, k: NDArray[np.int64], slots: SceneSlots, moved: Moved) -> Iterator[Column]:
     """The columns of some slots k."""
-    at = np.flatnonzero(k % math.ceil(scene.slots / _MOST_POINTS) == 0)
+    every = math.ceil(scene.slots / _MOST_POINTS)
+    at = np.flatnonzero(k % every == 0)
     if len(at):
         for label, values in zip(scene.moving, moved.values.T, strict=True):
             yield scalars(_moving(label), k[at], values[at])
@@ -43,15 +43,13 @@ def columns(scene: Scene, k: NDArray[np.int64], slots: SceneSlots, moved: Moved)
             yield scalars(_level(i, paths.TRUTH), k[at], slots.x[at, i])
             for name, peer in slots.peers.items():
                 yield scalars(_level(i, name), k[at], peer.x_hat[at, i])
-        if moved.energies is not None:
-            for name, values in zip(("bought", "sold"), moved.energies.T, strict=True):
-                yield scalars(f"{paths.ENERGY}/{name}", k[at], values[at])
-        if scene.house is not None:
-            load = scene.moving.index(scene.house.load)
-            yield scalars(f"{paths.GUESSES}/{paths.TRUTH}", k[at], moved.values[at, load])
-    for name, guess in moved.guesses.items():
-        if guess.shape[1]:
-            yield scalars(f"{paths.GUESSES}/{name}", guess[0].astype(np.int64), guess[1])
+    for panel in scene.panels:
+        for curve in panel.curves:
+            path = f"{panel.path}/{curve.name}"
+            slots_of, values = moved.curves[path]
+            drawn = slice(None) if curve.drawn == "points" else slots_of % every == 0
+            if len(slots_of[drawn]):
+                yield scalars(path, slots_of[drawn].astype(np.int64), values[drawn])
 
 
 def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
@@ -64,35 +62,35 @@ def log_styles(to: rr.RecordingStream, scene: Scene) -> None:
         _line(to, _level(i, paths.TRUTH), "truth", TRUTH_CURVE, 1.8)
         for j, shown in enumerate(scene.receivers):
             _line(to, _level(i, shown.name), shown.name, colour(j), 0.9)
-    if scene.house is not None:
-        _line(to, f"{paths.ENERGY}/bought", "bought", BOUGHT, 1.8)
-        _line(to, f"{paths.ENERGY}/sold", "sold", SOLD, 1.8)
-        _line(to, f"{paths.GUESSES}/{paths.TRUTH}", "truth", TRUTH_CURVE, 1.4, steps=True)
-        for j, shown in enumerate(scene.receivers):
-            # Points: a guess that jumps appears as a cloud, and hides no other.
-            style = rr.SeriesPoints(names=shown.name, colors=colour(j), markers="circle", marker_sizes=1.6)
-            to.log(f"{paths.GUESSES}/{shown.name}", style, static=True)
+    of_receivers = {shown.name: colour(j) for j, shown in enumerate(scene.receivers)}
+    for panel in scene.panels:
+        for curve in panel.curves:
+            path, bright = f"{panel.path}/{curve.name}", curve.colour or of_receivers[curve.name]
+            if curve.drawn == "points":
+                style = rr.SeriesPoints(names=curve.name, colors=bright, markers="circle", marker_sizes=curve.width)
+                to.log(path, style, static=True)
+            else:
+                _line(to, path, curve.name, bright, curve.width, steps=curve.drawn == "steps")
 
 
 def panels(scene: Scene, axis: rrb.TimeAxis) -> list[rrb.View]:
-    """The inputs and disturbances, a panel for each of the first two levels, and for a house the energy bought and sold."""
+    """The inputs and disturbances, a panel for each of the first two levels, and the applications' panels of the plant."""
     found: list[rrb.View] = [_panel("What moves the plant: " + ", ".join(scene.moving), paths.MOVING, axis)]
     for i in range(min(scene.n, 2)):
         label = scene.states[i] if scene.states else f"state {i}"
         title = f"{label}   grey: truth · others coloured as their curves: what they believe"
         found.append(_panel(title, f"{paths.LEVELS}/{i}", axis))
-    if scene.house is not None:
-        found.append(_panel("Energy bought and sold (kWh)", paths.ENERGY, axis))
-    return found
+    return found + [_application_panel(panel, axis) for panel in scene.panels if not panel.beside]
 
 
-def guessed(scene: Scene, axis: rrb.TimeAxis) -> list[rrb.View]:
-    """For a house, the load and every receiver's guess of it."""
-    if scene.house is None:
-        return []
-    title = f"{scene.house.load}, and what each would guess from its estimate"
-    least, most = -0.1 * scene.house.most, 1.15 * scene.house.most
-    return [_panel(title, paths.GUESSES, axis, rrb.ScalarAxis(range=(least, most), zoom_lock=True))]
+def beliefs(scene: Scene, axis: rrb.TimeAxis) -> list[rrb.View]:
+    """The applications' panels of what receivers believe."""
+    return [_application_panel(panel, axis) for panel in scene.panels if panel.beside]
+
+
+def _application_panel(panel: Panel, axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
+    span = None if panel.span is None else rrb.ScalarAxis(range=panel.span, zoom_lock=True)
+    return _panel(panel.title, panel.path, axis, span)
 
 
 def _panel(title: str, origin: str, axis: rrb.TimeAxis, values: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:

@@ -17,8 +17,6 @@ TRUTH = "truth"
 NOTES = "run"
 MOVING = "moving"
 LEVELS = "levels"
-ENERGY = "energy"
-GUESSES = "guesses"
 
 
 def lane(scene: Scene, i: int) -> str:

@@ -161,9 +161,7 @@ def _joined_packets(chunks: list[SceneSlots]) -> Flags | None:
 def _joined_moves(moves: list[Moved]) -> Moved | None:
     if not moves:
         return None
-    energies = [one.energies for one in moves if one.energies is not None]
     return Moved(
         np.concatenate([one.values for one in moves]),
-        np.concatenate(energies) if energies else None,
-        {name: np.concatenate([one.guesses[name] for one in moves], axis=1) for name in moves[0].guesses},
+        {path: np.concatenate([one.curves[path] for one in moves], axis=1) for path in moves[0].curves},
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
+from evedrop.scenario.application import Panel
 
 
 @dataclass(frozen=True)
@@ -21,16 +22,6 @@ class Shown:
     """The scheme's name for the legitimate estimator, the strategy's for an eavesdropper."""
     quality: float
     """Probability that its link delivers a packet."""
-
-
-@dataclass(frozen=True)
-class HouseScene:
-    """A plant that is a house."""
-
-    load: str
-    """Label of its load, one of `Scene.moving`."""
-    most: float
-    """The largest mean load over a minute or a period; the panel need not be as high as wrong guesses."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +45,8 @@ class Scene:
     """Labels of the states, such as "SOC (%)"; none, or one for each."""
     moving: tuple[str, ...] = ()
     """Labels of a closed loop's disturbances, then inputs, such as "P_load (kW)"."""
-    house: HouseScene | None = None
-    """For a plant that is a house."""
+    panels: tuple[Panel, ...] = ()
+    """Those of applications."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +73,8 @@ class Moved:
 
     values: Floats
     """The values of `Scene.moving`, (c, q + m)."""
-    energies: Floats | None = None
-    """For a house, the energy bought and sold since slot 0, in kWh, (c, 2)."""
-    guesses: Mapping[str, Floats] = field(default_factory=dict)
-    """Receiver → slots, and the load it guesses from each slot on, for periods that ended in these slots, (2, g)."""
+    curves: Mapping[str, Floats] = field(default_factory=dict)
+    """PATH/CURVE of the applications' panels → slots and values, (2, g)."""
 
 
 @dataclass(frozen=True)

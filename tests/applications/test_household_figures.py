@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from evedrop.api import montecarlo
+from evedrop.applications.microgrid import privacy
+from evedrop.applications.microgrid.energy import Meter, energy
 from evedrop.cli import main as cli
 from evedrop.errors import ScenarioError
 from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan
-from evedrop.model import privacy
 from evedrop.model.controllers import mpc
-from evedrop.model.energy import Meter, energy
 from tests.conftest import Evedrop
 from tests.scenario.test_plant_tables import LOOP
 

@@ -100,7 +100,7 @@ def test_the_folder_is_that_of_a_loop(ran: Ran) -> None:
     """With the disturbances that its scenario names, which runs again; and the logs of both controllers."""
     folder = ran(2).folder
     assert {path.name for path in ran(1).folder.iterdir()} == {path.name for path in folder.iterdir()}
-    assert load(folder).household is not None
+    assert "household" in load(folder).applications
     for number in (1, 2):
         assert (folder / "logs" / f"shard-{number}" / "controller.log").is_file()
 

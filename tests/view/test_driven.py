@@ -76,12 +76,13 @@ def test_slots_may_come_in_any_pieces() -> None:
     estimates = {name: 0.1 * rng.standard_normal((SLOTS, 2)) for name in scenario.receivers}
     found = []
     for cuts in ([0, SLOTS], [0, 1, 60, 61, 130, SLOTS]):
-        showing = Showing(scenario)
+        showing = Showing.of(scenario)
+        assert showing is not None
         pieces = [slice(first, end) for first, end in pairwise(cuts)]
         moves = [showing.take(u[rows], {name: x[rows] for name, x in estimates.items()}) for rows in pieces]
-        guesses = np.concatenate([one.guesses["naive"] for one in moves], axis=1)
-        energies = [one.energies for one in moves if one.energies is not None]
-        found.append((np.concatenate([one.values for one in moves]), np.concatenate(energies), guesses))
+        curves = {path: np.concatenate([one.curves[path] for one in moves], axis=1) for path in moves[0].curves}
+        energies = np.stack([curves["energy/bought"][1], curves["energy/sold"][1]], axis=1)
+        found.append((np.concatenate([one.values for one in moves]), energies, curves["guesses/naive"]))
     for whole, pieces_of_it in zip(*found, strict=True):
         assert np.allclose(whole, pieces_of_it, rtol=1e-12)
     values, energies, guesses = found[0]

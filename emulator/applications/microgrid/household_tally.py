@@ -7,58 +7,65 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, final
+from typing import Annotated, Any, Self, final
 
 import numpy as np
+from pydantic import Field
 
-from evedrop.model import privacy
-from evedrop.model.controllers import CONTROLLERS
-from evedrop.model.energy import Meter, energy
-from evedrop.model.load_guess import HousePlaces, LoadGuess
-from evedrop.model.perfect import PerfectLoop
+from evedrop.applications.microgrid import privacy
+from evedrop.applications.microgrid.energy import Meter, energy
+from evedrop.applications.microgrid.load_guess import HousePlaces, LoadGuess
+from evedrop.applications.microgrid.perfect import PerfectLoop
 from evedrop.model.process import Floats
-from evedrop.scenario import Scenario
-from evedrop.scenario.disturbances import disturbances_of
-from evedrop.scenario.household import HouseholdTable
+from evedrop.scenario.application import ApplicationTally, ControlledPlant
+from evedrop.scenario.table import Table
+
+Name = Annotated[str, Field(strict=True, min_length=1)]
 
 
-def guesses_of(scenario: Scenario, table: HouseholdTable, trials: int) -> dict[str, LoadGuess]:
+class HouseholdTable(Table):
+    """`[household]`: names of the plant's inputs, disturbances and states, powers in kW."""
+
+    grid: Annotated[Name, Field(examples=["P_grid"])]
+    load: Annotated[Name, Field(examples=["P_load"])]
+    battery: Annotated[Name, Field(examples=["SOC"])]
+    sun: Annotated[Name | None, Field(examples=["P_solar"])] = None
+    window_seconds: Annotated[float, Field(strict=True, gt=0.0, le=1e6, examples=[60.0])] = 60.0
+    active_above: Annotated[float, Field(strict=True, gt=0.0, le=1e6, examples=[0.7])] = 0.7
+    false_alarms: Annotated[float, Field(strict=True, gt=0.0, lt=1.0, examples=[0.05])] = 0.05
+
+    def window(self, period_seconds: float) -> int:
+        """The number of decisions in a window, at least 1; a decision lasts period_seconds."""
+        return max(1, round(self.window_seconds / period_seconds))
+
+
+def guesses_of(loop: ControlledPlant, table: HouseholdTable, trials: int) -> dict[str, LoadGuess]:
     """Receiver → the guess of the load from its estimates."""
-    plant, controller, assignment = scenario.plant, scenario.controller, scenario.assignment
-    assert plant is not None and controller is not None and assignment is not None  # noqa: S101, PT018 - a house has them
-    names, strategy = plant.disturbances, CONTROLLERS[controller.strategy]
-    sun = None if table.sun is None else names.index(table.sun)
-    house = HousePlaces((scenario.process.states or []).index(table.battery), names.index(table.load), sun)
-    shone = np.zeros(scenario.slots) if sun is None else disturbances_of(scenario)[:, sun]
-    return {name: LoadGuess(assignment, strategy(assignment, trials), house, shone) for name in scenario.receivers}
+    sun = None if table.sun is None else loop.disturbance(table.sun)
+    house = HousePlaces(loop.state(table.battery), loop.disturbance(table.load), sun)
+    shone = np.zeros(loop.slots) if sun is None else loop.disturbances[:, sun]
+    assignment, strategy = loop.assignment, loop.strategy
+    return {name: LoadGuess(assignment, strategy(assignment, trials), house, shone) for name in loop.receivers}
 
 
 @final
-class HouseholdTally:
+class HouseholdTally(ApplicationTally):
     """A house's totals over a set of trials, whose slots come in order."""
 
-    def __init__(self, scenario: Scenario, table: HouseholdTable, trials: int) -> None:
-        plant, controller, assignment = scenario.driven, scenario.controller, scenario.assignment
-        assert plant is not None and controller is not None and assignment is not None and scenario.plant is not None  # noqa: S101, PT018 - a house has them
-        self._table, self._plant = table, plant
-        self._slot_seconds = scenario.slot_seconds or 1.0
-        self._disturbances = disturbances_of(scenario)
-        self._grid = scenario.plant.inputs.index(table.grid)
-        self._period = controller.period
+    def __init__(self, loop: ControlledPlant, table: HouseholdTable, trials: int) -> None:
+        self._table, self._plant = table, loop.plant
+        self._slot_seconds = loop.slot_seconds
+        self._disturbances = loop.disturbances
+        self._grid = loop.input(table.grid)
+        self._period = loop.period
         self._window = table.window(self._period * self._slot_seconds)
-        strategy = CONTROLLERS[controller.strategy]
-        own = strategy(assignment, trials)
-        self._perfect = PerfectLoop(scenario.process.process, plant, own, self._period, self._disturbances)
-        self._load = scenario.plant.disturbances.index(table.load)
-        self._guesses = guesses_of(scenario, table, trials)
-        self._guessed: dict[str, list[Floats]] = {name: [] for name in scenario.receivers}
+        own = loop.strategy(loop.assignment, trials)
+        self._perfect = PerfectLoop(loop.process, loop.plant, own, self._period, self._disturbances)
+        self._load = loop.disturbance(table.load)
+        self._guesses = guesses_of(loop, table, trials)
+        self._guessed: dict[str, list[Floats]] = {name: [] for name in loop.receivers}
         self.meter = Meter.zero(trials)
         self.done = 0
-
-    @classmethod
-    def of(cls, scenario: Scenario, trials: int) -> HouseholdTally | None:
-        """The totals of some trials of a scenario; None without a house."""
-        return None if scenario.household is None else cls(scenario, scenario.household, trials)
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Add the next slots: states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
@@ -79,23 +86,20 @@ class HouseholdTally:
         return {name: value for name, value in self.__dict__.items() if name not in ("_perfect", "_guesses")}
 
     @classmethod
-    def merged(cls, parts: Sequence[HouseholdTally | None]) -> HouseholdTally | None:
+    def merged(cls, parts: Sequence[Self]) -> Self:
         """The totals of several sets of trials, in order. If some have fewer slots, guesses cover the slots that all have."""
-        known = [part for part in parts if part is not None]
-        if not known:
-            return None
-        whole = copy(known[0])
-        whole.meter = Meter.of_all([part.meter for part in known])
-        whole.done = min(part.done for part in known)
-        fewest = min(len(loads) for part in known for loads in part._guessed.values())
+        whole = copy(parts[0])
+        whole.meter = Meter.of_all([part.meter for part in parts])
+        whole.done = min(part.done for part in parts)
+        fewest = min(len(loads) for part in parts for loads in part._guessed.values())
         whole._guessed = {}
-        for name in known[0]._guessed:
-            rows = zip(*(part._guessed[name][:fewest] for part in known), strict=True)
+        for name in parts[0]._guessed:
+            rows = zip(*(part._guessed[name][:fewest] for part in parts), strict=True)
             whole._guessed[name] = [np.concatenate(row) for row in rows]
         return whole
 
     def summary(self) -> dict[str, Any]:
-        """The summary's entry on the house: means over trials; None for figures that do not exist."""
+        """The summary's entry: means over trials; None for figures that do not exist."""
         meter, seconds = self.meter, self._slot_seconds
         apart = meter.difference
         return {

@@ -1,0 +1,1 @@
+"""A heated room."""

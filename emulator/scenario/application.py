@@ -1,0 +1,270 @@
+"""The hook for applications: what a closed loop's plant is used for, such as the household of a microgrid.
+
+An application has a table of its own in a scenario, figures in the summary and in expectations, lines in the closing report,
+panels in the view and a picture of a sweep. No other room names an application: they ask those whose tables a scenario contains.
+
+Source: docs/your-own.md, applications.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, final
+
+from evedrop.model.controllers import Assignment, Controller
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process
+from evedrop.model.registry import Registry
+from evedrop.scenario.table import Table
+from evedrop.scenario.words import as_toml, listed
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Summary = Mapping[str, Any]
+"""An application's entry of the summary: its figures by name, and under `receivers` those of each receiver."""
+Kind = Literal["inputs", "disturbances", "states"]
+"""A kind of quantity that has names."""
+RECEIVERS = "receivers"
+
+
+@dataclass(frozen=True)
+class ControlledPlant:
+    """A plant with its controller, as an application sees it."""
+
+    assignment: Assignment
+    """What the controller knows, process and plant included."""
+    strategy: type[Controller]
+    around: Floats
+    """The reference of the states, (n,): states and estimates are deviations from it."""
+    disturbances: Floats
+    """Of every slot, (slots, q)."""
+    states: tuple[str, ...]
+    """Names of the n states; none if the scenario gives none."""
+    inputs: tuple[str, ...]
+    """Names of the m inputs."""
+    disturbance_names: tuple[str, ...]
+    disturbance_labels: tuple[str, ...]
+    """The same with their units, if the scenario gives units."""
+    receivers: tuple[str, ...]
+    """The legitimate estimator first."""
+
+    @property
+    def process(self) -> Process:
+        """The process."""
+        return self.assignment.process
+
+    @property
+    def plant(self) -> Plant:
+        """The plant."""
+        return self.assignment.plant
+
+    @property
+    def period(self) -> int:
+        """Slots between two decisions."""
+        return self.assignment.period
+
+    @property
+    def slot_seconds(self) -> float:
+        """Seconds of a slot."""
+        return self.assignment.slot_seconds
+
+    @property
+    def slots(self) -> int:
+        """Slots of the run."""
+        return len(self.disturbances)
+
+    def state(self, name: str) -> int:
+        """The index of a state."""
+        return self.states.index(name)
+
+    def input(self, name: str) -> int:
+        """The index of an input."""
+        return self.inputs.index(name)
+
+    def disturbance(self, name: str) -> int:
+        """The index of a disturbance."""
+        return self.disturbance_names.index(name)
+
+
+class ApplicationTally(ABC):
+    """An application's totals over a set of trials, whose slots come in order. Pickled between processes."""
+
+    @abstractmethod
+    def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
+        """Add the next c slots: true states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
+
+    @classmethod
+    @abstractmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """The totals of several sets of trials, in order."""
+
+    @abstractmethod
+    def summary(self) -> Summary:
+        """The summary's entry: every figure, a number or None, and for each receiver under `receivers` the receivers' figures."""
+
+
+@dataclass(frozen=True)
+class PanelCurve:
+    """One curve of a panel."""
+
+    name: str
+    """The label; a receiver's name for what this receiver believes."""
+    colour: tuple[int, int, int] | None = None
+    """None: the colour of the receiver of this name."""
+    drawn: Literal["line", "steps", "points"] = "line"
+    width: float = 1.8
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A panel of the view. Its curves are drawn over the slots of the run."""
+
+    path: str
+    """The place in the recording, one word."""
+    title: str
+    curves: tuple[PanelCurve, ...]
+    span: tuple[float, float] | None = None
+    """Lowest and highest value shown; None: as the curves need."""
+    beside: bool = False
+    """Whether it stands with what receivers believe, rather than with what the plant does."""
+
+
+class PanelFeed(ABC):
+    """The values of an application's panels in one trial, whose slots come in order."""
+
+    @abstractmethod
+    def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
+        """Add slots from `first` on: inputs within their limits, (c, m), and estimates as deviations, (c, n).
+
+        Returns PATH/CURVE → slots and values, (2, g).
+        """
+
+
+class Application(ABC):
+    """What a plant with a controller is used for. A class, never an instance, is registered."""
+
+    name: ClassVar[str]
+    """The name of its table in a scenario and of its entry in the summary."""
+    table: ClassVar[type[Table]]
+    """The entries of its table."""
+    names: ClassVar[Mapping[str, Kind]]
+    """The entries of its table that name an input or a disturbance of the plant, or a state of the process."""
+    figures: ClassVar[tuple[str, ...]]
+    """Its figures in the summary that expectations and sweeps can use."""
+    receiver_figures: ClassVar[tuple[str, ...]] = ()
+    """The same for each receiver's."""
+
+    @classmethod
+    @abstractmethod
+    def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ApplicationTally:
+        """Totals over no slots yet; table: an instance of `cls.table`."""
+
+    @classmethod
+    def lines(cls, summary: Summary) -> list[str]:
+        """Its lines of the closing report."""
+        del summary
+        return []
+
+    @classmethod
+    def panels(cls, loop: ControlledPlant, table: Table) -> tuple[Panel, ...]:
+        """Its panels of the view."""
+        del loop, table
+        return ()
+
+    @classmethod
+    def feed(cls, loop: ControlledPlant, table: Table) -> PanelFeed | None:
+        """What fills its panels; None if it has none."""
+        del loop, table
+        return None
+
+    @classmethod
+    def draw_sweep(cls, path: Path, table: pa.Table, key: str) -> None:
+        """Draw its figures of a sweep over the entry `key`, as `path`.png and `path`.pdf. By default there is no picture."""
+        del path, table, key
+
+    @classmethod
+    def figure(cls, summary: Summary, path: Sequence[str]) -> float | None:
+        """A figure by its name in an expectation without the application's: FIGURE, or RECEIVER and FIGURE."""
+        inner: Any = summary
+        for part in (RECEIVERS, *path) if len(path) > 1 else path:
+            inner = inner[part]
+        return None if inner is None else float(inner)
+
+    @classmethod
+    def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:
+        """Its columns in a receiver's row of a sweep."""
+        own = {name: cls.figure(summary, (name,)) for name in cls.figures}
+        return own | {name: cls.figure(summary, (receiver, name)) for name in cls.receiver_figures}
+
+
+@final
+class _BuiltIn(Mapping[str, type[Application]]):
+    """Name → class. A class is imported when it is looked up, since it may use rooms above this one."""
+
+    def __init__(self, places: Mapping[str, str]) -> None:
+        self._places = places
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._places
+
+    def __getitem__(self, name: str) -> type[Application]:
+        module, _, class_name = self._places[name].partition(":")
+        found: type[Application] = getattr(import_module(module), class_name)
+        return found
+
+
+APPLICATIONS: Registry[Application] = Registry(
+    "application",
+    Application,  # type: ignore[type-abstract]
+    "evedrop.applications",
+    _BuiltIn(
+        {
+            "comfort": "evedrop.applications.heating.comfort:Comfort",
+            "household": "evedrop.applications.microgrid.household:Household",
+        }
+    ),
+)
+
+
+def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, type[Application]]:
+    """The applications among names, such as those of a scenario's tables; besides: names that cannot be applications."""
+    return {name: APPLICATIONS[name] for name in tables if name not in besides and name in APPLICATIONS}
+
+
+def application_mistakes(applications: Mapping[str, type[Application]], tables: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes of applications across tables: no plant, names that the plant does not have, and a receiver of the same name."""
+    for name, application in applications.items():
+        yield from _mistakes_of(application, tables[name], tables)
+        if name in (tables.get("eavesdroppers") or {}):
+            yield f"eavesdroppers.{name}: is a name that the {name}'s figures use; expected another"
+
+
+def _mistakes_of(application: type[Application], table: Any, tables: Mapping[str, Any]) -> Iterator[str]:
+    plant, process = tables.get("plant"), tables.get("process")
+    if not isinstance(plant, Mapping) or not isinstance(tables.get("controller"), Mapping):
+        described = "which it describes; expected both, or no such table"
+        yield f"{application.name}: is given without a [plant] and a [controller], {described}"
+        return
+    if not isinstance(table, Mapping):
+        return
+    for entry, kind in application.names.items():
+        name = table.get(entry)
+        if not isinstance(name, str):
+            continue
+        where, holder = (f"process.{kind}", process) if kind == "states" else (f"plant.{kind}", plant)
+        names = holder.get(kind) if isinstance(holder, Mapping) else None
+        there = [one for one in names if isinstance(one, str)] if isinstance(names, list) else []
+        if name not in there:
+            choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(name)}, …]"
+            yield f"{application.name}.{entry}: is {as_toml(name)}, which is not among {where}; {choice}"
