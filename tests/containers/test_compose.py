@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -21,7 +21,7 @@ LONG = "--slots 3000 --pace 0.005"
 Make = Callable[..., Project]
 
 
-def digests(summary: dict[str, Any]) -> dict[str, str]:
+def digests(summary: Mapping[str, Any]) -> dict[str, str]:
     """Receiver → digest."""
     return {name: peer["digest"] for name, peer in summary["peers"].items()}
 

@@ -16,6 +16,7 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy import stats
 
 from evedrop.errors import TraceError
@@ -41,7 +42,8 @@ def recorded(spec: dict[str, Any], count: int, seed: int = 0) -> Outcomes:
     """A recording of a link, (count,)."""
     loss = loss_of(spec)
     u = np.random.default_rng(seed).random((count, loss.uniforms_per_slot, 1))
-    return (loss.fates(0, u)[:, 0] == Fate.DELIVERED).astype(np.uint8)
+    delivered: NDArray[np.uint8] = (loss.fates(0, u)[:, 0] == Fate.DELIVERED).astype(np.uint8)
+    return delivered
 
 
 def save(folder: Path, outcomes: Outcomes, **more: Any) -> Path:

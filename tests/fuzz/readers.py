@@ -88,7 +88,8 @@ def _as_json(mutator: Mutator, data: bytes) -> bytes:
 
 def _as_msgpack(mutator: Mutator, data: bytes) -> bytes:
     try:
-        return msgpack.packb(mutator.tree(msgpack.unpackb(data, strict_map_key=False)), use_bin_type=True)
+        packed: bytes = msgpack.packb(mutator.tree(msgpack.unpackb(data, strict_map_key=False)), use_bin_type=True)
+        return packed
     except (OverflowError, TypeError, ValueError):
         return mutator.raw(data)
 

@@ -195,10 +195,15 @@ def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: 
         "with private_folder() as folder:\n    print(folder, flush=True)\n    sys.stdin.read()\n"
     )
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
 
     def begun() -> tuple[subprocess.Popen[str], Path]:
-        process = subprocess.Popen([sys.executable, "-c", code], text=True, env=environment, **pipes)
+        process = subprocess.Popen(
+            [sys.executable, "-c", code],
+            text=True,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
         assert process.stdout is not None
         return process, Path(process.stdout.readline().strip())
 

@@ -230,7 +230,7 @@ def test_whatever_is_drawn_is_a_scenario(
 
 def test_the_same_faults_live_and_in_memory(tmp_path: Path) -> None:
     """All kinds, equal digests of every receiver; and again from what the results have kept."""
-    changes = {
+    changes: dict[str, Any] = {
         "slots": 250,
         "nemesis__from": 10,
         "nemesis__to": 240,

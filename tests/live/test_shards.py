@@ -212,7 +212,7 @@ def whole(live: Live) -> int:
     """Check that the folder of a run cut short is one, its tables as far as its trials came; the rows of slots."""
     results = live.results
     assert not (live.folder / "shards").exists()
-    rows = results.slots.num_rows
+    rows: int = results.slots.num_rows
     assert rows == results.journal.num_rows
     trials = results.slots["trials"].to_pylist()
     assert sum(trials) == sum(link["offered"] for link in results.summary["links"].values())

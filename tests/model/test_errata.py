@@ -25,7 +25,7 @@ MU, MU_D = 0.9, 0.6
 
 def power(k: int, M: Floats) -> Floats:
     """A^k M (A^k)ᵀ."""
-    Ak = np.linalg.matrix_power(A, k)
+    Ak: Floats = np.linalg.matrix_power(A, k)
     return Ak @ M @ Ak.T
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.counting import count_variance
@@ -21,11 +22,12 @@ from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 KEY = stream_key(root_of_seed(5), "link/eve")
 
 
-def delivered(spec: dict[str, Any], slots: range, trials: int = 3) -> np.ndarray[Any, Any]:
+def delivered(spec: dict[str, Any], slots: range, trials: int = 3) -> NDArray[np.bool_]:
     """What a fresh model delivers in these slots, (slots, trials)."""
     model = loss_of(spec)
     drawn = uniforms(Stream(KEY, range(trials), model.uniforms_per_slot).words(slots)).transpose(0, 2, 1)
-    return model.fates(slots.start, drawn) == Fate.DELIVERED
+    found: NDArray[np.bool_] = model.fates(slots.start, drawn) == Fate.DELIVERED
+    return found
 
 
 def test_a_looped_trace_begins_again() -> None:

@@ -34,6 +34,8 @@ BOTH = plant(np.array([[1.0, 0.0], [0.5, 1.0]]), np.array([[0.01, 0.002], [0.002
 def test_it_settles_where_the_riccati_equation_has_it(of: Plant) -> None:
     """Gain, covariance and K S Kᵀ of the stationary filter; of one measurement K S Kᵀ has rank one."""
     C, V = of.output_matrix, of.measurement_noise
+    assert C is not None
+    assert V is not None
     predicted = solve_discrete_are(A.T, C.T, W, V)
     S = C @ predicted @ C.T + V
     K = predicted @ C.T @ np.linalg.inv(S)
@@ -56,6 +58,7 @@ def test_it_is_the_kalman_filter_slot_by_slot() -> None:
     local, steps = LocalFilter(PROCESS, ONE, KEYS["measurement"], batch), Steps(PROCESS, ONE)
     random = np.random.default_rng(1)
     C, P = ONE.output_matrix, PROCESS.initial_covariance
+    assert C is not None
     x_before = np.zeros((2, 4000))
     for k in range(60):
         pushed = drive.pushed(k)

@@ -171,7 +171,8 @@ MISTAKES = {
 def test_mistakes_are_named(name: str) -> None:
     """What keeps matrices from being a process is said of the right entry."""
     *matrices, entry, sentence = MISTAKES[name]
-    found = mistakes_of(*(np.array(M, float) for M in matrices))
+    A, Q, initial = (np.array(M, float) for M in matrices)
+    found = mistakes_of(A, Q, initial)
     assert any(where == entry and re.search(sentence, what) for where, what in found), found
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.model.process import Process, Trajectory
+from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
@@ -56,7 +56,7 @@ def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> l
     return found
 
 
-def chi_of(process: Process, k: int, r: int) -> np.ndarray:
+def chi_of(process: Process, k: int, r: int) -> Floats:
     """χ_k of a trial: from the noise stream, coloured by the Cholesky factor of A Σ_{k−1} Aᵀ propagated by LAPACK's QR."""
     if k == 0:
         return np.zeros(process.n)
@@ -65,7 +65,8 @@ def chi_of(process: Process, k: int, r: int) -> np.ndarray:
         R = np.linalg.qr(np.hstack([process.A @ L, G]).T, mode="r")
         L = (R * np.sign(np.diag(R))[:, None]).T
     xi = normals(Stream(KEYS["noise"], range(r, r + 1), process.n).words(range(k, k + 1)))[0, 0]
-    return process.A @ L @ xi
+    chi: Floats = process.A @ L @ xi
+    return chi
 
 
 def nu_of(k: int, r: int) -> bool:

@@ -38,7 +38,8 @@ probabilities = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 1.0]))
 def covariances(draw: st.DrawFn, n: int) -> Floats:
     """A symmetric positive definite matrix."""
     factor = np.array(draw(st.lists(st.floats(-1.0, 1.0), min_size=n * n, max_size=n * n))).reshape(n, n)
-    return factor @ factor.T + draw(st.floats(0.01, 1.0)) * np.eye(n)
+    positive: Floats = factor @ factor.T + draw(st.floats(0.01, 1.0)) * np.eye(n)
+    return positive
 
 
 @st.composite
@@ -185,7 +186,11 @@ def test_belief_ignores_being_misled() -> None:
     for b0, b1 in ((1.0, 1.0), (0.8, 0.3)):
         outcomes = Outcomes.eavesdropper(0.9, 0.6, b0, b1)
         p_d = 1 - 0.9 * 0.6 * b0 - 0.9 * 0.4 * b1
-        reference = recursion(EXAMPLE, 60, lambda B, _, p_d=p_d: p_d * (A @ B @ A.T + Q), 1 - 0.9 * b0)
+
+        def step(B: Floats, _: Floats, p_d: float = p_d) -> Floats:
+            return p_d * (A @ B @ A.T + Q)
+
+        reference = recursion(EXAMPLE, 60, step, 1 - 0.9 * b0)
         assert close(expected_covariances(EXAMPLE, outcomes.believed, 60), reference)
     smart = Outcomes.eavesdropper(0.9, 0.6, 1.0, 0.0)
     assert smart.believed == smart

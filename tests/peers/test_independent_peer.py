@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from independent_legitimate import Estimator
 
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.loading import load
-from evedrop.model.digest import BeliefLog, Blocks, RunDigest
+from evedrop.model.digest import BeliefLog, Blocks, Digests, RunDigest
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
@@ -28,6 +27,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import Batch
 from tests.conftest import LIMIT
+from tests.peers.independent_legitimate import Estimator
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
 THREE_STATES = {
@@ -73,7 +73,8 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     estimator = SCHEMES["innovation"](model, 0.4).estimator(secret, batch)
     belief, log, digest = estimator.prior(), BeliefLog(model.n, 9, slots), RunDigest()
     gammas = np.random.default_rng(1).random((slots, 9)) < 0.7
-    beliefs, blocks = [], {}
+    beliefs = []
+    blocks: dict[int, Digests] = {}
     for k, gamma in enumerate(gammas):
         z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
         belief = estimator.step(k, belief, Reception(gamma, z))

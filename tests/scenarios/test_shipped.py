@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from evedrop.api import load_results, montecarlo, run
+from evedrop.api import montecarlo, run
 from evedrop.loading import load, shipped
-from evedrop.results.writer import Results
+from evedrop.results.writer import Results, load_results
 
 SLOTS = 300
 """Enough for a whole block of digests and a part of one."""
@@ -33,7 +34,7 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Pair
         scenario = load(name)
         timed = scenario.event or any(expect.slots or expect.by for expect in scenario.expect)
         slots = scenario.slots if timed else min(SLOTS, scenario.slots)
-        options = {"slots": slots, "trials": trials, "first_trial": first, "pace": 0.0}
+        options: dict[str, Any] = {"slots": slots, "trials": trials, "first_trial": first, "pace": 0.0}
         return run(name, out=folder / "live", **options), montecarlo(name, out=folder / "memory", **options)
 
     return made
@@ -106,7 +107,7 @@ def test_later_trials_are_the_same_alone(tmp_path: Path) -> None:
 
 def test_a_further_eavesdropper_changes_nobody_else(tmp_path: Path, twins: Callable[[str, str], Pair]) -> None:
     """Neither by its presence nor by its place among the others."""
-    extra = {"eavesdroppers__extra__strategy": "smart", "eavesdroppers__extra__link__quality": 0.5}
+    extra: dict[str, Any] = {"eavesdroppers__extra__strategy": "smart", "eavesdroppers__extra__link__quality": 0.5}
     slots = load("numerical").slots
     live = run("numerical", slots=slots, pace=0.0, trials=1, first_trial=17, out=tmp_path / "extra", **extra)
     found = digests(live)

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from unittest.mock import patch
 
 import pytest
-from simulated_run import Simulated, orbit, simulate
 
 from evedrop.view import recording
 from tests.conftest import LIMIT
+from tests.view.simulated_run import Simulated, orbit, simulate
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from read_back import rows
-from test_picture import filled
 
 from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
@@ -13,6 +11,8 @@ from evedrop.loading import checked, load
 from evedrop.view.picture import opened
 from evedrop.view.plant_slots import Showing
 from evedrop.view.replay import replay
+from tests.view.read_back import rows
+from tests.view.test_picture import filled
 
 SLOTS = 300
 
@@ -80,8 +80,8 @@ def test_slots_may_come_in_any_pieces() -> None:
         pieces = [slice(first, end) for first, end in pairwise(cuts)]
         moves = [showing.take(u[rows], {name: x[rows] for name, x in estimates.items()}) for rows in pieces]
         guesses = np.concatenate([one.guesses["naive"] for one in moves], axis=1)
-        energies = [one.energies for one in moves if one.energies is not None]
-        found.append((np.concatenate([one.values for one in moves]), np.concatenate(energies), guesses))
+        spent = [one.energies for one in moves if one.energies is not None]
+        found.append((np.concatenate([one.values for one in moves]), np.concatenate(spent), guesses))
     for whole, pieces_of_it in zip(*found, strict=True):
         assert np.allclose(whole, pieces_of_it, rtol=1e-12)
     values, energies, guesses = found[0]

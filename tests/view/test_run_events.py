@@ -6,11 +6,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from read_back import rows
-
 from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
 from evedrop.view.replay import replay
+from tests.view.read_back import rows
 
 EVENTS = [{"at": 3, "link": "legitimate", "set": {"quality": 0.2}}, {"from": 5, "to": 9, "cut": "smart"}]
 LINES = {3: ["link legitimate: quality = 0.2"], 5: ["cut smart"], 9: ["heal smart"]}
