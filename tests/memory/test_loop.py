@@ -20,6 +20,7 @@ from evedrop.memory.simulation import Mode
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results
 from evedrop.scenario import Scenario
+from tests.builders import digests_of
 from tests.conftest import Evedrop
 
 TITLE = "A tank that is steered over a lossy network"
@@ -98,8 +99,7 @@ def in_memory(folder: Path, plan: Plan | None = None, **changes: Any) -> Results
 
 def digests(results: Results) -> dict[str, str]:
     """Of all receivers, and of the controller."""
-    found = {name: peer["digest"] for name, peer in results.summary["peers"].items()}
-    return {**found, "controller": results.summary["controller"]["digest"]}
+    return {**digests_of(results), "controller": results.summary["controller"]["digest"]}
 
 
 def column(table: pa.Table | None, name: str, **where: Any) -> np.ndarray:

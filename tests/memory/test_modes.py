@@ -24,6 +24,7 @@ from evedrop.results.writer import Results
 from evedrop.scenario import Scenario
 from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
+from tests.builders import MICROGRID, process_table
 
 SURE = 4.5
 COVARIANCES, ERRORS = Plan(Mode.COVARIANCE_ONLY, workers=1), Plan(Mode.ERROR_COORDINATES, workers=1)
@@ -324,11 +325,7 @@ def test_the_table_of_the_microgrid(tmp_path: Path) -> None:
         {
             "title": "microgrid",
             "slots": 86_400,
-            "process": {
-                "A": [[1.0, 0.0], [0.0, 1.0]],
-                "Q": [[1e-5, 0.0], [0.0, 1e-5]],
-                "initial_covariance": [[1e-5, 0.0], [0.0, 1e-5]],
-            },
+            "process": process_table(MICROGRID),
             "encoding": {"scheme": "innovation", "state_probability": 0.5},
             "legitimate": {"link": {"quality": 0.6}},
             "eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.6}}},

@@ -18,7 +18,8 @@ from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.streams import Batch, stream_key
-from tests.model.slot_loop import ROOT, UNSTABLE, coins, play
+from tests.builders import UNSTABLE
+from tests.model.slot_loop import ROOT, coins, play
 
 KEY = stream_key(ROOT, "link/acknowledgements")
 

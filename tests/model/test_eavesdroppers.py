@@ -15,10 +15,10 @@ from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
 from evedrop.model.process import Process
 from evedrop.model.receiver import Action, Belief, Receiver, Reception
-from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.streams import Batch, Stream, uniforms
+from tests.builders import stream_keys
 
-ROOT = root_of_seed(12)
-KEYS = {name: stream_key(ROOT, name) for name in ("schedule", "coin")}
+KEYS = stream_keys(12, ("schedule", "coin"))
 PROCESS = Process(
     np.array([[1.0, 0.3], [0.5, 1.001]]), np.array([[1e-3, 2e-4], [2e-4, 1e-3]]), np.array([[1.0, 0.1], [0.1, 0.5]])
 )

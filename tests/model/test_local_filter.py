@@ -9,12 +9,13 @@ from scipy.linalg import solve_discrete_are
 from evedrop.model.local_filter import LocalFilter, Steps, settled
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory, mistakes_of
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.streams import Batch
+from tests.builders import stream_keys
 
 A = np.array([[1.0, 0.1], [0.0, 0.95]])
 W = np.array([[1e-4, 0.0], [0.0, 4e-4]])
 PROCESS = Process(A, np.eye(2), 0.04 * np.eye(2))
-KEYS = {name: stream_key(root_of_seed(8), name) for name in ("process", "measurement")}
+KEYS = stream_keys(8, ("process", "measurement"))
 
 
 def plant(C: np.ndarray, V: np.ndarray, noise: np.ndarray = W) -> Plant:

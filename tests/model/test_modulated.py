@@ -25,9 +25,8 @@ from evedrop.model.theory.covariances import (
     tail_index,
 )
 from evedrop.model.theory.covariances import limit_trace as independent_limit
+from tests.builders import MARGINAL, UNSTABLE
 
-MARGINAL = Process(np.array([[1.0, 0.05], [0.0, 1.0]]), np.diag([1e-3, 1e-4]), np.diag([1.0, 0.01]))
-UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))
 STABLE = Process(np.array([[0.9, 0.1], [0.0, 0.7]]), np.eye(2) * 1e-2, np.eye(2))
 MU_D = 0.6
 

@@ -17,7 +17,8 @@ from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.streams import Batch, stream_key
-from tests.model.slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, coins, keys_of
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import ROOT, STABLE, coins, keys_of
 
 KEYS = keys_of(("start", "track"))
 CLOSE = Process(UNSTABLE.A, UNSTABLE.Q, UNSTABLE.Q)

@@ -13,7 +13,8 @@ from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import expected_covariances
 from evedrop.streams import Batch
-from tests.model.slot_loop import DRIFTING, STABLE, UNSTABLE, coins, keys_of, play
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import STABLE, coins, keys_of, play
 
 KEYS = keys_of(("start", "track"))
 

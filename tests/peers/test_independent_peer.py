@@ -26,15 +26,11 @@ from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import Batch
+from tests.builders import DRIFTING, process_table
 from tests.conftest import LIMIT
 from tests.peers.independent_legitimate import Estimator
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
-THREE_STATES = {
-    "A": [[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]],
-    "Q": [[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]],
-    "initial_covariance": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]],
-}
 UNSTABLE = {
     "A": [[1.0, 0.3], [0.5, 1.001]],
     "Q": [[1e-3, 2e-4], [2e-4, 1e-3]],
@@ -59,7 +55,9 @@ def scenario_of(process: dict[str, list[list[float]]], slots: int, first_trial: 
     )
 
 
-@pytest.mark.parametrize(("process", "slots", "first_trial"), [(THREE_STATES, 300, 0), (UNSTABLE, 60, 12_345)])
+@pytest.mark.parametrize(
+    ("process", "slots", "first_trial"), [(process_table(DRIFTING), 300, 0), (UNSTABLE, 60, 12_345)]
+)
 def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> None:
     """Fed with the deliveries of a run, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots, first_trial)

@@ -25,6 +25,7 @@ from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
+from tests.builders import MARGINAL, process_table
 
 LIMIT_SECONDS = 60.0
 """After which what a test waits for counts as never come: far above what a busy machine needs."""
@@ -52,7 +53,7 @@ def scenario_of(**changes: Any) -> Scenario:
         "slots": 64,
         "trials": 5,
         "seed": 91,
-        "process": {"A": [[1.0, 0.05], [0.0, 1.0]], "Q": [[1e-3, 0.0], [0.0, 1e-4]]},
+        "process": process_table(MARGINAL),
         "encoding": {"scheme": "innovation", "state_probability": 0.4},
         "legitimate": {"link": {"quality": 0.8}},
         "eavesdroppers": {
@@ -62,7 +63,6 @@ def scenario_of(**changes: Any) -> Scenario:
         },
         **changes,
     }
-    tables["process"]["initial_covariance"] = [[1.0, 0.0], [0.0, 0.01]]
     return Scenario.model_validate(tables)
 
 
