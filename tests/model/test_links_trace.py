@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links import loss_of
 from evedrop.model.links.counting import count_variance
 from evedrop.model.links.link import Fate
 from evedrop.model.links.markov import stationary
@@ -124,7 +124,7 @@ def test_the_rate_of_a_chain_scatters_as_all_its_paths_do(
 def test_the_rate_of_many_slots_has_its_limit() -> None:
     """A Gilbert–Elliott link over 10⁸ slots: π_g π_b (1 + λ)/(1 − λ) a slot, λ = 1 − p − r."""
     p, r, slots = 0.01, 0.09, 100_000_000
-    loss = LOSS_MODELS["gilbert-elliott"](p=p, r=r)  # type: ignore[call-arg]
+    loss = loss_of({"model": "gilbert-elliott", "p": p, "r": r})
     limit = p * r / (p + r) ** 2 * (2 - p - r) / (p + r) / slots
     assert loss.rate_variance(range(slots)) == pytest.approx(limit, rel=1e-5)
     assert loss_of({"model": "bernoulli", "quality": 0.7}).rate_variance(range(50)) == pytest.approx(0.21 / 50)
