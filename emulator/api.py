@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
     from evedrop.results.comparison import Comparison
 
+__all__ = ["compare", "design", "load_results", "montecarlo", "run"]
+
 Tell = Callable[[Mapping[str, Any]], None]
 
 

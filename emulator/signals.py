@@ -49,6 +49,10 @@ def held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def _ignore(_number: int, _frame: FrameType | None) -> None:
+    """The handler of further signals."""
+
+
 @contextmanager
 def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
@@ -56,8 +60,8 @@ def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
         return
 
     def handler(_number: int, _frame: FrameType | None) -> None:
-        for number in before:
-            signal.signal(number, signal.SIG_IGN)
+        for number in before:  # by a function: Python reports a signal that is under way to SIG_IGN as an error
+            signal.signal(number, _ignore)
         interrupt()
 
     # Signals ignored from the start stay ignored: by nohup, and the interrupts of a background job.

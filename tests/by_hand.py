@@ -120,7 +120,7 @@ class ByHand:
         return {name: one.returncode for name, one in self.processes.items()}
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Mapping[str, Any]:
         """Of the results."""
         return load_results(self.folder / "run").summary
 

@@ -27,6 +27,7 @@ def test_its_figures_are_sums_over_slots(tmp_path: Path) -> None:
     loop = controlled_plant(scenario)
     assert loop is not None
     trials = results.trials.to_pylist()
+    assert results.inputs is not None
     states = [row["x"] for row in trials if row["peer"] == "legitimate"]
     power = [row["u"] for row in results.inputs.to_pylist()]
     outside = [max(20.5 - room, room - 22.5, 0.0) for room, _ in states]

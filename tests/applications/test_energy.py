@@ -52,7 +52,7 @@ def test_what_differs_slot_by_slot_bounds_the_rest(run: np.ndarray, reference: n
     assert np.all(found.total <= found.summed + 1e-12)
     assert np.all(found.net <= found.summed + 1e-12)
     same = difference(reference, reference)
-    assert (same.net, same.total, same.summed) == (0.0, 0.0, 0.0)
+    assert same.net == same.total == same.summed == 0.0
     alone = [difference(run[:, r], reference).summed for r in range(3)]
     assert np.array_equal(found.summed, alone)
 

@@ -166,7 +166,7 @@ def test_active_windows_are_the_days(tmp_path: Path) -> None:
 
 def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
     """The same figures from one process and from two."""
-    options = {"trials": 501, "slots": 130, "eavesdroppers__bayesian__strategy": "smart"}
+    options: dict[str, Any] = {"trials": 501, "slots": 130, "eavesdroppers__bayesian__strategy": "smart"}
     one = montecarlo("microgrid", out=tmp_path / "one", plan=Plan(workers=1), **options)
     two = montecarlo("microgrid", out=tmp_path / "two", plan=Plan(workers=2), **options)
     assert one.summary["household"] == two.summary["household"]

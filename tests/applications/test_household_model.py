@@ -78,6 +78,7 @@ def test_who_knows_the_level_knows_the_load(sun: int | None) -> None:
     found = [guess.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
     assert found[0] is None
     for period, load in enumerate(found[1:]):
+        assert load is not None
         assert np.allclose(load, d[period * PERIOD, 1], atol=1e-9)
 
 
@@ -94,8 +95,11 @@ def test_what_is_not_known_is_taken_for_load() -> None:
         x[k + 1] = x[k] + B @ u + (B_D @ d[k])[:, None] + nothing[k]
     blind = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), HousePlaces(0, 1, None), d[:, 0])
     found = [blind.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
-    assert np.allclose(found[1:], -1.0)
+    for load in found[1:]:
+        assert load is not None
+        assert np.allclose(load, -1.0)
     off = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), HousePlaces(0, 1, 0), d[:, 0])
     off.take(0, x[0])
     last = off.take(PERIOD, x[PERIOD] - np.array([[0.3], [0.0]]))
+    assert last is not None
     assert np.allclose(last, 0.5 + 0.3 / (0.03 * PERIOD))

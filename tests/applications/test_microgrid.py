@@ -19,7 +19,7 @@ TABLE = {0.1: (1.333e-4, 3.133e-4), 0.5: (2.667e-5, 4.667e-5), 0.9: (1.481e-5, 1
 """μ_d → day means of the trace, of the legitimate estimator and smart."""
 WIDE = [[2500.0, 0.0], [0.0, 2500.0]]
 COVARIANCES = Plan(Mode.COVARIANCE_ONLY, workers=1)
-NO_PACKETS = {"eavesdroppers__bayesian__strategy": "smart"}
+NO_PACKETS: dict[str, Any] = {"eavesdroppers__bayesian__strategy": "smart"}
 """A study of covariances excludes receivers that read packets, and not only their fates."""
 
 

@@ -74,7 +74,8 @@ class Centred(Sent):
 
     def of(self, k: int, x: Floats) -> Floats:  # noqa: ARG002 - every slot alike
         """Less the mean over trials."""
-        return x - x.mean(axis=1, keepdims=True)
+        centred: Floats = x - x.mean(axis=1, keepdims=True)
+        return centred
 
 
 class Counted(Sent):
@@ -136,7 +137,7 @@ def plain_with(encoder: Any = PlainEncoder, estimator: Any = PlainEstimator, **e
     return type("Mine", (Plain,), {"shared": shared, **entries})
 
 
-class AllInnovations(SharedSecret):
+class AllInnovations(SharedSecret):  # type: ignore[misc]  # final: nobody should do this
     """Slot 0 as any other."""
 
     def nu(self, k: int) -> Flags:
@@ -160,7 +161,7 @@ class Apart(Cipher):
         return super().estimator({"mask": bytes(32)} if keys else keys, batch)  # type: ignore[return-value]
 
 
-SCHEME_RULES = {
+SCHEME_RULES: dict[str, tuple[type[Scheme], str, str]] = {
     "a trial by itself": (plain_with(Centred), "slot 0, trial 0: Packet.z is ", "no sum over trials"),
     "the same scheme made twice": (plain_with(Counted), "with another one of its kind", "keep no state outside"),
     "a slot asked for again": (plain_with(estimator=Remembers), "when the slot is asked for again", "Belief.memory"),
@@ -262,7 +263,7 @@ class Better(Bernoulli):
 class Unsteady(GilbertElliott):
     """Has bursts, and says that it has none."""
 
-    chain = None
+    chain = None  # type: ignore[assignment]  # the lie
 
 
 class InPlace(Bernoulli):

@@ -17,6 +17,7 @@ from evedrop.loading import load
 from evedrop.loading.amended import with_event
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.writer import load_results
+from tests.builders import digests_of
 from tests.conftest import Evedrop
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-own.md"
@@ -65,11 +66,6 @@ def tutorial(evedrop: Evedrop) -> Evedrop:
     return evedrop
 
 
-def digests(folder: Path) -> dict[str, str]:
-    """Receiver → digest of a run."""
-    return {name: peer["digest"] for name, peer in load_results(folder).summary["peers"].items()}
-
-
 def test_the_tutorial_has_three_short_classes_and_a_scenario() -> None:
     """Each is complete in less than 40 lines."""
     blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
@@ -92,7 +88,7 @@ def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     )
     assert "is not the one" not in (again := tutorial("montecarlo", "live", "--trials", "20", "--out", "again")).err
     assert again.status == 0
-    assert digests(tutorial.folder / "again") == digests(tutorial.folder / "live")
+    assert digests_of(tutorial.folder / "again") == digests_of(tutorial.folder / "live")
     peers = load_results(tutorial.folder / "live").summary["peers"]
     assert peers["tracker"]["expected_trace_covariance"] is None
     assert peers["legitimate"]["expected_trace_covariance"] == pytest.approx(0.00059, rel=0.02)
@@ -103,7 +99,7 @@ def test_workers_import_it_too(tutorial: Evedrop) -> None:
     for workers in "12":
         options = ("--trials", "502", "--slots", "4", "--workers", workers, "--out", workers)
         assert tutorial("montecarlo", "three.toml", *options).status == 0
-    assert digests(tutorial.folder / "1") == digests(tutorial.folder / "2")
+    assert digests_of(tutorial.folder / "1") == digests_of(tutorial.folder / "2")
 
 
 def test_a_module_that_has_changed_since_is_warned_of(tutorial: Evedrop) -> None:
@@ -155,7 +151,7 @@ def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: 
     named = ("--set", "eavesdroppers.tracker.link.loss.model=shifts")
     assert tutorial("run", *short, *named, "--view", "off", "--set", "trials=2", "--out", "live").status == 0
     assert tutorial("montecarlo", *short, *named, "--trials", "2", "--out", "memory").status == 0
-    assert digests(tutorial.folder / "live") == digests(tutorial.folder / "memory")
+    assert digests_of(tutorial.folder / "live") == digests_of(tutorial.folder / "memory")
     assert 'scheme = "flip"' in (tutorial.folder / "live" / "scenario.toml").read_text()
     assert tutorial("check", "--scheme", "flip").status == 0
     done = tutorial("check", *short, "--set", "eavesdroppers.tracker.link.loss.model=bad")
@@ -310,7 +306,7 @@ def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -
     with_table = ("--set", "acknowledgements.link.quality=0.9")
     assert evedrop("run", "mine.toml", "--view", "off", "--out", "live", *with_table).status == 0
     assert evedrop("montecarlo", "mine.toml", "--trials", "3", "--out", "memory", *with_table).status == 0
-    assert digests(evedrop.folder / "live") == digests(evedrop.folder / "memory")
+    assert digests_of(evedrop.folder / "live") == digests_of(evedrop.folder / "memory")
 
 
 def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
@@ -441,7 +437,7 @@ def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedro
     ):
         words = (command[0], "three.toml", *command[1:], "--slots", "30", "--out", name, "--set", event)
         assert tutorial(*words).status == 0
-    assert digests(tutorial.folder / "live") == digests(tutorial.folder / "memory")
+    assert digests_of(tutorial.folder / "live") == digests_of(tutorial.folder / "memory")
 
 
 def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:

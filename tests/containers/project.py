@@ -50,10 +50,8 @@ class Project:
 
     def compose(self, *arguments: str, may_fail: bool = False) -> subprocess.CompletedProcess[str]:
         """What `docker-compose` says."""
-        command, options = (
-            ("docker-compose", "--ansi", "never", *arguments),
-            {"cwd": self.folder, "env": self.environment},
-        )
+        command = ("docker-compose", "--ansi", "never", *arguments)
+        options: dict[str, Any] = {"cwd": self.folder, "env": self.environment}
         if may_fail:
             return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600, **options)
         try:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from evedrop.api import montecarlo
+from tests.builders import digests_of
 from tests.conftest import wait_until
 from tests.containers.project import ENDLESS, ROLES, Project
 
@@ -21,17 +21,14 @@ LONG = "--slots 3000 --pace 0.005"
 Make = Callable[..., Project]
 
 
-def digests(summary: dict[str, Any]) -> dict[str, str]:
-    """Receiver → digest."""
-    return {name: peer["digest"] for name, peer in summary["peers"].items()}
-
-
 def complete(project: Project, slots: int) -> None:
     """Check that the newest results are those of the same trials, computed here in memory."""
-    summary = project.results().summary
+    results = project.results()
+    summary = results.summary
     assert summary["ended"] == "complete"
     folder = project.folder / f"memory-{len(list((project.folder / 'runs').iterdir()))}"
-    assert digests(summary) == digests(montecarlo("two-eavesdroppers", slots=slots, trials=1, out=folder).summary)
+    memory = montecarlo("two-eavesdroppers", slots=slots, trials=1, out=folder)
+    assert digests_of(results) == digests_of(memory)
     assert not any(link["unexplained"] for link in summary["links"].values())
 
 

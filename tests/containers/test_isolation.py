@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import pytest
 
@@ -68,6 +69,11 @@ def addresses(going: Project, service: str) -> dict[str, str]:
     return {name.rpartition("_")[2]: network["IPAddress"] for name, network in networks.items()}
 
 
+def is_healthy(project: Project, service: str) -> bool:
+    """Whether Docker calls a service's container healthy."""
+    return bool(project.state(service)["Health"]["Status"] == "healthy")
+
+
 def test_who_can_reach_what(going: Project) -> None:
     """Every role reaches the router and no other, has its own brief alone, and no rights; all come to be healthy."""
     everybody = {service: addresses(going, service) for service in ROLES}
@@ -92,9 +98,7 @@ def test_who_can_reach_what(going: Project) -> None:
         assert found["briefs"] == [process]
         assert found["rights"] == ["1000", "0" * 16]
     for service in ROLES:
-        wait_until(
-            lambda service=service: going.state(service)["Health"]["Status"] == "healthy", f"a healthy {service}"
-        )
+        wait_until(partial(is_healthy, going, service), f"a healthy {service}")
 
 
 SERVICES = """

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.results.writer import Results, load_results
 from tests.faults import ours
-from tests.faults.disturbed import Disturbed
 from tests.faults.kinds import SIGNALS, Fault
 from tests.faults.reference import Reference, tables_of, unlike
+from tests.faults.variants import Variant
+from tests.proxy import Cable
 
 FAILED, INTERRUPTED, KILLED = 3, 130, -9
 OUTCOMES = ("as if undisturbed", "failed by name", "interrupted", "launcher killed", "MISS")
@@ -26,8 +28,55 @@ def outcome_of(status: int) -> str:
     return {0: OUTCOMES[0], FAILED: OUTCOMES[1], INTERRUPTED: OUTCOMES[2], KILLED: OUTCOMES[3]}.get(status, OUTCOMES[4])
 
 
+class Launcher(Protocol):
+    """A launcher that has ended."""
+
+    @property
+    def returncode(self) -> int:
+        """Its exit status."""
+
+
+class Run(Protocol):
+    """What is looked at of a run that has ended: a `Disturbed` has it."""
+
+    @property
+    def variant(self) -> Variant:
+        """Of which it is a run."""
+
+    @property
+    def folder(self) -> Path:
+        """Everything of it."""
+
+    @property
+    def out(self) -> Path:
+        """Its results."""
+
+    @property
+    def renamed(self) -> Path:
+        """Its results, if they were moved."""
+
+    @property
+    def temporary(self) -> Path:
+        """Where its processes put what is temporary."""
+
+    @property
+    def launcher(self) -> Launcher:
+        """Its launcher."""
+
+    @property
+    def done(self) -> int:
+        """How many slots it said are done."""
+
+    @property
+    def cables(self) -> Mapping[tuple[int, str], Cable]:
+        """Shard and process → its cable."""
+
+    def text(self, name: str) -> str:
+        """What it wrote to stdout or stderr."""
+
+
 def misses(
-    run: Disturbed, hits: Sequence[Fault], longest_outage: float, reference: Reference, before: frozenset[int]
+    run: Run, hits: Sequence[Fault], longest_outage: float, reference: Reference, before: frozenset[int]
 ) -> list[str]:
     """What was promised and does not hold, now that the launcher has ended; hits: the faults that hit something."""
     left = ours.none_left(before, _LEAVE_SECONDS)
@@ -43,7 +92,7 @@ def misses(
     return found
 
 
-def _of_status(status: int, run: Disturbed, hits: Sequence[Fault], longest_outage: float) -> Iterator[str]:
+def _of_status(status: int, run: Run, hits: Sequence[Fault], longest_outage: float) -> Iterator[str]:
     fatal = [fault for fault in hits if not fault.survived(longest_outage)]
     if status != 0 and not fatal:
         yield f"status {status}, although nothing of this may end a run: {_first_line(run)}"
@@ -62,14 +111,14 @@ def _of_status(status: int, run: Disturbed, hits: Sequence[Fault], longest_outag
         yield f"status {status}: {_first_line(run)}"
 
 
-def _first_line(run: Disturbed) -> str:
+def _first_line(run: Run) -> str:
     complaints = [
         line for line in run.text("stderr").splitlines() if line.startswith("evedrop: ") and "warning" not in line
     ]
     return complaints[0] if complaints else run.text("stderr").strip().partition("\n")[0]
 
 
-def _of_what_is_said(run: Disturbed) -> Iterator[str]:
+def _of_what_is_said(run: Run) -> Iterator[str]:
     """Tracebacks, wherever they are."""
     logs = [path for folder in _folders(run) for path in sorted(folder.glob("**/*.log"))]
     for path in (run.folder / "stdout", run.folder / "stderr", *logs):
@@ -78,20 +127,20 @@ def _of_what_is_said(run: Disturbed) -> Iterator[str]:
             yield f"{path.relative_to(run.folder)} has a traceback: {text.strip().splitlines()[-1]}"
 
 
-def _of_ports(run: Disturbed) -> Iterator[str]:
+def _of_ports(run: Run) -> Iterator[str]:
     for cable in run.cables.values():
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", cable.port)) == 0:
                 yield f"port {cable.port} still listens"
 
 
-def _folders(run: Disturbed) -> list[Path]:
+def _folders(run: Run) -> list[Path]:
     """Where results are, or were moved to: those of each shard where they could not be made one."""
     found = [folder for folder in (run.out, run.renamed) if folder.is_dir()]
     return [one for folder in found for one in (sorted((folder / "shards").glob("*")) or [folder])]
 
 
-def _of_results(status: int, run: Disturbed, hits: Sequence[Fault], reference: Reference) -> Iterator[str]:
+def _of_results(status: int, run: Run, hits: Sequence[Fault], reference: Reference) -> Iterator[str]:
     disk = any(fault.target == "results" for fault in hits)
     folders = _folders(run)
     written = [folder for folder in folders if any(_has_rows(path) for path in folder.glob("**/*.parquet"))]
@@ -112,9 +161,7 @@ def _of_results(status: int, run: Disturbed, hits: Sequence[Fault], reference: R
         yield "there are no results"
 
 
-def _of_summary(
-    status: int, run: Disturbed, hits: Sequence[Fault], results: Results, reference: Reference
-) -> Iterator[str]:
+def _of_summary(status: int, run: Run, hits: Sequence[Fault], results: Results, reference: Reference) -> Iterator[str]:
     """Whether the summary says how it ended, and accounts for every packet; tables are whole up to what it says."""
     summary = results.summary
     unexplained = [name for name, link in summary["links"].items() if link["unexplained"]]

@@ -6,9 +6,8 @@ import math
 import shutil
 import subprocess
 import sys
-import threading
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pyarrow as pa
@@ -21,7 +20,8 @@ from tests.faults.cases import HASTY_SECONDS, PATIENT_SECONDS, case_of
 from tests.faults.kinds import EVERYBODY, KINDS, Fault
 from tests.faults.moments import PHASES, Moment
 from tests.faults.reference import Reference, in_memory, tables_of, unlike
-from tests.faults.variants import VARIANTS
+from tests.faults.variants import VARIANTS, Variant
+from tests.proxy import Cable
 
 ROOT = Path(__file__).parents[2]
 ENDURED, FAILED, INTERRUPTED = "82", "132", "55"
@@ -92,8 +92,41 @@ def test_another_summary_is_seen(reference: Reference) -> None:
     assert len(list(unlike(summary, reference))) == 1 + 2 * len(VARIANTS["plain"].receivers)
 
 
+@dataclass
+class Status:
+    """A launcher that has ended."""
+
+    returncode: int = 0
+
+
+@dataclass
+class Ended:
+    """What the judge looks at of a run."""
+
+    folder: Path
+    out: Path
+    launcher: Status = field(default_factory=Status)
+    variant: Variant = VARIANTS["plain"]
+    done: int = 400
+    cables: dict[tuple[int, str], Cable] = field(default_factory=dict)
+
+    @property
+    def renamed(self) -> Path:
+        """Nothing is there."""
+        return self.folder / "renamed"
+
+    @property
+    def temporary(self) -> Path:
+        """Empty, as it should be."""
+        return self.folder / "temporary"
+
+    def text(self, name: str) -> str:
+        """What it wrote to stdout or stderr."""
+        return (self.folder / name).read_text()
+
+
 @pytest.fixture
-def ended(tmp_path: Path, memory: Path, reference: Reference) -> SimpleNamespace:
+def ended(tmp_path: Path, memory: Path, reference: Reference) -> Ended:
     """What the judge looks at of a run, which ended as nothing had happened."""
     out = tmp_path / "run"
     shutil.copytree(memory, out)
@@ -101,18 +134,7 @@ def ended(tmp_path: Path, memory: Path, reference: Reference) -> SimpleNamespace
     (tmp_path / "temporary").mkdir()
     for name in ("stdout", "stderr"):
         (tmp_path / name).touch()
-    return SimpleNamespace(
-        variant=VARIANTS["plain"],
-        folder=tmp_path,
-        out=out,
-        renamed=tmp_path / "renamed",
-        temporary=tmp_path / "temporary",
-        launcher=SimpleNamespace(returncode=0),
-        done=400,
-        cables={},
-        over=threading.Event(),
-        text=lambda name: (tmp_path / name).read_text(),
-    )
+    return Ended(tmp_path, out)
 
 
 KILL = Fault("kill", "smart", Moment("run", 0.5))
@@ -127,7 +149,7 @@ SEEN: dict[str, tuple[int, str, list[Fault], str]] = {
 
 
 @pytest.mark.parametrize("what", SEEN)
-def test_the_judge_sees(what: str, ended: SimpleNamespace, reference: Reference) -> None:
+def test_the_judge_sees(what: str, ended: Ended, reference: Reference) -> None:
     """What a launcher must not do or say."""
     ended.launcher.returncode, said, hits, expected = SEEN[what]
     (ended.folder / "stderr").write_text(said)
@@ -135,7 +157,7 @@ def test_the_judge_sees(what: str, ended: SimpleNamespace, reference: Reference)
     assert [line for line in found if expected in line], found
 
 
-def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: SimpleNamespace, reference: Reference) -> None:
+def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, reference: Reference) -> None:
     """A private folder, and a table that is cut off; of a run with which nothing is wrong it says nothing."""
     before = frozenset(one.pid for one in ours.descendants())
     assert judge.misses(ended, [], PATIENT_SECONDS, reference, before) == []

@@ -16,6 +16,7 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy import stats
 
 from evedrop.errors import TraceError
@@ -29,6 +30,7 @@ from evedrop.loading import load
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.recordings.link_recording import Outcomes
+from tests.builders import scalar_tables
 from tests.conftest import Evedrop
 
 BERNOULLI = {"model": "bernoulli", "quality": 0.9}
@@ -41,7 +43,8 @@ def recorded(spec: dict[str, Any], count: int, seed: int = 0) -> Outcomes:
     """A recording of a link, (count,)."""
     loss = loss_of(spec)
     u = np.random.default_rng(seed).random((count, loss.uniforms_per_slot, 1))
-    return (loss.fates(0, u)[:, 0] == Fate.DELIVERED).astype(np.uint8)
+    delivered: NDArray[np.uint8] = (loss.fates(0, u)[:, 0] == Fate.DELIVERED).astype(np.uint8)
+    return delivered
 
 
 def save(folder: Path, outcomes: Outcomes, **more: Any) -> Path:
@@ -283,13 +286,7 @@ def test_the_command_prints_what_can_be_pasted(evedrop: Evedrop) -> None:
     assert [one["name"] for one in found["candidates"]] == ["bernoulli", "gilbert", "gilbert-elliott"]
     assert set(found["candidates"][1]["intervals"]) == {"p", "r"}
     assert found["outcomes"] == 5000
-    scenario = {
-        "title": "Pasted",
-        "slots": 10,
-        "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": tomllib.loads(lines[-1]),
-    }
+    scenario = scalar_tables(1.0, 0.01, slots=10, legitimate=tomllib.loads(lines[-1]))
     (evedrop.folder / "mine.toml").write_text(tomli_w.dumps(scenario))
     assert load(evedrop.folder / "mine.toml").legitimate.link.model.chain is not None
 

@@ -14,7 +14,7 @@ import tomllib
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -88,7 +88,8 @@ def _as_json(mutator: Mutator, data: bytes) -> bytes:
 
 def _as_msgpack(mutator: Mutator, data: bytes) -> bytes:
     try:
-        return msgpack.packb(mutator.tree(msgpack.unpackb(data, strict_map_key=False)), use_bin_type=True)
+        packed: bytes = msgpack.packb(mutator.tree(msgpack.unpackb(data, strict_map_key=False)), use_bin_type=True)
+        return packed
     except (OverflowError, TypeError, ValueError):
         return mutator.raw(data)
 
@@ -188,7 +189,7 @@ def _trace(data: bytes, folder: Path, name: str = "walk.csv") -> None:
     recording = LinkRecording(folder / name)
     for column in [None, *recording.columns()[:3]]:
         for read in (recording.outcomes, recording.delays):
-            _tried(lambda read=read, column=column: read(column))  # type: ignore[misc]
+            _tried(partial(read, column))
 
 
 def _tried(act: Callable[[], Any]) -> None:
@@ -286,7 +287,7 @@ def _look_at(place: Path) -> None:
 
     results = load_results(place)
     for table in ("slots", "trials", "journal", "digests", "inputs"):
-        _tried(lambda table=table: getattr(results, table))  # type: ignore[misc]
+        _tried(partial(getattr, results, table))
     _tried(lambda: difference(results, results))
     _tried(lambda: print_results(place))
 

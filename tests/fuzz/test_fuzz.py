@@ -116,8 +116,8 @@ def changed(tables: Any, path: tuple[Any, ...], value: Any) -> Any:
         inner = {one: found for one, found in tables.items() if one != name or rest or value is not None}
         return {**inner, name: changed(tables[name], rest, value)} if rest or value is not None else inner
     if isinstance(tables, list) and isinstance(name, int) and name < len(tables):
-        inner = [changed(tables[name], rest, value)] if rest or value is not None else []
-        return [*tables[:name], *inner, *tables[name + 1 :]]
+        found = [changed(tables[name], rest, value)] if rest or value is not None else []
+        return [*tables[:name], *found, *tables[name + 1 :]]
     return tables
 
 

@@ -17,6 +17,7 @@ from evedrop.live.protocol.brief import read_brief
 from evedrop.loading import checked
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
+from tests.builders import MARGINAL, process_table
 from tests.by_hand import ByHand, as_if_undisturbed, by_hand
 from tests.conftest import wait_until
 from tests.hosts.lan import Lan, lan
@@ -32,11 +33,7 @@ def scenario_of(**changes: Any) -> Scenario:
         "slots": 500,
         "seed": 31,
         "pace": 0.01,
-        "process": {
-            "A": [[1.0, 0.05], [0.0, 1.0]],
-            "Q": [[1e-3, 0.0], [0.0, 1e-4]],
-            "initial_covariance": [[1.0, 0.0], [0.0, 0.01]],
-        },
+        "process": process_table(MARGINAL),
         "encoding": {"scheme": "plain"},
         "legitimate": {"link": {"quality": 0.8}},
         "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.7}}},

@@ -18,6 +18,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.ports import RouterEndpoint, meeting_at
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
+from tests.builders import digests_of
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 
 ROLES = ("router", "relay", "sensor", "legitimate", "observer")
@@ -35,11 +36,6 @@ def written(evedrop: Evedrop, *options: str, out: str = "briefs", slots: int = 2
 def begun(evedrop: Evedrop, name: str, path: str, *options: str, **how: Any) -> Live:
     """A process of a brief, started by hand."""
     return evedrop.begun(name if name in ROLES else "eavesdropper", path, *options, **how)
-
-
-def digests(path: Path) -> dict[str, str]:
-    """Receiver → its digest."""
-    return {name: one["digest"] for name, one in load_results(path).summary["peers"].items()}
 
 
 def closing(done: Done) -> list[str]:
@@ -98,7 +94,7 @@ def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards:
     assert {name: done.status for name, done in ended.items()} == dict.fromkeys(briefs, 0), ended
     assert {name: done.err for name, done in ended.items()} == dict.fromkeys(briefs, "")
     assert evedrop("montecarlo", "eavesdroppers", "--slots", "200", "--trials", "1", "--out", "memory").status in {0, 1}
-    assert digests(hosts[1] / "results") == digests(evedrop.folder / "memory")
+    assert digests_of(hosts[1] / "results") == digests_of(evedrop.folder / "memory")
 
 
 @pytest.mark.parametrize(
@@ -154,7 +150,7 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
         == 0
     )
     assert evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--out", "b").status == 0
-    assert digests(evedrop.folder / "a") == digests(evedrop.folder / "b")
+    assert digests_of(evedrop.folder / "a") == digests_of(evedrop.folder / "b")
 
 
 @pytest.mark.parametrize("scenario", ["acknowledged", "restart"])
@@ -165,7 +161,11 @@ def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> 
     assert two.status == 0, two.err
     assert evedrop("run", scenario, *small, "--view", "off", "--out", "one").status == 0
     assert evedrop("montecarlo", scenario, *small, "--out", "memory").status == 0
-    assert digests(evedrop.folder / "two") == digests(evedrop.folder / "one") == digests(evedrop.folder / "memory")
+    assert (
+        digests_of(evedrop.folder / "two")
+        == digests_of(evedrop.folder / "one")
+        == digests_of(evedrop.folder / "memory")
+    )
 
 
 def test_a_run_of_two_routers_is_steered_and_ended_as_any(evedrop: Evedrop) -> None:

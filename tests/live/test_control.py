@@ -15,6 +15,7 @@ from evedrop import load_results
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.live.network.control_file import Control, read_control
+from tests.builders import digests_of
 from tests.conftest import Done, Evedrop, Live, wait_until
 
 SCENARIO = """
@@ -103,11 +104,6 @@ def slot_of(answer: str) -> int:
     return int(re.findall(r"slot (\d+)", answer)[-1])
 
 
-def digests(folder: Path) -> dict[str, str]:
-    """Receiver → digest."""
-    return {name: peer["digest"] for name, peer in load_results(folder).summary["peers"].items()}
-
-
 def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> None:
     """Steered in real time, while a receiver is away too: live and in memory its folder gives the same digests again."""
     run = steered(slots=800, pace=0.002, events=KILLED + DELAYED)
@@ -130,13 +126,13 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
     assert said[4].startswith("slots ")
     assert slot_of(said[4]) == slot_of(said[2]) + 7 == slot_of(said[3]) + 7
     assert run.end().status == 0
-    once = digests(run.live.folder)
+    once = digests_of(run.live.folder)
     assert None not in once.values()
     folder = str(run.live.folder)
     for command in (("run", folder, "--view", "off", "--pace", "0"), ("montecarlo", folder, "--trials", "3")):
         again = evedrop.folder / f"again-{command[0]}"
         assert evedrop(*command, "--out", str(again)).status == 0
-        assert digests(again) == once
+        assert digests_of(again) == once
         assert evedrop("diff", folder, str(again)).status == 0
         events = [(one["slot"], one["event"]) for one in load_results(run.live.folder).summary["events"]]
         repeated = [(one["slot"], one["event"]) for one in load_results(again).summary["events"]]

@@ -48,7 +48,10 @@ class Network:
         def put(payload: bytes) -> None:
             assert Reader(key, payload).text("do") == "end"
             self.told[name] += 1
-            self.does.get(name, lambda _: self.ends(name))(self.told[name])
+            if name in self.does:
+                self.does[name](self.told[name])
+            else:
+                self.ends(name)
 
         return put
 

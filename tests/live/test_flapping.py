@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import wait_until
+from tests.live.network.bench import is_matched
 from tests.live.test_recovery import ACKNOWLEDGED, INNOVATION, LOOP
 from tests.proxy import cable
 from tests.resets import reset_connections
@@ -146,7 +148,7 @@ def test_a_message_of_another_key_is_dropped_counted_and_sent_again(tmp_path: Pa
         with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(observer)))) as session:
             for name in ("other", "sensor"):
                 publisher = session.declare_publisher(keys.control(name))
-                wait_until(lambda publisher=publisher: publisher.matching_status.matching, f"{name} to read")
+                wait_until(partial(is_matched, publisher), f"{name} to read")
                 publisher.put(enclosed(keys.downlink("legitimate"), control("end")))
             publisher.put(enclosed(RunKeys("another").control("sensor"), control("end")))
         assert set(run.statuses().values()) == {0}

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -129,7 +130,7 @@ def test_a_signal_may_come_at_any_time(evedrop: Evedrop, command: str, number: s
     takes = time.monotonic() - begun
     for part in range(40):
         live = evedrop.started(*COMMANDS[command], out=f"{command.rsplit(maxsplit=1)[-1]}-{part}")
-        wait_until(lambda live=live: heeds(live.process.pid), "handlers")  # type: ignore[misc]
+        wait_until(partial(heeds, live.process.pid), "handlers")
         with contextlib.suppress(subprocess.TimeoutExpired):
             live.process.wait(takes * part / 40)
         live.process.send_signal(number)
@@ -230,7 +231,7 @@ def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Sign
         run.write()
         run.start("router", "sensor", "smart")  # which wait for the others
         for name in ("smart", "sensor", "router"):
-            wait_until(lambda name=name: heeds(run.processes[name].pid), f"{name} with handlers")  # type: ignore[misc]
+            wait_until(partial(heeds, run.processes[name].pid), f"{name} with handlers")
             run.processes[name].send_signal(number)
             assert run.processes[name].wait(60) == 130
 

@@ -17,6 +17,7 @@ from evedrop.loading import load
 from evedrop.model.links import LOSS_MODELS
 from evedrop.results.writer import Results
 from evedrop.scenario import Scenario
+from tests.builders import MARGINAL, digests_of, process_table
 from tests.conftest import Evedrop
 
 LOSSES: dict[str, dict[str, Any]] = {
@@ -49,11 +50,7 @@ def scenario(**changes: Any) -> dict[str, Any]:
     return {
         "title": "Every loss model",
         "slots": 300,
-        "process": {
-            "A": [[1.0, 0.05], [0.0, 1.0]],
-            "Q": [[1e-3, 0.0], [0.0, 1e-4]],
-            "initial_covariance": [[1.0, 0.0], [0.0, 0.01]],
-        },
+        "process": process_table(MARGINAL),
         "encoding": {"scheme": "innovation", "state_probability": 0.3},
         "legitimate": {"link": {"loss": LOSSES["gilbert-elliott"]}},
         "eavesdroppers": {
@@ -92,9 +89,7 @@ def test_every_model_is_in_the_scenario() -> None:
 
 def test_live_and_memory_are_the_same_bits(live: Results, memory: Results) -> None:
     """Every loss model gives one digest, in processes and in memory, and every packet is accounted for."""
-    assert {name: peer["digest"] for name, peer in live.summary["peers"].items()} == {
-        name: peer["digest"] for name, peer in memory.summary["peers"].items()
-    }
+    assert digests_of(live) == digests_of(memory)
     assert all(link["unexplained"] == 0 for link in live.summary["links"].values())
     lost = live.summary["links"]["pattern"]["lost"]
     assert lost == 7 * 300 // 4

@@ -17,6 +17,7 @@ from evedrop.loading import checked, load
 from evedrop.model.slot.link import NEVER
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario import Scenario
+from tests.builders import scalar_tables
 
 NEMESIS: dict[str, Any] = {"faults": ["kill", "pause", "cut"], "every": 20, "lasting": 8}
 LOOP: dict[str, Any] = {
@@ -27,20 +28,12 @@ LOOP: dict[str, Any] = {
 
 def tables(nemesis: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
     """A scenario with this nemesis."""
-    return {
-        "title": "Nemesis",
-        "slots": 1000,
-        "seed": 4,
-        "process": {"A": [[0.9]], "Q": [[0.1]], "initial_covariance": [[1.0]]},
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": {
-            "eve": {"strategy": "smart", "link": {"quality": 0.9}},
-            "mallory": {"strategy": "naive", "link": {"quality": 0.9}},
-        },
-        "nemesis": {**NEMESIS, **(nemesis or {})},
-        **more,
+    eavesdroppers = {
+        "eve": {"strategy": "smart", "link": {"quality": 0.9}},
+        "mallory": {"strategy": "naive", "link": {"quality": 0.9}},
     }
+    made = scalar_tables(0.9, 0.1, slots=1000, seed=4, eavesdroppers=eavesdroppers)
+    return {**made, "nemesis": {**NEMESIS, **(nemesis or {})}, **more}
 
 
 def right(nemesis: dict[str, Any] | None = None, **more: Any) -> Scenario:
@@ -230,7 +223,7 @@ def test_whatever_is_drawn_is_a_scenario(
 
 def test_the_same_faults_live_and_in_memory(tmp_path: Path) -> None:
     """All kinds, equal digests of every receiver; and again from what the results have kept."""
-    changes = {
+    changes: dict[str, Any] = {
         "slots": 250,
         "nemesis__from": 10,
         "nemesis__to": 240,

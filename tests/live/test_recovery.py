@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
-from tests.conftest import Evedrop, wait_until
+from tests.conftest import Evedrop, Live, wait_until
 from tests.proxy import Cable, cable
 
 SCENARIO = """
@@ -105,6 +107,16 @@ RUNS: dict[str, dict[str, Any]] = {
 RARER = ("silent and acknowledged", "coded and acknowledged", "in a loop over the truth", "paced, with events")
 
 
+def has_told(live: Live, event: str, times: int) -> bool:
+    """Whether a run has told of an event exactly so often."""
+    return live.told(event) == times
+
+
+def has_ended(process: subprocess.Popen[bytes], status: int) -> bool:
+    """Whether a process has ended with this status."""
+    return process.poll() == status
+
+
 @pytest.mark.parametrize("what", [pytest.param(what, marks=[long] if what in RARER else []) for what in RUNS])
 def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
@@ -114,7 +126,7 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
         live.running(more_than=max(live.done(), 100))
         live.kill("router")
         # Losses that overlap are one outage: this one must be over before the next.
-        wait_until(lambda times=times: live.told("reconnected") == times, "a run that goes on")
+        wait_until(partial(has_told, live, "reconnected", times), "a run that goes on")
     done = live.end(120)
     assert done.status == 0, done.err
     live.nothing_left()
@@ -282,7 +294,7 @@ def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
         run.running()
         wire.cut()
         for process in ("smart", "observer"):
-            wait_until(lambda process=process: run.processes[process].poll() == 3, f"the end of {process}")
+            wait_until(partial(has_ended, run.processes[process], 3), f"the end of {process}")
         assert "smart cut off from the network for 2 s" in run.log("observer").read_text()
 
 

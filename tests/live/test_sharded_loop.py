@@ -16,6 +16,7 @@ from evedrop import montecarlo, run
 from evedrop.loading import load
 from evedrop.results.writer import Results
 from tests.applications.test_microgrid import part_of_day
+from tests.builders import digests_of
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import Evedrop
 from tests.live.test_shards import child, close, in_order
@@ -69,9 +70,7 @@ def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, other: int) -> N
     for name in ("trials", "digests"):
         assert in_order(getattr(ran(2), name)) == in_order(getattr(ran(other), name))
     found, wanted = ran(2).summary, ran(other).summary
-    assert {name: peer["digest"] for name, peer in found["peers"].items()} == {
-        name: peer["digest"] for name, peer in wanted["peers"].items()
-    }
+    assert digests_of(ran(2)) == digests_of(ran(other))
     assert found["controller"]["digest"] == wanted["controller"]["digest"] is not None
     assert found["household"] == wanted["household"]
     assert 0 < found["household"]["active_windows"] < found["household"]["windows"] == 29

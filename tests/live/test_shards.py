@@ -20,6 +20,7 @@ from evedrop.live.launch.shards import OneProgress
 from evedrop.loading import load
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results
+from tests.builders import digests_of
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 
 TRIALS = 7
@@ -132,11 +133,9 @@ def test_every_shard_may_have_two_routers(ran: Ran, tmp_path: Path) -> None:
 @pytest.mark.parametrize("shards", [1, 2, 3])
 def test_digests_are_those_of_memory(ran: Ran, shards: int) -> None:
     """However many processes carry a trial's packets, it is that trial."""
-    digests = [
-        {name: peer["digest"] for name, peer in results.summary["peers"].items()} for results in (ran(shards), ran(0))
-    ]
-    assert digests[0] == digests[1]
-    assert None not in digests[0].values()
+    digests = digests_of(ran(shards))
+    assert digests == digests_of(ran(0))
+    assert None not in digests.values()
 
 
 def test_nothing_is_left_of_the_shards_but_their_logs(ran: Ran) -> None:
@@ -212,7 +211,7 @@ def whole(live: Live) -> int:
     """Check that the folder of a run cut short is one, its tables as far as its trials came; the rows of slots."""
     results = live.results
     assert not (live.folder / "shards").exists()
-    rows = results.slots.num_rows
+    rows: int = results.slots.num_rows
     assert rows == results.journal.num_rows
     trials = results.slots["trials"].to_pylist()
     assert sum(trials) == sum(link["offered"] for link in results.summary["links"].values())

@@ -47,8 +47,8 @@ def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:
         "print(launcher_is_gone(), flush=True)\ninput()\nprint(launcher_is_gone(), flush=True)\n"
         "while not launcher_is_gone():\n    pass\nprint('gone')\n"
     )
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) as process:
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stdout.readline() == "False\n"

@@ -146,12 +146,14 @@ class Run:
         for name, where in self.answers.items():
             self.stall.take(name, where)
 
-    def wait(self, seconds: float, done: int = 50, step: float = 0.25, **how: bool) -> None:
+    def wait(
+        self, seconds: float, done: int = 50, step: float = 0.25, *, held: bool = False, missing: bool = False
+    ) -> None:
         """Let time go by."""
         end = self.clock.now + seconds
         while self.clock.now < end:
             self.clock.now += step
-            self.stall.look(done, self.reported, **{"held": False, "missing": False, **how})
+            self.stall.look(done, self.reported, held=held, missing=missing)
 
     def reported(self) -> Mapping[str, int]:
         """How far everybody is."""

@@ -12,16 +12,10 @@ from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
 from evedrop.loading import checked
 from evedrop.scenario import Scenario
+from tests.builders import scalar_tables
 
 SLOTS = 100
-TABLES: dict[str, Any] = {
-    "title": "Steered",
-    "slots": SLOTS,
-    "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
-    "encoding": {"scheme": "innovation", "state_probability": 0.5},
-    "legitimate": {"link": {"quality": 0.9}},
-    "eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.7}}},
-}
+TABLES = scalar_tables(1.0, 0.01, slots=SLOTS, eavesdroppers={"smart": {"strategy": "smart", "link": {"quality": 0.7}}})
 
 
 @dataclass

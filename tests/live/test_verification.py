@@ -79,7 +79,7 @@ def changed(place: int, **how: Callable[[Any], Any]) -> list[Report]:
     return made
 
 
-def at(where: tuple[int, ...], change: Callable[[float], float]) -> Callable[[np.ndarray], np.ndarray]:
+def at(where: tuple[int, ...], change: Callable[[Any], Any]) -> Callable[[np.ndarray], np.ndarray]:
     """An array with one number changed."""
 
     def done(array: np.ndarray) -> np.ndarray:
@@ -173,7 +173,7 @@ def slots_of(**changes: Any) -> Slots:
     return Slots(8, np.zeros((2, N, TRIALS)), np.zeros((2, TRIALS), bool), {"eve": replace(receiver, **changes)}, sent)
 
 
-CLAIMS = {
+CLAIMS: dict[str, tuple[dict[str, Any], str]] = {
     "received": ({"action": np.array([[2, 0, 2, 2], [0, 0, 2, 2]], np.uint8)}, "eve contradicts router: in slot 9, trial 11, it "
                  r"says that it received nothing \(action 0\), but the journal says that it was delivered"),
     "lost": ({"action": np.array([[2, 3, 2, 2], [0, 2, 2, 2]], np.uint8)}, "eve contradicts router: in slot 8, trial 11, it "
@@ -201,7 +201,7 @@ def test_who_contradicts_the_journal_is_found_out(what: str) -> None:
 
 
 EXTENT = Extent(SLOTS, 300, N, TRIALS, RECORDED)
-WRONG = {
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "a block that does not end": (
         {"digests": {1: np.zeros((4, 32), np.uint8)}},
         r"digests of block 1; expected none: no block",
@@ -243,7 +243,7 @@ def test_nothing_follows_the_last_slot(first: int) -> None:
         read_report(Reader("evedrop/r/telemetry/eve", raw), first, EXTENT, Blocks(SLOTS, CUTS))
 
 
-JOURNALS = {
+JOURNALS: dict[str, tuple[dict[str, Any], str]] = {
     "more fates than packets": ({"lost": {**dict.fromkeys(REASONS, np.zeros(1, np.uint32)), "cut": np.ones(1, np.uint32)}},
                                 r"5 fates of eve's packets of slot 7; expected 4 fates"),
     "fewer fates than packets": ({"delivered": np.array([[True, True, False, True]])},

@@ -12,11 +12,12 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.api import load_results, montecarlo
+from evedrop.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.memory import workers
 from evedrop.memory.montecarlo import Plan
 from evedrop.ports import free_port
+from evedrop.results.writer import load_results
 from tests.conftest import Evedrop, wait_until
 
 pytest.importorskip("distributed")

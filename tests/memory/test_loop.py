@@ -20,6 +20,7 @@ from evedrop.memory.simulation import Mode
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results
 from evedrop.scenario import Scenario
+from tests.builders import digests_of
 from tests.conftest import Evedrop
 
 TITLE = "A tank that is steered over a lossy network"
@@ -98,8 +99,7 @@ def in_memory(folder: Path, plan: Plan | None = None, **changes: Any) -> Results
 
 def digests(results: Results) -> dict[str, str]:
     """Of all receivers, and of the controller."""
-    found = {name: peer["digest"] for name, peer in results.summary["peers"].items()}
-    return {**found, "controller": results.summary["controller"]["digest"]}
+    return {**digests_of(results), "controller": results.summary["controller"]["digest"]}
 
 
 def column(table: pa.Table | None, name: str, **where: Any) -> np.ndarray:
@@ -114,9 +114,13 @@ def test_the_loop_is_closed_over_the_estimate(tmp_path: Path) -> None:
     """The tables tell the same story: every state follows from the one before, and every input from the estimate."""
     results = in_memory(tmp_path / "run")
     x, x_hat = (column(results.trials, name, peer="legitimate", trial=1) - [55.0, 50.0] for name in ("x", "x_hat"))
+    assert results.inputs is not None
     assert results.inputs.schema.names == ["slot", "trial", "u", "d", "failed", "clipped"]
     u, d = (column(results.inputs, name, trial=1) for name in ("u", "d"))
-    assert np.array_equal(d, scenario_of().plant.disturbance_values)
+    plant = scenario_of().plant
+    assert plant is not None
+    assert plant.disturbance_values is not None
+    assert np.array_equal(d, plant.disturbance_values)
     moved = x[:-1] @ np.array([[1.0, 0.05], [0.0, 1.0]]) + u[:-1] * [0.1, 0.0] + d[:-1] * [-0.05, 0.0]
     assert np.allclose(x[1:, 1], moved[:, 1], atol=1e-10)
     assert 3e-4 < (x[1:, 0] - moved[:, 0]).std() < 3e-3
@@ -184,6 +188,7 @@ def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
     assert live.summary["ended"] == "complete"
     assert None not in digests(live).values()
     assert digests(live) == digests(memory)
+    assert live.inputs is not None
     assert live.inputs.equals(memory.inputs)
     assert difference(live, memory).same
     timed = {"mean_solve_seconds", "longest_solve_seconds"}
@@ -209,7 +214,9 @@ def test_a_killed_controller_is_named(evedrop: Evedrop) -> None:
     assert "logs/controller.log" in done.err
     live.nothing_left()
     assert live.results.summary["controller"]["digest"] is None
-    assert live.results.inputs.num_rows == live.results.summary["slots"]
+    inputs = live.results.inputs
+    assert inputs is not None
+    assert inputs.num_rows == live.results.summary["slots"]
 
 
 def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
@@ -295,8 +302,8 @@ def test_late_packets_are_followed_with_the_inputs(tmp_path: Path) -> None:
     link = {"quality": 0.9, "delay": {"model": "normal", "mean": 1.0, "deviation": 1.0}}
     late = {}
     for knows in (False, True):
-        changes = {"legitimate__link": link, "legitimate__window": 4, "legitimate__knows_input": knows}
-        quiet = {"plant__disturbance_values": [[0.0]] * 300, "plant__noise": [[0.0, 0.0], [0.0, 0.0]]}
+        changes: dict[str, Any] = {"legitimate__link": link, "legitimate__window": 4, "legitimate__knows_input": knows}
+        quiet: dict[str, Any] = {"plant__disturbance_values": [[0.0]] * 300, "plant__noise": [[0.0, 0.0], [0.0, 0.0]]}
         results = in_memory(tmp_path / str(knows), **changes, **quiet, controller__acts_on="truth")
         found = results.summary["controller"]["mean_squared_errors"]
         in_loop = results.summary["peers"]["legitimate"]["mean_squared_error"]

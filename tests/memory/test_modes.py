@@ -22,7 +22,9 @@ from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.results.writer import Results
 from evedrop.scenario import Scenario
+from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
+from tests.builders import MICROGRID, process_table
 
 SURE = 4.5
 COVARIANCES, ERRORS = Plan(Mode.COVARIANCE_ONLY, workers=1), Plan(Mode.ERROR_COORDINATES, workers=1)
@@ -50,16 +52,26 @@ def scenario(A: list[list[float]], slots: int, mu_d: float = 0.6, **eavesdropper
 SMART = {"strategy": "smart", "link": {"quality": 0.85}}
 NAIVE = {"strategy": "naive", "link": {"quality": 0.7}}
 SUSPICIOUS = {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.3, "link": {"quality": 0.9}}
-ALL = {"smart": SMART, "naive": NAIVE, "suspicious": SUSPICIOUS}
+ALL: dict[str, Any] = {"smart": SMART, "naive": NAIVE, "suspicious": SUSPICIOUS}
+
+
+def quality_of(link: LinkTable | None) -> float:
+    """The quality of a link whose losses are independent."""
+    assert link is not None
+    assert link.quality is not None
+    return link.quality
 
 
 def outcomes_of(of: Scenario) -> dict[str, Outcomes]:
     """Receiver → what it does with a slot, by the paper's definition of its strategy."""
     mu_d = of.encoding.mu_d
-    found = {"legitimate": Outcomes.legitimate(of.legitimate.link.quality, mu_d)}
+    found = {"legitimate": Outcomes.legitimate(quality_of(of.legitimate.link), mu_d)}
     for name, table in of.eavesdroppers.items():
-        use = {"smart": (1.0, 0.0), "naive": (1.0, 1.0), "suspicious": (table.use_state, table.use_innovation)}
-        found[name] = Outcomes.eavesdropper(table.link.quality, mu_d, *use[table.strategy])
+        uses = {"smart": (1.0, 0.0), "naive": (1.0, 1.0), "suspicious": (table.use_state, table.use_innovation)}
+        use_state, use_innovation = uses[table.strategy]
+        assert use_state is not None
+        assert use_innovation is not None
+        found[name] = Outcomes.eavesdropper(quality_of(table.link), mu_d, use_state, use_innovation)
     return found
 
 
@@ -220,7 +232,11 @@ def test_random_scenarios_agree_with_theory(
 @pytest.mark.parametrize("plan", [COVARIANCES, ERRORS], ids=["covariance-only", "error-coordinates"])
 def test_what_leaves_double_precision_is_refused(plan: Plan, tmp_path: Path) -> None:
     """A naive receiver's error overflows: one line with slot and remedy, nothing on disk; that many slots can be run."""
-    changes = {"slots": 4000, "eavesdroppers__naive__strategy": "naive", "eavesdroppers__naive__link__quality": 0.9}
+    changes: dict[str, Any] = {
+        "slots": 4000,
+        "eavesdroppers__naive__strategy": "naive",
+        "eavesdroppers__naive__link__quality": 0.9,
+    }
     with pytest.raises(
         UsageError, match=r"naive's expected error leaves double precision at slot \d+; give --slots"
     ) as told:
@@ -237,10 +253,11 @@ def test_what_leaves_double_precision_is_refused(plan: Plan, tmp_path: Path) -> 
 @pytest.mark.parametrize("strategy", ["bayesian", "likelihood", "genie", "colluding", "replay-informed"])
 def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path) -> None:
     """Named with strategy, reason and ways out; nothing on disk. What follows from losses alone is taken."""
-    more: dict[str, Any] = {
+    entries: dict[str, dict[str, Any]] = {
         "colluding": {"links": [{"quality": 0.5}, {"quality": 0.6}], "reads_as": "genie"},
         "replay-informed": {"link": {"quality": 0.5}, "reads_as": "smart", "learns_at": 3},
-    }.get(strategy, {"link": {"quality": 0.5}})
+    }
+    more = entries.get(strategy, {"link": {"quality": 0.5}})
     of = scenario(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
     said = rf"--mode {plan.mode.value} follows .* the actions of eve \(strategy {strategy}\).*; give --mode exact, or remove eve"
     with pytest.raises(UsageError, match=said):
@@ -293,7 +310,7 @@ def test_misled_receivers_believe_less_than_there_is(covariances: Results) -> No
 
 def test_error_coordinates_have_no_digest(tmp_path: Path) -> None:
     """Squared errors beside theory, beyond the horizon of the ordinary mode; the horizon is not asked for."""
-    changes = {"encoding__state_probability": 0.9, "slots": 300}
+    changes: dict[str, Any] = {"encoding__state_probability": 0.9, "slots": 300}
     results = montecarlo("numerical", trials=20, plan=ERRORS, out=tmp_path / "run", **changes)
     assert results.summary["mode"] == "error-coordinates"
     assert {peer["digest"] for peer in results.summary["peers"].values()} == {None}
@@ -308,11 +325,7 @@ def test_the_table_of_the_microgrid(tmp_path: Path) -> None:
         {
             "title": "microgrid",
             "slots": 86_400,
-            "process": {
-                "A": [[1.0, 0.0], [0.0, 1.0]],
-                "Q": [[1e-5, 0.0], [0.0, 1e-5]],
-                "initial_covariance": [[1e-5, 0.0], [0.0, 1e-5]],
-            },
+            "process": process_table(MICROGRID),
             "encoding": {"scheme": "innovation", "state_probability": 0.5},
             "legitimate": {"link": {"quality": 0.6}},
             "eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.6}}},

@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow.compute as pc
 import pytest
 
-from evedrop.api import load_results, montecarlo
+from evedrop.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.memory.montecarlo import Plan
-from evedrop.results.writer import Results
+from evedrop.results.writer import Results, load_results
 from tests.conftest import Evedrop
 
 CASES: dict[str, dict[str, Any]] = {

@@ -16,9 +16,9 @@ from evedrop.loading import checked
 from evedrop.memory.montecarlo import check_mode
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.numeric.detection import Chart
-from evedrop.results.writer import Results
 from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection, chart_of
+from tests.builders import digests_of
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
@@ -74,19 +74,14 @@ def mistakes(scheme: str, **more: Any) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def digests(results: Results) -> dict[str, str]:
-    """Receiver → digest."""
-    return {name: peer["digest"] for name, peer in results.summary["peers"].items()}
-
-
 @pytest.mark.parametrize("scheme", RUNS)
 def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
     """Equal digests and accounts of every receiver, the same alarms, and no packet unaccounted for."""
     scenario = scenario_of(scheme)
     live = run(scenario, out=tmp_path / "live")
     memory = montecarlo(scenario, trials=5, out=tmp_path / "memory")
-    assert all(digests(live).values())
-    assert digests(live) == digests(memory)
+    assert all(digests_of(live).values())
+    assert digests_of(live) == digests_of(memory)
     assert live.summary["links"] == memory.summary["links"]
     assert live.summary["detection"] == memory.summary["detection"]
     rows = live.trials.to_pydict()
@@ -243,8 +238,8 @@ def test_a_betrayed_state_opens_twin_tracks(tmp_path: Path) -> None:
     scenario = scenario_of("twin-track", slots=40, trials=30, eavesdroppers={"tracker": tracker, "spy": spy})
     live = run(scenario, out=tmp_path / "live")
     memory = montecarlo(scenario, trials=30, out=tmp_path / "memory")
-    assert all(digests(live).values())
-    assert digests(live) == digests(memory)
+    assert all(digests_of(live).values())
+    assert digests_of(live) == digests_of(memory)
     rows = live.slots.to_pydict()
     error = {
         name: np.array([e for e, peer in zip(rows["mean_squared_error"], rows["peer"], strict=True) if peer == name])

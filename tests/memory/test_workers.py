@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -122,10 +123,10 @@ def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch,
     from evedrop.api import montecarlo
     from evedrop.memory import montecarlo as module
 
-    def failing(tasks: list[object], *_: object) -> object:
+    def failing(tasks: list[Any], *_: object) -> object:
         from evedrop.memory.trials import carry_out
 
-        yield carry_out(tasks[0], lambda _: None, lambda: False)  # type: ignore[arg-type]
+        yield carry_out(tasks[0], lambda _: None, lambda: False)
         raise RunError("a worker process died")
 
     monkeypatch.setattr(module, "in_processes", failing)

@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-import numpy as np
-
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Belief, Flags, Receiver, Reception
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.streams import Batch, Stream, uniforms
+from tests.builders import UNSTABLE, stream_keys
 
-EXAMPLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), 1e-3 * np.eye(2))
+EXAMPLE = Process(UNSTABLE.A, UNSTABLE.Q, UNSTABLE.Q)
 """The paper's numerical illustration with Σ0 = Q."""
-MARGINAL = Process(np.array([[1.0, 0.05], [0.0, 1.0]]), np.diag([1e-3, 1e-4]), np.diag([1.0, 0.01]))
-MICROGRID = Process(np.eye(2), 1e-5 * np.eye(2), 1e-5 * np.eye(2))
 
 
 def keys(seed: int) -> dict[str, bytes]:
     """Of all streams."""
-    return {name: stream_key(root_of_seed(seed), name) for name in ("process", "schedule", "noise", "coin", "link")}
+    return stream_keys(seed, ("process", "schedule", "noise", "coin", "link"))
 
 
 class Slot(NamedTuple):

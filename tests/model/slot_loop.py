@@ -14,14 +14,8 @@ from evedrop.model.schemes.scheme import Packet, Scheme
 from evedrop.streams import Batch, root_of_seed, stream_key
 
 ROOT = root_of_seed(4)
-UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.eye(2))
 STABLE = Process(
     np.array([[0.9, 0.3], [-0.2, 0.7]]), np.array([[1e-2, 2e-3], [2e-3, 2e-2]]), np.array([[0.1, 0.02], [0.02, 0.2]])
-)
-DRIFTING = Process(
-    np.array([[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]]),
-    np.array([[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]]),
-    np.array([[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]]),
 )
 
 Flags = np.ndarray[Any, Any]

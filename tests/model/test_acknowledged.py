@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 import pytest
-from slot_loop import DRIFTING, STABLE, UNSTABLE, Played, play
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -17,6 +16,8 @@ from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.model.theory.covariances import expected_covariances
 from evedrop.streams import Batch
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import STABLE, Played, play
 
 
 def played_over(process: Process, gamma: np.ndarray, gamma_e: np.ndarray, acks: np.ndarray) -> Played:

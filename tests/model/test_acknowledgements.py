@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.stats import binomtest
-from slot_loop import ROOT, UNSTABLE, coins, play
 
 from evedrop.model.acknowledgements import ATTACKS, AckChannel, rates_of
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -19,6 +18,8 @@ from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.streams import Batch, stream_key
+from tests.builders import UNSTABLE
+from tests.model.slot_loop import ROOT, coins, play
 
 KEY = stream_key(ROOT, "link/acknowledgements")
 

@@ -17,7 +17,8 @@ from evedrop.model.receiver import Reception
 from evedrop.model.slot.link import link_of
 from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
 from evedrop.streams import Batch, Stream, uniforms
-from tests.model.listening import EXAMPLE, MARGINAL, MICROGRID, Slot, followed, keys, slots
+from tests.builders import MARGINAL, MICROGRID
+from tests.model.listening import EXAMPLE, Slot, followed, keys, slots
 
 HALVES = {"quality": 0.6, "model": "bernoulli"}, {"quality": 0.5, "model": "bernoulli"}
 BURSTS = {"model": "gilbert-elliott", "p": 0.1, "r": 0.4}

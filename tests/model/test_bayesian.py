@@ -16,7 +16,8 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Receiver, Reception
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.streams import Batch
-from tests.model.listening import EXAMPLE, MARGINAL, MICROGRID, followed, keys, slots
+from tests.builders import MARGINAL, MICROGRID
+from tests.model.listening import EXAMPLE, followed, keys, slots
 
 SURE = 4.5  # standard errors: a normal mean is beyond with a probability below 7e-6
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, coins, play
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -16,6 +15,8 @@ from evedrop.model.process import Process
 from evedrop.model.schemes.cipher import Cipher
 from evedrop.model.theory.covariances import expected_covariances, state_covariances
 from evedrop.streams import Batch, Stream, stream_key
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import ROOT, STABLE, coins, play
 
 KEY = stream_key(ROOT, "mask")
 

@@ -28,7 +28,7 @@ def test_log_is_within_one_unit_in_the_last_place(x: list[float]) -> None:
 def test_log_at_landmarks() -> None:
     """Exact at 1, near 1 without cancellation, and across every change of exponent."""
     assert log(np.array([1.0]))[0] == 0.0
-    near = 1.0 + np.arange(-1000, 1000) * 2.0**-45
+    near = 1.0 + np.arange(-1000, 1000, dtype=np.float64) * 2.0**-45
     assert np.allclose(log(near), np.log1p(near - 1.0), rtol=3e-16, atol=0)
     powers = np.array(
         [math.ldexp(m, e) for e in range(-1000, 1000, 7) for m in (0.5, 0.7071067811865475, 0.7071067811865477)]

@@ -14,7 +14,8 @@ from evedrop.model.theory.covariances import (
 )
 from evedrop.model.theory.design import Adversary, best_difference, design, relative_secrecy
 from evedrop.paper import microgrid
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.streams import Batch
+from tests.builders import stream_keys
 
 A = np.array([[1.0, 0.3], [0.5, 1.001]])
 Q = 1e-3 * np.eye(2)
@@ -25,7 +26,7 @@ MU, MU_D = 0.9, 0.6
 
 def power(k: int, M: Floats) -> Floats:
     """A^k M (A^k)ᵀ."""
-    Ak = np.linalg.matrix_power(A, k)
+    Ak: Floats = np.linalg.matrix_power(A, k)
     return Ak @ M @ Ak.T
 
 
@@ -162,7 +163,7 @@ def test_item_6_successive_packets_tell_types_apart() -> None:
     """E[z_k z_(k−1)ᵀ] is A Σ_(k−1) for two states and 0 with an innovation, though E[z_k z_kᵀ] is Σ_k for both."""
     process = Process(np.array([[1.0, 0.1], [0.0, 0.95]]), np.diag([0.1, 0.2]), np.eye(2))
     batch = Batch(slots=4, trials=40_000)
-    keys = {name: stream_key(root_of_seed(6), name) for name in ("process", "schedule", "noise")}
+    keys = stream_keys(6, ("process", "schedule", "noise"))
     trajectory, encoder = Trajectory(process, keys["process"], batch), Innovation(process, 0.5).encoder(keys, batch)
     packets = []
     for k in range(batch.slots):

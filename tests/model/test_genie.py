@@ -28,7 +28,8 @@ from evedrop.model.theory.covariances import (
 )
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
 from evedrop.streams import Batch
-from tests.model.listening import EXAMPLE, MARGINAL, followed, keys, slots
+from tests.builders import MARGINAL
+from tests.model.listening import EXAMPLE, followed, keys, slots
 
 SURE = 4.5  # standard errors: a normal mean is beyond with a probability below 7e-6
 MIXED = Process(np.array([[1.2, 0.3, 0.1], [0.0, 0.7, 0.2], [0.0, 0.1, 0.4]]), 0.1 * np.eye(3) + 0.02, np.eye(3))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, Played, coins, play
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -22,6 +21,8 @@ from evedrop.model.theory import closed_forms
 from evedrop.model.theory.covariances import limit
 from evedrop.model.theory.transmission_design import best_policy
 from evedrop.streams import Batch, stream_key
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import ROOT, STABLE, Played, coins, play
 
 MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 READERS = {"scheduled": "naive", "encrypted-schedule": "selective"}

@@ -20,11 +20,12 @@ from evedrop.model.slot.account import COUNTED_BURSTS, Accountant
 from evedrop.model.slot.intermittent_receiver import Absence, Follower
 from evedrop.model.slot.link import Fates, Link, LinkSchedule, streams_of
 from evedrop.model.slot.transit import Arrival, Late, Transit
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.streams import Batch
+from tests.builders import stream_keys
 
 PROCESS = Process(np.array([[1.0, 0.1], [0.0, 0.9]]), np.diag([0.1, 0.2]), np.eye(2))
 BATCH = Batch(40, 9)
-KEYS = {name: stream_key(root_of_seed(5), name) for name in ("process", "schedule", "noise", "coin")}
+KEYS = stream_keys(5, ("process", "schedule", "noise", "coin"))
 MU_D = 0.5
 FULL = {
     "loss": {"model": "bernoulli", "quality": 0.8},
@@ -52,8 +53,7 @@ def packets() -> list[np.ndarray]:
 def fates(window: int) -> Fates:
     """Of a link that loses, delays and duplicates."""
     course = LinkSchedule(FULL, window)
-    keys = {name: stream_key(root_of_seed(6), name) for name in streams_of("it", course)}
-    return Link(course, "it", keys, BATCH).fates(range(BATCH.slots))
+    return Link(course, "it", stream_keys(6, streams_of("it", course)), BATCH).fates(range(BATCH.slots))
 
 
 def same(one: Belief, other: Belief) -> bool:

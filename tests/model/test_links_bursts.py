@@ -18,7 +18,7 @@ from evedrop.model.slot.link import link_of
 from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(21), "link/eve")
-BURSTS = {"model": "gilbert-elliott", "p": 0.02, "r": 0.25}
+BURSTS: dict[str, Any] = {"model": "gilbert-elliott", "p": 0.02, "r": 0.25}
 SOFT = {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.02, "bad": 0.7}
 FOUR_STATES = {  # netem's: good, isolated loss, burst, gap within a burst
     "model": "markov",
@@ -171,7 +171,8 @@ def run_lengths(lost: np.ndarray[Any, Any]) -> list[int]:
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     starts, ends = edges[lost[edges + 1]], edges[~lost[edges + 1]]
     ends = ends[np.searchsorted(ends, starts[0], "right") :] if len(starts) else ends[:0]
-    return (ends - starts[: len(ends)]).tolist()
+    lengths: list[int] = (ends - starts[: len(ends)]).tolist()
+    return lengths
 
 
 def test_gilbert_elliott_bursts_are_geometric() -> None:

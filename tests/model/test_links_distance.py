@@ -42,7 +42,8 @@ def place(given: list[Any], k: int) -> tuple[float, float]:
     """Where one is in slot k."""
     rows = given if isinstance(given[0], list) else [[0, *given]]
     slots = [row[0] for row in rows]
-    return tuple(float(np.interp(k, slots, [row[i] for row in rows])) for i in (1, 2))  # type: ignore[return-value]
+    x, y = (float(np.interp(k, slots, [row[i] for row in rows])) for i in (1, 2))
+    return x, y
 
 
 def snr(spec: dict[str, Any], u: np.ndarray[Any, Any], k: int, first: int) -> float:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links import loss_of
 from evedrop.model.links.counting import count_variance
 from evedrop.model.links.link import Fate
 from evedrop.model.links.markov import stationary
@@ -21,11 +22,12 @@ from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 KEY = stream_key(root_of_seed(5), "link/eve")
 
 
-def delivered(spec: dict[str, Any], slots: range, trials: int = 3) -> np.ndarray[Any, Any]:
+def delivered(spec: dict[str, Any], slots: range, trials: int = 3) -> NDArray[np.bool_]:
     """What a fresh model delivers in these slots, (slots, trials)."""
     model = loss_of(spec)
     drawn = uniforms(Stream(KEY, range(trials), model.uniforms_per_slot).words(slots)).transpose(0, 2, 1)
-    return model.fates(slots.start, drawn) == Fate.DELIVERED
+    found: NDArray[np.bool_] = model.fates(slots.start, drawn) == Fate.DELIVERED
+    return found
 
 
 def test_a_looped_trace_begins_again() -> None:
@@ -122,7 +124,7 @@ def test_the_rate_of_a_chain_scatters_as_all_its_paths_do(
 def test_the_rate_of_many_slots_has_its_limit() -> None:
     """A Gilbert–Elliott link over 10⁸ slots: π_g π_b (1 + λ)/(1 − λ) a slot, λ = 1 − p − r."""
     p, r, slots = 0.01, 0.09, 100_000_000
-    loss = LOSS_MODELS["gilbert-elliott"](p=p, r=r)  # type: ignore[call-arg]
+    loss = loss_of({"model": "gilbert-elliott", "p": p, "r": r})
     limit = p * r / (p + r) ** 2 * (2 - p - r) / (p + r) / slots
     assert loss.rate_variance(range(slots)) == pytest.approx(limit, rel=1e-5)
     assert loss_of({"model": "bernoulli", "quality": 0.7}).rate_variance(range(50)) == pytest.approx(0.21 / 50)

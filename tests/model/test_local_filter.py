@@ -9,12 +9,13 @@ from scipy.linalg import solve_discrete_are
 from evedrop.model.local_filter import LocalFilter, Steps, settled
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory, mistakes_of
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.streams import Batch
+from tests.builders import stream_keys
 
 A = np.array([[1.0, 0.1], [0.0, 0.95]])
 W = np.array([[1e-4, 0.0], [0.0, 4e-4]])
 PROCESS = Process(A, np.eye(2), 0.04 * np.eye(2))
-KEYS = {name: stream_key(root_of_seed(8), name) for name in ("process", "measurement")}
+KEYS = stream_keys(8, ("process", "measurement"))
 
 
 def plant(C: np.ndarray, V: np.ndarray, noise: np.ndarray = W) -> Plant:
@@ -34,6 +35,8 @@ BOTH = plant(np.array([[1.0, 0.0], [0.5, 1.0]]), np.array([[0.01, 0.002], [0.002
 def test_it_settles_where_the_riccati_equation_has_it(of: Plant) -> None:
     """Gain, covariance and K S Kᵀ of the stationary filter; of one measurement K S Kᵀ has rank one."""
     C, V = of.output_matrix, of.measurement_noise
+    assert C is not None
+    assert V is not None
     predicted = solve_discrete_are(A.T, C.T, W, V)
     S = C @ predicted @ C.T + V
     K = predicted @ C.T @ np.linalg.inv(S)
@@ -56,6 +59,7 @@ def test_it_is_the_kalman_filter_slot_by_slot() -> None:
     local, steps = LocalFilter(PROCESS, ONE, KEYS["measurement"], batch), Steps(PROCESS, ONE)
     random = np.random.default_rng(1)
     C, P = ONE.output_matrix, PROCESS.initial_covariance
+    assert C is not None
     x_before = np.zeros((2, 4000))
     for k in range(60):
         pushed = drive.pushed(k)

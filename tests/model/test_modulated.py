@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +25,8 @@ from evedrop.model.theory.covariances import (
     tail_index,
 )
 from evedrop.model.theory.covariances import limit_trace as independent_limit
+from tests.builders import MARGINAL, UNSTABLE
 
-MARGINAL = Process(np.array([[1.0, 0.05], [0.0, 1.0]]), np.diag([1e-3, 1e-4]), np.diag([1.0, 0.01]))
-UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))
 STABLE = Process(np.array([[0.9, 0.1], [0.0, 0.7]]), np.eye(2) * 1e-2, np.eye(2))
 MU_D = 0.6
 
@@ -125,14 +125,20 @@ def test_the_recursion_is_the_sum_over_all_words(use: tuple[float, float] | None
     assert found[-1] == pytest.approx(enumerated(UNSTABLE, chain, use, slots)[-1], rel=1e-12)
 
 
-THREE = loss_of(
+def chain_of(spec: dict[str, Any]) -> Chain:
+    """The chain of a loss model that has one."""
+    chain = loss_of(spec).chain
+    assert chain is not None
+    return chain
+
+
+THREE = chain_of(
     {
         "model": "markov",
         "transitions": [[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.0, 0.6, 0.4]],
         "loss": [0.01, 0.4, 1.0],
     }
-).chain
-assert THREE is not None
+)
 
 
 @every_receiver

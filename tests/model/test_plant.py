@@ -15,6 +15,7 @@ from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.streams import Batch, root_of_seed, stream_key
+from tests.builders import stream_keys
 
 B = 1e-3 * np.array([[1.56, 1.56], [-5.66, 0.0]])
 KEY = stream_key(root_of_seed(9), "process")
@@ -160,7 +161,7 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
     """A x̂ + B u where nothing was received; the other estimate and the offset between the two give the same number."""
     process, batch = Process(np.array([[1.0, 0.1], [0.0, 0.9]]), 1e-4 * np.eye(2), np.eye(2)), Batch(200, 5)
     scheme = scheme_of(process, {"scheme": "innovation", "state_probability": 0.4})
-    secret = {name: stream_key(root_of_seed(1), name) for name in scheme.secret_streams}
+    secret = stream_keys(1, scheme.secret_streams)
     random, of = np.random.default_rng(3), plant()
     drive, trajectory = Drive(of, np.zeros((200, 0))), Trajectory(process, KEY, batch, None, of.noise)
     encoder = scheme.encoder(secret, batch)

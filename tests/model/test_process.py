@@ -15,22 +15,15 @@ from evedrop.model.process import Process, StateFactors, Trajectory, mistakes_of
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.model.theory.horizon import horizon
 from evedrop.streams import Batch, root_of_seed, stream_key
+from tests.builders import DRIFTING, UNSTABLE
 
-A = np.array([[1.0, 0.3], [0.5, 1.001]])
-Q = 1e-3 * np.eye(2)
-EXAMPLE = Process(A, Q, np.eye(2))
 KEY = stream_key(root_of_seed(1), "process")
-THREE = Process(
-    np.array([[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]]),
-    np.array([[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]]),
-    np.array([[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]]),
-)
 
 
 @pytest.mark.parametrize(("initial", "last"), [(1.0, 87), (1e-3, 96), (1e-12, 97)])
 def test_horizon_of_the_papers_example(initial: float, last: int) -> None:
     """The last slot within float64's reach: 87 for Σ0 = I, 96 for Σ0 = Q, 97 for 1e-12 I."""
-    process = Process(A, Q, initial * np.eye(2))
+    process = Process(UNSTABLE.A, UNSTABLE.Q, initial * np.eye(2))
     assert horizon(process, 200) == last
     assert horizon(process, 100_000) == last
     assert horizon(process, last + 2) == last
@@ -82,7 +75,7 @@ def states(process: Process, batch: Batch) -> np.ndarray:
     return np.stack([trajectory.advance().copy() for _ in range(batch.slots)])
 
 
-@pytest.mark.parametrize("process", [EXAMPLE, THREE])
+@pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
 def test_a_trial_alone_is_the_same_trial(process: Process) -> None:
     """Trial 1003 alone, among 7 and among 500 is the same to the bit, and so are fewer slots."""
     among = states(process, Batch(60, 500, 900))
@@ -93,14 +86,14 @@ def test_a_trial_alone_is_the_same_trial(process: Process) -> None:
 
 def test_states_follow_the_process() -> None:
     """What is not A x is white noise of covariance Q, and x_0 has Σ0: chi-squared over 20 000 trials at 1e-6 confidence."""
-    trajectory = Trajectory(THREE, KEY, Batch(4, 20_000))
+    trajectory = Trajectory(DRIFTING, KEY, Batch(4, 20_000))
     before = np.zeros((3, 20_000))
     for k in range(4):
         x = trajectory.advance().copy()
         if k:
-            assert np.allclose(trajectory.predicted, THREE.A @ before, rtol=1e-12, atol=1e-13)
-        w = x - (THREE.A @ before if k else 0.0)
-        white = np.linalg.solve(np.linalg.cholesky(THREE.Q if k else THREE.initial_covariance), w)
+            assert np.allclose(trajectory.predicted, DRIFTING.A @ before, rtol=1e-12, atol=1e-13)
+        w = x - (DRIFTING.A @ before if k else 0.0)
+        white = np.linalg.solve(np.linalg.cholesky(DRIFTING.Q if k else DRIFTING.initial_covariance), w)
         distance = np.sum(white * white)
         assert 1e-6 < stats.chi2.cdf(distance, white.size) < 1 - 1e-6
         assert stats.kstest(white.ravel(), "norm").pvalue > 1e-6
@@ -109,15 +102,17 @@ def test_states_follow_the_process() -> None:
 
 def test_covariances_are_the_recursion() -> None:
     """Σ_k = A Σ_{k−1} Aᵀ + Q from Σ0, in closed form."""
-    found = state_covariances(THREE, 20)
+    found = state_covariances(DRIFTING, 20)
     for k in (0, 1, 7, 19):
         power = np.linalg.matrix_power
-        expected = power(THREE.A, k) @ THREE.initial_covariance @ power(THREE.A, k).T
-        expected += sum((power(THREE.A, j) @ THREE.Q @ power(THREE.A, j).T for j in range(k)), np.zeros((3, 3)))
+        expected = power(DRIFTING.A, k) @ DRIFTING.initial_covariance @ power(DRIFTING.A, k).T
+        expected += sum(
+            (power(DRIFTING.A, j) @ DRIFTING.Q @ power(DRIFTING.A, j).T for j in range(k)), np.zeros((3, 3))
+        )
         assert np.allclose(found[k], expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("process", [EXAMPLE, THREE])
+@pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
 def test_factors_are_of_the_covariances(process: Process) -> None:
     """A L_{k−1} times its transpose is A Σ_{k−1} Aᵀ, to 1e-12, whatever the order in which slots are asked for."""
     factors = StateFactors(process)
@@ -131,8 +126,8 @@ def test_factors_are_of_the_covariances(process: Process) -> None:
 
 def test_factors_hold_where_cholesky_fails() -> None:
     """In the unstable example they hold at k = 60 against exact fractions, where Σ has no Cholesky factor any more."""
-    exact = [[Fraction(float(v)) for v in row] for row in EXAMPLE.initial_covariance]
-    A_, Q_ = ([[Fraction(float(v)) for v in row] for row in M] for M in (A, Q))
+    exact = [[Fraction(float(v)) for v in row] for row in UNSTABLE.initial_covariance]
+    A_, Q_ = ([[Fraction(float(v)) for v in row] for row in M] for M in (UNSTABLE.A, UNSTABLE.Q))
 
     def times(M: list[list[Fraction]], N: list[list[Fraction]]) -> list[list[Fraction]]:
         return [[sum((M[i][j] * N[j][c] for j in range(2)), Fraction(0)) for c in range(2)] for i in range(2)]
@@ -142,18 +137,18 @@ def test_factors_hold_where_cholesky_fails() -> None:
         exact = times(times(A_, exact), transposed)
         if k < 60:
             exact = [[exact[i][j] + Q_[i][j] for j in range(2)] for i in range(2)]
-    F = [[Fraction(v) for v in row] for row in StateFactors(EXAMPLE).carried(60)]
+    F = [[Fraction(v) for v in row] for row in StateFactors(UNSTABLE).carried(60)]
     found = times(F, [list(row) for row in zip(*F, strict=True)])
     for i in range(2):
         for j in range(2):
             assert abs(found[i][j] / exact[i][j] - 1) < Fraction(1, 10**13)
     with pytest.raises(np.linalg.LinAlgError):
-        np.linalg.cholesky(state_covariances(EXAMPLE, 60)[-1] - Q)
+        np.linalg.cholesky(state_covariances(UNSTABLE, 60)[-1] - UNSTABLE.Q)
 
 
 def test_spectral_radius_of_the_example() -> None:
     """ρ(A) = 1.387799, the paper's."""
-    assert abs(EXAMPLE.spectral_radius - 1.387799) < 5e-7
+    assert abs(UNSTABLE.spectral_radius - 1.387799) < 5e-7
 
 
 MISTAKES = {
@@ -171,11 +166,12 @@ MISTAKES = {
 def test_mistakes_are_named(name: str) -> None:
     """What keeps matrices from being a process is said of the right entry."""
     *matrices, entry, sentence = MISTAKES[name]
-    found = mistakes_of(*(np.array(M, float) for M in matrices))
+    A, Q, initial = (np.array(M, float) for M in matrices)
+    found = mistakes_of(A, Q, initial)
     assert any(where == entry and re.search(sentence, what) for where, what in found), found
 
 
-@pytest.mark.parametrize("process", [EXAMPLE, THREE])
+@pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
 def test_a_process_has_no_mistakes(process: Process) -> None:
     """The examples pass."""
     assert mistakes_of(process.A, process.Q, process.initial_covariance) == []

@@ -19,11 +19,12 @@ PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))
 @pytest.mark.parametrize("base", [SCHEMES[name] for name in SCHEMES])
 def test_theory_of_packets_is_not_inherited(base: type[Scheme]) -> None:
     """A subclass may send other packets: no bound, closed form or floor is claimed for it unless it claims it itself."""
-    other = type("Other", (base,), {})
+    other: type[Scheme] = type("Other", (base,), {})
     assert not other.sends_states_and_innovations
     assert other.closed_forms == {}
     assert other.error_floor is Scheme.error_floor
-    again = type("Again", (other,), {"sends_states_and_innovations": True, "closed_forms": {"naive": "scheduled"}})
+    claims = {"sends_states_and_innovations": True, "closed_forms": {"naive": "scheduled"}}
+    again: type[Scheme] = type("Again", (other,), claims)
     assert again.sends_states_and_innovations
     assert again.closed_forms == {"naive": "scheduled"}
 
@@ -47,4 +48,5 @@ def test_the_built_in_classes_say_what_theory_knows() -> None:
 def test_a_scheme_with_its_own_start_is_known_by_its_method() -> None:
     """Also a subclass, and without a word of its author."""
     assert {name for name in SCHEMES if SCHEMES[name].decides_initial_state()} == {"twin-track"}
-    assert type("Other", (TwinTrack,), {}).decides_initial_state()
+    other: type[Scheme] = type("Other", (TwinTrack,), {})
+    assert other.decides_initial_state()

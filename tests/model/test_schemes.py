@@ -10,22 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.model.process import Process, Trajectory
+from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import state_covariances
-from evedrop.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.streams import Batch, Stream, normals, uniforms
+from tests.builders import DRIFTING, UNSTABLE, stream_keys
 
-ROOT = root_of_seed(4)
 STREAMS = {stream for scheme in SCHEMES.values() for stream in scheme.secret_streams}
-KEYS = {name: stream_key(ROOT, name) for name in ("process", *sorted(STREAMS))}
-STABLE = Process(
-    np.array([[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]]),
-    np.array([[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]]),
-    np.array([[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]]),
-)
-UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.eye(2))
+KEYS = stream_keys(4, ("process", *sorted(STREAMS)))
 MU_D = 0.4
 
 
@@ -56,7 +50,7 @@ def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> l
     return found
 
 
-def chi_of(process: Process, k: int, r: int) -> np.ndarray:
+def chi_of(process: Process, k: int, r: int) -> Floats:
     """χ_k of a trial: from the noise stream, coloured by the Cholesky factor of A Σ_{k−1} Aᵀ propagated by LAPACK's QR."""
     if k == 0:
         return np.zeros(process.n)
@@ -65,7 +59,8 @@ def chi_of(process: Process, k: int, r: int) -> np.ndarray:
         R = np.linalg.qr(np.hstack([process.A @ L, G]).T, mode="r")
         L = (R * np.sign(np.diag(R))[:, None]).T
     xi = normals(Stream(KEYS["noise"], range(r, r + 1), process.n).words(range(k, k + 1)))[0, 0]
-    return process.A @ L @ xi
+    chi: Floats = process.A @ L @ xi
+    return chi
 
 
 def nu_of(k: int, r: int) -> bool:
@@ -73,7 +68,7 @@ def nu_of(k: int, r: int) -> bool:
     return bool(k and uniforms(Stream(KEYS["schedule"], range(r, r + 1), 1).words(range(k, k + 1)))[0, 0, 0] >= MU_D)
 
 
-@pytest.mark.parametrize(("process", "slots"), [(STABLE, 60), (UNSTABLE, 40)])
+@pytest.mark.parametrize(("process", "slots"), [(DRIFTING, 60), (UNSTABLE, 40)])
 def test_packets_are_the_papers(process: Process, slots: int) -> None:
     """Z is x, or x_k − A x_{k−1} + χ_k where ν = 1, with ν and χ drawn and coloured by other means."""
     before = np.zeros((process.n, 4))
@@ -88,7 +83,7 @@ def test_packets_are_the_papers(process: Process, slots: int) -> None:
         before = x
 
 
-@pytest.mark.parametrize(("process", "slots"), [(STABLE, 60), (UNSTABLE, 40)])
+@pytest.mark.parametrize(("process", "slots"), [(DRIFTING, 60), (UNSTABLE, 40)])
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 2**31), quality=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
 def test_legitimate_estimator_is_the_textbooks(process: Process, slots: int, seed: int, quality: float) -> None:
@@ -118,14 +113,14 @@ def test_plain_scheme_is_the_textbooks() -> None:
     """Z = x always; lost: (A x̂, A P Aᵀ + Q), received: (z, 0)."""
     batch = Batch(40, 3)
     gamma = np.random.default_rng(0).random((40, 3)) < 0.6
-    found = beliefs("plain", STABLE, batch, gamma)
-    x_hat, P = np.zeros((3, 3)), np.repeat(STABLE.initial_covariance[:, :, None], 3, axis=2)
-    for k, (x, z, nu) in enumerate(packets("plain", STABLE, batch)):
+    found = beliefs("plain", DRIFTING, batch, gamma)
+    x_hat, P = np.zeros((3, 3)), np.repeat(DRIFTING.initial_covariance[:, :, None], 3, axis=2)
+    for k, (x, z, nu) in enumerate(packets("plain", DRIFTING, batch)):
         assert np.array_equal(x, z)
         assert not nu.any()
         if k:
-            x_hat = STABLE.A @ x_hat
-            P = np.einsum("ij,jkr,lk->ilr", STABLE.A, P, STABLE.A) + STABLE.Q[:, :, None]
+            x_hat = DRIFTING.A @ x_hat
+            P = np.einsum("ij,jkr,lk->ilr", DRIFTING.A, P, DRIFTING.A) + DRIFTING.Q[:, :, None]
         x_hat, P = np.where(gamma[k], x, x_hat), np.where(gamma[k], 0.0, P)
         assert np.allclose(found[k].x_hat, x_hat, rtol=1e-12, atol=1e-13)
         assert np.allclose(found[k].P, P, rtol=1e-12, atol=1e-15)
@@ -137,8 +132,8 @@ def test_a_lost_packet_desynchronises_nothing() -> None:
     slots = 80
     gamma = np.ones((slots, 50), bool)
     gamma[10:30] = False
-    found = beliefs("innovation", STABLE, Batch(slots, 50), gamma)
-    sent = list(packets("innovation", STABLE, Batch(slots, 50)))
+    found = beliefs("innovation", DRIFTING, Batch(slots, 50), gamma)
+    sent = list(packets("innovation", DRIFTING, Batch(slots, 50)))
     synced = np.ones(50, bool)
     for k, (x, _, nu) in enumerate(sent):
         synced = (synced & gamma[k]) | (gamma[k] & ~nu)
@@ -150,13 +145,13 @@ def test_a_lost_packet_desynchronises_nothing() -> None:
 def test_encoding_noise_has_its_covariance() -> None:
     """χ is white, normal, of covariance A Σ_{k−1} Aᵀ and independent of the process: 20 000 trials at 1e-6 confidence."""
     trials = 20_000
-    covariances = state_covariances(STABLE, 4)
+    covariances = state_covariances(DRIFTING, 4)
     before = np.zeros((3, trials))
     chis: list[np.ndarray] = []
-    for k, (x, z, nu) in enumerate(packets("innovation", STABLE, Batch(4, trials))):
+    for k, (x, z, nu) in enumerate(packets("innovation", DRIFTING, Batch(4, trials))):
         if k:
-            chi = (z - (x - STABLE.A @ before))[:, nu]
-            white = np.linalg.solve(np.linalg.cholesky(STABLE.A @ covariances[k - 1] @ STABLE.A.T), chi)
+            chi = (z - (x - DRIFTING.A @ before))[:, nu]
+            white = np.linalg.solve(np.linalg.cholesky(DRIFTING.A @ covariances[k - 1] @ DRIFTING.A.T), chi)
             assert 1e-6 < stats.chi2.cdf(np.sum(white * white), white.size) < 1 - 1e-6
             assert stats.kstest(white.ravel(), "norm").pvalue > 1e-6
             limit = 4.9 / np.sqrt(white.shape[1])
@@ -173,8 +168,8 @@ def test_encoding_noise_has_its_covariance() -> None:
 @pytest.mark.parametrize("kind", [False, True])
 def test_packets_of_either_type_look_alike(kind: bool) -> None:
     """E z zᵀ is Σ_k for states and for innovations: whitened by Σ_k both are standard normal, at 1e-6 confidence."""
-    covariances = state_covariances(STABLE, 8)
-    for k, (_, z, nu) in enumerate(packets("innovation", STABLE, Batch(8, 20_000))):
+    covariances = state_covariances(DRIFTING, 8)
+    for k, (_, z, nu) in enumerate(packets("innovation", DRIFTING, Batch(8, 20_000))):
         chosen = z[:, nu == kind]
         if k == 0:
             assert not nu.any()
@@ -188,7 +183,7 @@ def test_packets_of_either_type_look_alike(kind: bool) -> None:
 
 def test_schedule_has_its_probability() -> None:
     """States come with probability μ_d, and always in slot 0: binomial bounds at 1e-6 confidence."""
-    nus = np.stack([nu for _, _, nu in packets("innovation", STABLE, Batch(50, 2000))])
+    nus = np.stack([nu for _, _, nu in packets("innovation", DRIFTING, Batch(50, 2000))])
     assert not nus[0].any()
     assert stats.binomtest(int((~nus[1:]).sum()), nus[1:].size, MU_D).pvalue > 1e-6
 
@@ -196,8 +191,8 @@ def test_schedule_has_its_probability() -> None:
 @pytest.mark.parametrize("mu_d", [0.0, 1.0])
 def test_certain_schedules(mu_d: float) -> None:
     """μ_d = 1 sends states only; μ_d = 0 innovations only, from slot 1 on."""
-    encoder = scheme_of(STABLE, {"scheme": "innovation", "state_probability": mu_d}).encoder(KEYS, Batch(30, 20))
-    trajectory = Trajectory(STABLE, KEYS["process"], Batch(30, 20))
+    encoder = scheme_of(DRIFTING, {"scheme": "innovation", "state_probability": mu_d}).encoder(KEYS, Batch(30, 20))
+    trajectory = Trajectory(DRIFTING, KEYS["process"], Batch(30, 20))
     for k in range(30):
         x = trajectory.advance()
         assert encoder.encode(k, x, trajectory.predicted).nu.all() == (mu_d == 0.0 and k > 0)

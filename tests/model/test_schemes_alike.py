@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from slot_loop import STABLE, UNSTABLE, Played, coins, keys_of, play
 
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.streams import Batch
+from tests.builders import UNSTABLE
+from tests.model.slot_loop import STABLE, Played, coins, keys_of, play
 
 
 def made(name: str, process: Process, **changes: Any) -> Scheme:

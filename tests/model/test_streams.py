@@ -22,7 +22,8 @@ def counter_mode(key: bytes, k: int, r: int, per_trial: int) -> list[int]:
     blocks = -(-per_trial // 2)
     start = (k * 2**64 + r * blocks).to_bytes(16, "big")
     keystream = Cipher(algorithms.AES(key), modes.CTR(start)).encryptor().update(bytes(16 * blocks))
-    return np.frombuffer(keystream, "<u8")[:per_trial].tolist()
+    words: list[int] = np.frombuffer(keystream, "<u8")[:per_trial].tolist()
+    return words
 
 
 @settings(deadline=None)

@@ -26,10 +26,7 @@ from evedrop.model.theory.covariances import (
     state_covariances,
     tail_index,
 )
-
-EXAMPLE_A = np.array([[1.0, 0.3], [0.5, 1.001]])
-EXAMPLE = Process(EXAMPLE_A, 1e-3 * np.eye(2), np.eye(2))
-MICROGRID = Process(np.eye(2), 1e-5 * np.eye(2), 1e-5 * np.eye(2))
+from tests.builders import MICROGRID, UNSTABLE
 
 probabilities = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 1.0]))
 
@@ -38,7 +35,8 @@ probabilities = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 1.0]))
 def covariances(draw: st.DrawFn, n: int) -> Floats:
     """A symmetric positive definite matrix."""
     factor = np.array(draw(st.lists(st.floats(-1.0, 1.0), min_size=n * n, max_size=n * n))).reshape(n, n)
-    return factor @ factor.T + draw(st.floats(0.01, 1.0)) * np.eye(n)
+    positive: Floats = factor @ factor.T + draw(st.floats(0.01, 1.0)) * np.eye(n)
+    return positive
 
 
 @st.composite
@@ -128,10 +126,10 @@ def test_outcomes_are_a_distribution(process: Process, mu_e: float, mu_d: float,
 def test_long_runs_cross_blocks() -> None:
     """Blocks of slots join without a seam: runs of several blocks equal the recursion."""
     for outcomes, reference in (
-        (Outcomes.legitimate(0.9, 0.6), legitimate_recursion(EXAMPLE, 1050, 0.9, 0.6)),
-        (Outcomes.eavesdropper(0.9, 0.6, 1, 1), eavesdropper_recursion(EXAMPLE, 1050, 0.9, 0.6, 1, 1)),
+        (Outcomes.legitimate(0.9, 0.6), legitimate_recursion(UNSTABLE, 1050, 0.9, 0.6)),
+        (Outcomes.eavesdropper(0.9, 0.6, 1, 1), eavesdropper_recursion(UNSTABLE, 1050, 0.9, 0.6, 1, 1)),
     ):
-        assert close(expected_covariances(EXAMPLE, outcomes, 1050), reference)
+        assert close(expected_covariances(UNSTABLE, outcomes, 1050), reference)
     naive = expected_covariances(MICROGRID, Outcomes.eavesdropper(0.6, 0.1, 1, 1), 5000)
     assert close(naive, eavesdropper_recursion(MICROGRID, 5000, 0.6, 0.1, 1, 1))
 
@@ -171,34 +169,38 @@ def test_expectation_is_the_mean_over_all_words(k: int) -> None:
     """E P_k is the probability-weighted mean over every sequence of events."""
     mu, mu_d, b0, b1 = 0.7, 0.6, 0.8, 0.3
     ours = {"L": 1 - mu, "S": mu * mu_d, "D": mu * (1 - mu_d)}
-    found = expected_covariances(EXAMPLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
-    assert found == pytest.approx(enumerated(EXAMPLE, k, ours, 1 - mu), rel=1e-12)
+    found = expected_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
+    assert found == pytest.approx(enumerated(UNSTABLE, k, ours, 1 - mu), rel=1e-12)
     theirs = {"S": mu * mu_d * b0, "M": mu * (1 - mu_d) * b1}
     theirs["L"] = 1 - sum(theirs.values())
-    found = expected_covariances(EXAMPLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
-    assert found == pytest.approx(enumerated(EXAMPLE, k, theirs, 1 - mu * b0), rel=1e-12)
+    found = expected_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
+    assert found == pytest.approx(enumerated(UNSTABLE, k, theirs, 1 - mu * b0), rel=1e-12)
 
 
 def test_belief_ignores_being_misled() -> None:
     """The belief's expectation is the recursion B_k = p_d (A B Aᵀ + Q), which the naive one takes for its error."""
-    A, Q = EXAMPLE.A, EXAMPLE.Q
+    A, Q = UNSTABLE.A, UNSTABLE.Q
     for b0, b1 in ((1.0, 1.0), (0.8, 0.3)):
         outcomes = Outcomes.eavesdropper(0.9, 0.6, b0, b1)
         p_d = 1 - 0.9 * 0.6 * b0 - 0.9 * 0.4 * b1
-        reference = recursion(EXAMPLE, 60, lambda B, _, p_d=p_d: p_d * (A @ B @ A.T + Q), 1 - 0.9 * b0)
-        assert close(expected_covariances(EXAMPLE, outcomes.believed, 60), reference)
+
+        def step(B: Floats, _: Floats, p_d: float = p_d) -> Floats:
+            return p_d * (A @ B @ A.T + Q)
+
+        reference = recursion(UNSTABLE, 60, step, 1 - 0.9 * b0)
+        assert close(expected_covariances(UNSTABLE, outcomes.believed, 60), reference)
     smart = Outcomes.eavesdropper(0.9, 0.6, 1.0, 0.0)
     assert smart.believed == smart
 
 
 def test_noise_has_the_covariance_of_the_carried_state() -> None:
     """E[χ_k χ_kᵀ] + Q = Σ_k for k ≥ 1, so that either type of packet has the state's covariance."""
-    sigma = state_covariances(EXAMPLE, 30)
-    noise = noise_covariances(EXAMPLE, 30)
-    assert np.allclose(noise[1:] + EXAMPLE.Q, sigma[1:], rtol=1e-12)
+    sigma = state_covariances(UNSTABLE, 30)
+    noise = noise_covariances(UNSTABLE, 30)
+    assert np.allclose(noise[1:] + UNSTABLE.Q, sigma[1:], rtol=1e-12)
     assert np.array_equal(noise[0], np.zeros((2, 2)))
-    assert np.array_equal(misled_covariances(EXAMPLE, 30), 2.0 * noise)
-    assert noise_covariances(EXAMPLE, 0).shape == (0, 2, 2)
+    assert np.array_equal(misled_covariances(UNSTABLE, 30), 2.0 * noise)
+    assert noise_covariances(UNSTABLE, 0).shape == (0, 2, 2)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e60, 1e200])
@@ -218,7 +220,7 @@ def test_overflow_is_infinite_and_silent(scale: float) -> None:
 def test_bounded_expectation_of_unstable_process_stays_at_its_limit() -> None:
     """After 86 400 slots, when A^k has long overflowed, the expectation still is its limit."""
     outcomes = Outcomes.legitimate(0.9, 0.6)
-    assert expected_traces(EXAMPLE, outcomes, 86_400)[-1] == pytest.approx(limit_trace(EXAMPLE, outcomes), rel=1e-12)
+    assert expected_traces(UNSTABLE, outcomes, 86_400)[-1] == pytest.approx(limit_trace(UNSTABLE, outcomes), rel=1e-12)
 
 
 @given(processes(), st.floats(0.05, 1.0), st.floats(0.05, 1.0), st.sampled_from([(1.0, 0.0), (0.7, 0.0)]))
@@ -258,22 +260,22 @@ def test_traces_fall_as_the_state_is_sent_more_often(process: Process, mu: float
 
 def test_near_the_bound_no_number_comes_from_a_failed_solve() -> None:
     """Just above the bound the limit is large and finite, at it and below it infinite."""
-    bound = stability_bound(EXAMPLE, 0.9)
-    above = [limit_trace(EXAMPLE, Outcomes.legitimate(0.9, bound + 10.0**-e)) for e in (3, 6, 9)]
+    bound = stability_bound(UNSTABLE, 0.9)
+    above = [limit_trace(UNSTABLE, Outcomes.legitimate(0.9, bound + 10.0**-e)) for e in (3, 6, 9)]
     assert above == sorted(above)
     assert all(math.isfinite(trace) and trace > 0.0 for trace in above)
     assert above[2] / above[1] == pytest.approx(1000.0, rel=1e-3)
     for mu_d in (bound - 1e-12, bound - 1e-3, 0.0):
-        assert math.isinf(limit_trace(EXAMPLE, Outcomes.legitimate(0.9, mu_d)))
-    assert np.isinf(lyapunov(EXAMPLE, 1.0)).all()
+        assert math.isinf(limit_trace(UNSTABLE, Outcomes.legitimate(0.9, mu_d)))
+    assert np.isinf(lyapunov(UNSTABLE, 1.0)).all()
 
 
 def test_stability_bounds_of_special_links() -> None:
     """0 for a marginally stable process, beyond 1 or inf where no μ_d will do, 0 for a stable one."""
     assert stability_bound(MICROGRID, 0.6) == 0.0
-    assert stability_bound(EXAMPLE, 0.9) == pytest.approx(0.534206, abs=5e-7)
-    assert stability_bound(EXAMPLE, 0.4) > 1.0
-    assert math.isinf(stability_bound(EXAMPLE, 0.0))
+    assert stability_bound(UNSTABLE, 0.9) == pytest.approx(0.534206, abs=5e-7)
+    assert stability_bound(UNSTABLE, 0.4) > 1.0
+    assert math.isinf(stability_bound(UNSTABLE, 0.0))
     assert math.isinf(stability_bound(MICROGRID, 0.0))
     stable = Process(0.5 * np.eye(2), np.eye(2), np.eye(2))
     assert stability_bound(stable, 0.0) == stability_bound(stable, 0.3) == 0.0
@@ -283,8 +285,8 @@ def test_stability_bounds_of_special_links() -> None:
 def test_lossless_link_has_no_error() -> None:
     """With μ = 1 the legitimate error is 0 in every slot and in the limit, whatever μ_d."""
     for mu_d in (0.0, 0.1, 1.0):
-        assert np.array_equal(expected_traces(EXAMPLE, Outcomes.legitimate(1.0, mu_d), 50), np.zeros(50))
-        assert limit_trace(EXAMPLE, Outcomes.legitimate(1.0, mu_d)) == 0.0
+        assert np.array_equal(expected_traces(UNSTABLE, Outcomes.legitimate(1.0, mu_d), 50), np.zeros(50))
+        assert limit_trace(UNSTABLE, Outcomes.legitimate(1.0, mu_d)) == 0.0
 
 
 def test_microgrid_closed_form() -> None:
@@ -301,14 +303,14 @@ def test_microgrid_closed_form() -> None:
 
 def test_variance_is_infinite_below_the_square_of_the_bound() -> None:
     """The example's tr P has no variance for μ_d < 0.8116, where (1−μμ_d) ρ⁴ = 1; the microgrid's always has one."""
-    assert has_infinite_variance(EXAMPLE, Outcomes.legitimate(0.9, 0.8115))
-    assert not has_infinite_variance(EXAMPLE, Outcomes.legitimate(0.9, 0.8117))
+    assert has_infinite_variance(UNSTABLE, Outcomes.legitimate(0.9, 0.8115))
+    assert not has_infinite_variance(UNSTABLE, Outcomes.legitimate(0.9, 0.8117))
     smart = Outcomes.eavesdropper(0.5, 0.9, 1, 0)
-    assert tail_index(EXAMPLE, smart) == pytest.approx(-math.log(0.55) / (2 * math.log(EXAMPLE.spectral_radius)))
+    assert tail_index(UNSTABLE, smart) == pytest.approx(-math.log(0.55) / (2 * math.log(UNSTABLE.spectral_radius)))
     for outcomes in (
         Outcomes.legitimate(1.0, 0.6), Outcomes.plain(1.0), Outcomes.eavesdropper(0.9, 0.6, 1, 1),
     ):  # fmt: skip
-        assert math.isinf(tail_index(EXAMPLE, outcomes))
+        assert math.isinf(tail_index(UNSTABLE, outcomes))
     assert math.isinf(tail_index(MICROGRID, Outcomes.legitimate(0.1, 0.1)))
 
 
@@ -332,15 +334,15 @@ def test_second_moment_diverges_where_variance_is_said_infinite(mu_d: float) -> 
 def test_misled_error_grows_in_proportion_to_the_state(b0: float, b1: float) -> None:
     """The ratio tr E P_k / tr Σ_k tends to 2 p_i / (p_i + p_r), for naive 2 (1 − μ_d)."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, b0, b1)
-    ratio = expected_traces(EXAMPLE, outcomes, 300)[-1] / np.trace(state_covariances(EXAMPLE, 300)[-1])
+    ratio = expected_traces(UNSTABLE, outcomes, 300)[-1] / np.trace(state_covariances(UNSTABLE, 300)[-1])
     assert ratio == pytest.approx(2 * 0.4 * b1 / (0.4 * b1 + 0.6 * b0), rel=1e-9)
 
 
 def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
     """Why a misled receiver has no heavy tail: no sequence of events gives more than a fixed multiple of E tr P_k."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, 1, 1)
-    expected = expected_traces(EXAMPLE, outcomes, 200)
-    sigma = np.trace(state_covariances(EXAMPLE, 200), axis1=1, axis2=2)
+    expected = expected_traces(UNSTABLE, outcomes, 200)
+    sigma = np.trace(state_covariances(UNSTABLE, 200), axis1=1, axis2=2)
     ratio = 2.0 * sigma[5:] / expected[5:]
     assert ratio.max() < 1.01 * ratio[:20].max()
 
@@ -355,6 +357,6 @@ def test_who_never_uses_a_state_has_no_heavy_tail() -> None:
     """p_r = 0: deaf, or never told a state, it grows alike in every trial; the largest trace is a few times the mean."""
     for outcomes in (NOBODY, Outcomes.eavesdropper(0.0, 0.6, 1.0, 0.0), Outcomes.eavesdropper(0.9, 0.6, 0.0, 0.0),
                      Outcomes.legitimate(0.6, 0.0)):  # fmt: skip
-        assert math.isinf(tail_index(EXAMPLE, outcomes))
-        assert not has_infinite_variance(EXAMPLE, outcomes)
-        assert expected_traces(EXAMPLE, NOBODY, 200)[-1] < 10.0 * expected_traces(EXAMPLE, outcomes, 200)[-1]
+        assert math.isinf(tail_index(UNSTABLE, outcomes))
+        assert not has_infinite_variance(UNSTABLE, outcomes)
+        assert expected_traces(UNSTABLE, NOBODY, 200)[-1] < 10.0 * expected_traces(UNSTABLE, outcomes, 200)[-1]

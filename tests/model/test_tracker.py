@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from slot_loop import DRIFTING, ROOT, STABLE, UNSTABLE, coins, keys_of
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
@@ -18,6 +17,8 @@ from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.streams import Batch, stream_key
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import ROOT, STABLE, coins, keys_of
 
 KEYS = keys_of(("start", "track"))
 CLOSE = Process(UNSTABLE.A, UNSTABLE.Q, UNSTABLE.Q)

@@ -5,22 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
-from slot_loop import DRIFTING, STABLE, UNSTABLE, coins, keys_of, play
 
 from evedrop.model.eavesdroppers import READERS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.process import Process
+from evedrop.model.process import Floats, Process
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import expected_covariances
 from evedrop.streams import Batch
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import STABLE, coins, keys_of, play
 
 KEYS = keys_of(("start", "track"))
 
 
-def spread(process: Process, k: int) -> np.ndarray:
+def spread(process: Process, k: int) -> Floats:
     """A^k Σ0 A^kᵀ."""
-    power = np.linalg.matrix_power(process.A, k)
+    power: Floats = np.linalg.matrix_power(process.A, k)
     return power @ process.initial_covariance @ power.T
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import stats
-from slot_loop import DRIFTING, UNSTABLE, coins, play
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.schemes.withholding import Withholding
 from evedrop.model.theory.covariances import expected_covariances, limit, lyapunov
 from evedrop.streams import Batch
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import coins, play
 
 
 def test_packets_are_sent_with_their_probability() -> None:

@@ -10,10 +10,15 @@ import math
 import struct
 import sys
 import time
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
+from typing import Any
 
 import msgpack
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
+
+Matrix = list[list[float]]
+Belief = tuple[list[float], Matrix]
 
 A_ = (3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
       4.5921953931549871457e4, 6.7265770927008700853e4, 3.3430575583588128105e4, 2.5090809287301226727e3)  # fmt: skip
@@ -29,7 +34,7 @@ F_ = (1.0, 5.99832206555887937690e-1, 1.36929880922735805310e-1, 1.4875361290850
       7.86869131145613259100e-4, 1.84631831751005468180e-5, 1.42151175831644588870e-7, 2.04426310338993978564e-15)  # fmt: skip
 
 
-def poly(coefficients, x):
+def poly(coefficients: Sequence[float], x: float) -> float:
     """Horner's rule, from the highest power down."""
     v = coefficients[-1]
     for c in coefficients[-2::-1]:
@@ -37,7 +42,7 @@ def poly(coefficients, x):
     return v
 
 
-def log(x):
+def log(x: float) -> float:
     """The logarithm of the protocol's section on arithmetic."""
     m, p = math.frexp(x)
     if m < 0.7071067811865476:
@@ -55,7 +60,7 @@ def log(x):
     return p * 6.93147180369123816490e-01 - ((h - (s * (h + t) + p * 1.90821492927058770002e-10)) - f)
 
 
-def quantile(u):
+def quantile(u: float) -> float:
     """Wichura's AS 241."""
     q = u - 0.5
     r = 0.180625 - q * q
@@ -66,7 +71,7 @@ def quantile(u):
     return size if u > 0.5 else -size
 
 
-def words(key, slot, trial, m):
+def words(key: bytes, slot: int, trial: int, m: int) -> tuple[int, ...]:
     """The m words of a stream for one slot and trial."""
     b = (m + 1) // 2
     encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()  # noqa: S305 - the protocol's counter mode
@@ -74,37 +79,37 @@ def words(key, slot, trial, m):
     return struct.unpack(f"<{2 * b}Q", encryptor.update(counters))[:m]
 
 
-def uniform(word):
+def uniform(word: int) -> float:
     """A uniform of a word."""
     return (word >> 11) * 2.0**-53
 
 
-def normal(word):
+def normal(word: int) -> float:
     """A normal of a word."""
     return quantile(((word >> 12) + 0.5) * 2.0**-52)
 
 
-def dot(pairs):
+def dot(pairs: Iterable[tuple[float, float]]) -> float:
     """A sum in order: it starts with its first product."""
-    total = None
-    for a, b in pairs:
-        total = a * b if total is None else total + a * b
+    total, *products = [a * b for a, b in pairs]
+    for one in products:
+        total += one
     return total
 
 
-def times(M, N):
+def times(M: Matrix, N: Matrix) -> Matrix:
     """A product of matrices."""
     columns = list(zip(*N, strict=True))
     return [[dot(zip(row, column, strict=True)) for column in columns] for row in M]
 
 
-def carried(M, P):
+def carried(M: Matrix, P: Matrix) -> Matrix:
     """M P Mᵀ."""
     B = times(M, P)
     return [[dot(zip(left, right, strict=True)) for right in M] for left in B]
 
 
-def cholesky(M):
+def cholesky(M: Matrix) -> Matrix:
     """The lower Cholesky factor."""
     n = len(M)
     L = [[0.0] * n for _ in M]
@@ -117,7 +122,7 @@ def cholesky(M):
     return L
 
 
-def triangular(W):
+def triangular(W: Matrix) -> Matrix:
     """The triangular factor by rotations."""
     n, m = len(W), len(W[0])
     for i in range(n):
@@ -140,7 +145,7 @@ def triangular(W):
 class Estimator:
     """One receiver of the scheme `innovation`, all trials of its brief."""
 
-    def __init__(self, brief):
+    def __init__(self, brief: dict[str, Any]) -> None:
         model = brief["model"]
         self.A, self.Q = model["A"], model["Q"]
         self.n, self.R, self.first = len(self.A), brief["trials"], brief["first_trial"]
@@ -149,16 +154,16 @@ class Estimator:
         self.G = cholesky(self.Q)
         self.L = cholesky(model["initial_covariance"])
         self.due = 0
-        self.belief = [([0.0] * self.n, model["initial_covariance"]) for _ in range(self.R)]
+        self.belief: list[Belief] = [([0.0] * self.n, model["initial_covariance"]) for _ in range(self.R)]
         self.hashes = [sha256() for _ in range(self.R)]
-        self.blocks = {}
-        self.rows = []
+        self.blocks: dict[int, bytes] = {}
+        self.rows: list[tuple[int, list[list[float]], list[int], list[Matrix]]] = []
 
-    def receive(self, payload):
+    def receive(self, payload: bytes) -> None:
         """A recorded delivery: step all trials."""
         self.take(msgpack.unpackb(payload))
 
-    def take(self, message):
+    def take(self, message: dict[str, Any]) -> None:
         """A delivery: step all trials."""
         k = message["k"]
         if k != self.due:
@@ -167,7 +172,7 @@ class Estimator:
         got = [(message["gamma"][r // 8] >> (r % 8)) & 1 for r in range(self.R)]
         heard = sum(got)
         z = struct.unpack(f"<{self.n * heard}d", message.get("z", b""))
-        noise_factor = None
+        noise_factor: Matrix = []
         if k > 0:
             noise_factor = times(self.A, self.L)
             self.L = triangular([left + right for left, right in zip(noise_factor, self.G, strict=True)])
@@ -189,7 +194,7 @@ class Estimator:
             self.hashes = [sha256() for _ in range(self.R)]
         self.rows.append((k, [x for x, _ in self.belief], actions, [P for _, P in self.belief]))
 
-    def step(self, k, r, z, noise_factor):
+    def step(self, k: int, r: int, z: list[float] | None, noise_factor: Matrix) -> tuple[Belief, int]:
         """One trial, one slot: the belief after it, and the action."""
         x, P = self.belief[r]
         trial = self.first + r
@@ -207,7 +212,7 @@ class Estimator:
             return (z, [[0.0] * self.n for _ in range(self.n)]), 1
         return ([a + (b - c) for a, b, c in zip(x, z, chi, strict=True)], C), 2
 
-    def digest(self):
+    def digest(self) -> str:
         """Of the whole run."""
         whole = sha256()
         for r in range(self.R):
@@ -215,7 +220,7 @@ class Estimator:
                 whole.update(self.blocks[block][32 * r : 32 * r + 32])
         return whole.hexdigest()
 
-    def report(self):
+    def report(self) -> bytes:
         """The report of all slots since the last one."""
         rows, self.rows = self.rows, []
         flat, traces = [], []
@@ -235,10 +240,11 @@ class Estimator:
             "trace": struct.pack(f"<{len(traces)}d", *traces),
             "digests": {b: d for b, d in self.blocks.items() if b + 255 >= rows[0][0]},
         }
-        return msgpack.packb(message)
+        packed: bytes = msgpack.packb(message)
+        return packed
 
 
-def take_part(brief):
+def take_part(brief: dict[str, Any]) -> str:
     """Follow a run to its end."""
     import zenoh
 
@@ -253,14 +259,17 @@ def take_part(brief):
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
         commands = session.declare_subscriber(under + f"control/{name}", zenoh.handlers.FifoChannel(16))
         deliveries = session.declare_subscriber(under + f"downlink/{name}", zenoh.handlers.FifoChannel(65536))
-        block = {"congestion_control": zenoh.CongestionControl.BLOCK}
-        telemetry = session.declare_publisher(under + f"telemetry/{name}", **block)
-        progress = session.declare_publisher(under + f"progress/{name}", **block)
+        block = zenoh.CongestionControl.BLOCK
+        telemetry = session.declare_publisher(under + f"telemetry/{name}", congestion_control=block)
+        progress = session.declare_publisher(under + f"progress/{name}", congestion_control=block)
 
-        def put(publisher, message):
+        def put(publisher: zenoh.Publisher, message: bytes) -> None:
             publisher.put(msgpack.packb(str(publisher.key_expr)) + message)
 
-        def received(subscriber):
+        def is_read(publisher: zenoh.Publisher) -> bool:
+            return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+
+        def received(subscriber: zenoh.Subscriber[Any]) -> Any:
             """The next message on a subscriber's key; what names another key is dropped."""
             while True:
                 unpacker = msgpack.Unpacker()
@@ -268,7 +277,7 @@ def take_part(brief):
                 if unpacker.unpack() == str(subscriber.key_expr):
                     return unpacker.unpack()
 
-        while not (telemetry.matching_status.matching and progress.matching_status.matching):
+        while not (is_read(telemetry) and is_read(progress)):
             time.sleep(0.005)
         token = session.liveliness().declare_token(under + f"alive/{name}")
         for k in range(brief["slots"]):

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from independent_legitimate import Estimator
 
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.loading import load
-from evedrop.model.digest import BeliefLog, Blocks, RunDigest
+from evedrop.model.digest import BeliefLog, Blocks, Digests, RunDigest
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
@@ -27,14 +26,11 @@ from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import Batch
+from tests.builders import DRIFTING, process_table
 from tests.conftest import LIMIT
+from tests.peers.independent_legitimate import Estimator
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
-THREE_STATES = {
-    "A": [[1.0, 0.05, 0.0], [0.0, 1.0, 0.1], [0.0, -0.1, 0.99]],
-    "Q": [[1e-3, 0.0, 0.0], [0.0, 2e-3, 1e-4], [0.0, 1e-4, 1e-3]],
-    "initial_covariance": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.0], [0.0, 0.0, 0.3]],
-}
 UNSTABLE = {
     "A": [[1.0, 0.3], [0.5, 1.001]],
     "Q": [[1e-3, 2e-4], [2e-4, 1e-3]],
@@ -59,7 +55,9 @@ def scenario_of(process: dict[str, list[list[float]]], slots: int, first_trial: 
     )
 
 
-@pytest.mark.parametrize(("process", "slots", "first_trial"), [(THREE_STATES, 300, 0), (UNSTABLE, 60, 12_345)])
+@pytest.mark.parametrize(
+    ("process", "slots", "first_trial"), [(process_table(DRIFTING), 300, 0), (UNSTABLE, 60, 12_345)]
+)
 def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> None:
     """Fed with the deliveries of a run, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots, first_trial)
@@ -73,7 +71,8 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     estimator = SCHEMES["innovation"](model, 0.4).estimator(secret, batch)
     belief, log, digest = estimator.prior(), BeliefLog(model.n, 9, slots), RunDigest()
     gammas = np.random.default_rng(1).random((slots, 9)) < 0.7
-    beliefs, blocks = [], {}
+    beliefs = []
+    blocks: dict[int, Digests] = {}
     for k, gamma in enumerate(gammas):
         z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
         belief = estimator.step(k, belief, Reception(gamma, z))

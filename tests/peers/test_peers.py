@@ -16,7 +16,7 @@ import pytest
 import evedrop.live.network.mailbox
 import evedrop.peers.following
 import evedrop.peers.sensor
-from evedrop.errors import Gap, MalformedMessage
+from evedrop.errors import EvedropError, Gap, MalformedMessage
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.reporting import is_due
 from evedrop.live.network.resending import ReplayBuffer
@@ -25,7 +25,7 @@ from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import Brief, Flow
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
-from evedrop.model.digest import Blocks
+from evedrop.model.digest import Blocks, Digests
 from evedrop.model.flag_bits import packed_flags
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
@@ -195,7 +195,8 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     while not stage.put.empty():
         put.append(stage.put.get())
     assert put.pop() == ("closed", b"")
-    end, blocks = 0, {}
+    end = 0
+    blocks: dict[int, Digests] = {}
     for key, payload in put:
         if key == keys.telemetry(name):
             report = telemetry.read_report(wire.Reader(key, payload), end, EXTENT, Blocks(SLOTS))
@@ -219,7 +220,8 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
         stage.fill(RunKeys("r").downlink(name), deliveries(600))
         stage.commands.put(wire.control("end"))
         RECEIVERS[name](brief)
-        end, x_hat, P, blocks = 0, [], [], {}
+        end, x_hat, P = 0, [], []
+        blocks: dict[int, bytes] = {}
         for payload in stage.all(RunKeys("r").telemetry(name)):
             report = telemetry.read_report(wire.Reader("", payload), end, replace(EXTENT, slots=600), Blocks(600))
             end += report.count
@@ -232,7 +234,7 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
 
 
 GOOD = deliveries()
-BAD = {
+BAD: dict[str, tuple[list[bytes], type[EvedropError], str]] = {
     "a slot stays missing": (
         [GOOD[0], GOOD[2], GOOD[3]],
         Gap,

@@ -20,15 +20,10 @@ from evedrop.loading import load
 from evedrop.model.links.checks import as_toml
 from evedrop.recordings import link_recording as traces
 from evedrop.recordings.link_recording import LinkRecording
+from tests.builders import scalar_tables
 from tests.conftest import Evedrop
 
-GOOD: dict[str, Any] = {
-    "title": "A recorded walk",
-    "slots": 6,
-    "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
-    "encoding": {"scheme": "innovation", "state_probability": 0.5},
-    "legitimate": {"link": {"loss": {"model": "trace", "file": "walk.csv"}}},
-}
+GOOD = scalar_tables(1.0, 0.01, slots=6, legitimate={"link": {"loss": {"model": "trace", "file": "walk.csv"}}})
 
 
 def write(folder: Path, name: str, text: str | bytes) -> Path:

@@ -12,10 +12,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.api import load_results, montecarlo
+from evedrop.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.diff import difference
-from evedrop.results.writer import Results
+from evedrop.results.writer import Results, load_results
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_a_table_of_another_version_is_refused(what: str, runs: dict[str, Result
 
 def test_runs_of_different_processes_differ(runs: dict[str, Results], tmp_path: Path) -> None:
     """One state against two: the first row is different, and no more is made of it."""
-    one = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
+    one: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
     other = montecarlo("eavesdroppers", slots=600, trials=6, out=tmp_path / "one", **one)
     found = difference(runs["whole"], other)
     assert not found.same

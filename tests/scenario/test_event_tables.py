@@ -11,20 +11,13 @@ from evedrop.loading import checked
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import NEVER
 from evedrop.scenario import Scenario
+from tests.builders import scalar_tables
 
 
 def tables(*events: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A scenario with these events."""
-    return {
-        "title": "Events",
-        "slots": 100,
-        "process": {"A": [[1.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]},
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": {"eve": {"strategy": "smart", "link": {"quality": 0.9}}},
-        "event": list(events),
-        **more,
-    }
+    eve = {"strategy": "smart", "link": {"quality": 0.9}}
+    return {**scalar_tables(1.0, 0.1, slots=100, eavesdroppers={"eve": eve}, event=list(events)), **more}
 
 
 def mistakes(*events: dict[str, Any], **more: Any) -> list[str]:

@@ -11,16 +11,15 @@ import tomli_w
 from evedrop.errors import ScenarioError
 from evedrop.loading import parse
 from evedrop.scenario import Scenario
+from tests.builders import scalar_tables
 
-GOOD: dict[str, Any] = {
-    "title": "A vehicle",
-    "slots": 50,
-    "trials": 12,
-    "process": {"A": [[1.0]], "Q": [[1e-3]], "initial_covariance": [[1.0]]},
-    "encoding": {"scheme": "innovation", "state_probability": 0.5},
-    "legitimate": {"link": {"quality": 0.9}},
-    "eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.8}}},
-}
+GOOD = scalar_tables(
+    1.0,
+    1e-3,
+    slots=50,
+    trials=12,
+    eavesdroppers={"smart": {"strategy": "smart", "link": {"quality": 0.8}}},
+)
 ERROR = "legitimate.mean_squared_error"
 
 

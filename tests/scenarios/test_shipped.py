@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from evedrop.api import load_results, montecarlo, run
+from evedrop.api import montecarlo, run
 from evedrop.loading import load, shipped
-from evedrop.results.writer import Results
+from evedrop.results.writer import Results, load_results
+from tests.builders import digests_of
 
 SLOTS = 300
 """Enough for a whole block of digests and a part of one."""
@@ -33,15 +35,10 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Pair
         scenario = load(name)
         timed = scenario.event or any(expect.slots or expect.by for expect in scenario.expect)
         slots = scenario.slots if timed else min(SLOTS, scenario.slots)
-        options = {"slots": slots, "trials": trials, "first_trial": first, "pace": 0.0}
+        options: dict[str, Any] = {"slots": slots, "trials": trials, "first_trial": first, "pace": 0.0}
         return run(name, out=folder / "live", **options), montecarlo(name, out=folder / "memory", **options)
 
     return made
-
-
-def digests(results: Results) -> dict[str, str]:
-    """Receiver → digest."""
-    return {name: peer["digest"] for name, peer in results.summary["peers"].items()}
 
 
 def blocks(results: Results) -> set[tuple[str, int, int, bytes]]:
@@ -68,8 +65,8 @@ every_batch = pytest.mark.parametrize(
 def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callable[[str, str], Pair]) -> None:
     """Equal digests of every receiver, equal sums, and a verdict that agrees."""
     live, memory = twins(name, batch)
-    assert digests(live) == digests(memory)
-    assert all(digests(live).values())
+    assert digests_of(live) == digests_of(memory)
+    assert all(digests_of(live).values())
     assert blocks(live) == blocks(memory)
     for receiver, figures in live.summary["peers"].items():
         for figure, found in figures.items():
@@ -106,12 +103,12 @@ def test_later_trials_are_the_same_alone(tmp_path: Path) -> None:
 
 def test_a_further_eavesdropper_changes_nobody_else(tmp_path: Path, twins: Callable[[str, str], Pair]) -> None:
     """Neither by its presence nor by its place among the others."""
-    extra = {"eavesdroppers__extra__strategy": "smart", "eavesdroppers__extra__link__quality": 0.5}
+    extra: dict[str, Any] = {"eavesdroppers__extra__strategy": "smart", "eavesdroppers__extra__link__quality": 0.5}
     slots = load("numerical").slots
     live = run("numerical", slots=slots, pace=0.0, trials=1, first_trial=17, out=tmp_path / "extra", **extra)
-    found = digests(live)
+    found = digests_of(live)
     assert found.pop("extra")
-    assert found == digests(twins("numerical", "a later trial")[1])
+    assert found == digests_of(twins("numerical", "a later trial")[1])
 
 
 def test_the_resolved_scenario_runs_to_the_same_digests(tmp_path: Path, twins: Callable[[str, str], Pair]) -> None:
@@ -119,7 +116,7 @@ def test_the_resolved_scenario_runs_to_the_same_digests(tmp_path: Path, twins: C
     live, _ = twins("eavesdroppers", "a later trial")
     again = montecarlo(live.folder / "scenario.toml", trials=1, out=tmp_path / "file")
     folder = montecarlo(live.folder, trials=1, out=tmp_path / "folder")
-    assert digests(again) == digests(folder) == digests(live)
+    assert digests_of(again) == digests_of(folder) == digests_of(live)
 
 
 def test_simulated_errors_agree_with_theory(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.channel import CONFIDENCE, channel_of, interval
 from evedrop.score.sums import Tally
 from evedrop.streams import Batch
+from tests.builders import scalar_tables
 
 LINKS: dict[str, dict[str, Any]] = {
     "coins": {"quality": 0.9},
@@ -41,17 +42,16 @@ LINKS: dict[str, dict[str, Any]] = {
 def scenario(seed: int, events: list[dict[str, Any]] | None = None) -> Scenario:
     """One with all these links, which the legitimate estimator's is not among."""
     return Scenario.model_validate(
-        {
-            "title": "Channel",
-            "slots": 400,
-            "trials": 20,
-            "seed": seed,
-            "process": {"A": [[1.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]},
-            "encoding": {"scheme": "plain"},
-            "legitimate": {"link": {"quality": 0.9}},
-            "eavesdroppers": {name: {"strategy": "naive", "link": link, "window": 4} for name, link in LINKS.items()},
-            "event": events or [],
-        }
+        scalar_tables(
+            1.0,
+            0.1,
+            slots=400,
+            trials=20,
+            seed=seed,
+            encoding={"scheme": "plain"},
+            eavesdroppers={name: {"strategy": "naive", "link": link, "window": 4} for name, link in LINKS.items()},
+            event=events or [],
+        )
     )
 
 

@@ -56,9 +56,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Runs:
 
     @cache
     def one(where: str) -> Results:
-        return {"live": run, "memory": montecarlo}[where](
-            "eavesdroppers", out=tmp_path_factory.mktemp(where), **OPTIONS
-        )
+        ways: dict[str, Callable[..., Results]] = {"live": run, "memory": montecarlo}
+        return ways[where]("eavesdroppers", out=tmp_path_factory.mktemp(where), **OPTIONS)
 
     return one
 
@@ -199,8 +198,8 @@ def test_secrecy_is_held_where_theory_and_run_agree(
     """Of both kinds; whatever the other kind's verdict is."""
     for kind in ("relative", "perfect"):
         scenario = load("eavesdroppers", {"expect": [{"secrecy": kind, "against": "smart"}]})
-        other = {"relative": Verdict.HELD, "perfect": Verdict.HELD}
-        claims = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
+        other: dict[str, Any] = {"relative": Verdict.HELD, "perfect": Verdict.HELD}
+        claims: dict[str, Any] = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
         verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
                           trials=9, judged_by="mean")  # fmt: skip
         (one,) = Evidence(scenario, {}, {}, {}, {}, {"smart": verdict}).judged(None)

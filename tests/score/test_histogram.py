@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from random import Random
 
 import numpy as np
 import pytest
@@ -92,14 +93,14 @@ def test_a_long_run_is_looked_at_in_even_steps(slots: int, lengths: list[int]) -
 
 @given(st.lists(st.lists(values, min_size=1, max_size=20), min_size=2, max_size=6), st.randoms())
 @settings(deadline=None, max_examples=50)
-def test_merging_is_the_same_in_any_order(parts: list[list[float]], random: object) -> None:
+def test_merging_is_the_same_in_any_order(parts: list[list[float]], random: Random) -> None:
     """Parts merged in any order and grouping are the histogram of all samples at once."""
     whole = histograms(np.concatenate([np.array(part) for part in parts])[None, :]).quantiles()
     made = [histograms(np.array(part)[None, :]) for part in parts]
-    random.shuffle(made)  # type: ignore[attr-defined]
+    random.shuffle(made)
     while len(made) > 1:
         last = made.pop()
-        made[random.randrange(len(made))].merge(last)  # type: ignore[attr-defined]
+        made[random.randrange(len(made))].merge(last)
     assert np.array_equal(made[0].quantiles(), whole)
 
 

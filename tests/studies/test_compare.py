@@ -20,7 +20,7 @@ from evedrop.score.kept import SecrecyKept
 from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
 from tests.conftest import Evedrop
 
-MARGINAL = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
+MARGINAL: dict[str, Any] = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
 
 VERDICTS = {
@@ -374,7 +374,7 @@ def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:
 
 def test_workers_change_nothing(everything: Everything, tmp_path: Path) -> None:
     """One worker finds what two found."""
-    some = {"schemes": ["scheduled", "cipher"], "adversaries": ["naive", "blocks-all"]}
+    some: dict[str, Any] = {"schemes": ["scheduled", "cipher"], "adversaries": ["naive", "blocks-all"]}
     alone = compare("bayesian", out=tmp_path, plan=Plan(workers=1), **some, **MARGINAL)
     for scheme in some["schemes"]:
         for adversary in some["adversaries"]:

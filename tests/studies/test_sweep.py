@@ -6,6 +6,7 @@ import itertools
 import json
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -111,7 +112,7 @@ def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: P
     """Figures, verdicts and digests of each point are those of `montecarlo` with the same entries, to the bit."""
     rows = {(*(row[key] for key in GRID), row["peer"]): row for row in swept[0].to_pylist()}
     for i, point in enumerate(itertools.product(*GRID.values())):
-        changes = {key.replace(".", "__"): value for key, value in zip(GRID, point, strict=True)}
+        changes: dict[str, Any] = {key.replace(".", "__"): value for key, value in zip(GRID, point, strict=True)}
         alone = montecarlo(
             "eavesdroppers", **{**CHANGES, **changes}, out=tmp_path / str(i), plan=Plan(workers=1)
         ).summary
@@ -154,7 +155,7 @@ def test_the_results_reference_has_every_column_of_a_sweep(swept: tuple[pa.Table
 
 def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> None:
     """A strategy and slots, covariance-only: the actual trace stands in its own column, and the plot is drawn."""
-    grid = {"eavesdroppers.smart.strategy": ["smart", "naive"], "slots": [10, 20]}
+    grid: dict[str, list[Any]] = {"eavesdroppers.smart.strategy": ["smart", "naive"], "slots": [10, 20]}
     plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
     table = sweep_over("eavesdroppers", {"trials": 5}, grid, tmp_path / "run", lambda _: None, plan)
     assert table.num_rows == 2 * 2 * 4

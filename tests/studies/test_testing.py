@@ -201,6 +201,7 @@ def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:
         cwd=evedrop.folder,
         env=evedrop.environment,
         stdout=subprocess.DEVNULL,
+        text=True,
     )
     live = Live(process, evedrop.temporary, evedrop.folder)
     live.child("sensor")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 from unittest.mock import patch
 
 import pytest
-from simulated_run import Simulated, orbit, simulate
 
 from evedrop.view import recording
 from tests.conftest import LIMIT
+from tests.view.simulated_run import Simulated, orbit, simulate
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -23,7 +24,7 @@ def unhurried() -> Iterator[None]:
 def simulated() -> Callable[..., Simulated]:
     """`simulate`, over the marginally stable `orbit` unless told otherwise."""
 
-    def make(slots: int = 400, *, n: int = 2, growth: float = 1.0, **options: float) -> Simulated:
-        return simulate(orbit(n, growth), slots, **options)  # type: ignore[arg-type]
+    def make(slots: int = 400, *, n: int = 2, growth: float = 1.0, **options: Any) -> Simulated:
+        return simulate(orbit(n, growth), slots, **options)
 
     return make

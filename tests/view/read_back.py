@@ -19,7 +19,8 @@ def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
 
 def lane(rrd: Path, entity: str, slots: int) -> list[str]:
     """A lane's word in every slot, from its changes."""
-    changes, words = rows(rrd, entity, "StateChange:state"), []
+    changes = rows(rrd, entity, "StateChange:state")
+    words: list[str] = []
     for k in range(slots):
         words.append(changes[k][0] if k in changes else words[-1])
     return words

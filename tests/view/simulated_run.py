@@ -12,8 +12,9 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Receiver, Reception
 from evedrop.model.schemes import SCHEMES
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.streams import Batch
 from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
+from tests.builders import stream_keys
 
 STATE_PROBABILITY = 0.35
 USE_STATE, USE_INNOVATION = 0.8, 0.3
@@ -59,8 +60,7 @@ def simulate(
     process: Process, slots: int, *, trials: int = 1, pace: float = 0.0, copies: int = 1, seed: int = 7
 ) -> Simulated:
     """Sensor, legitimate estimator and `copies` of each strategy of eavesdropper, through lossy links."""
-    root, batch = root_of_seed(seed), Batch(slots, trials)
-    keys = {name: stream_key(root, name) for name in ("process", "schedule", "noise", "coin")}
+    batch, keys = Batch(slots, trials), stream_keys(seed, ("process", "schedule", "noise", "coin"))
     scheme = SCHEMES["innovation"](process, STATE_PROBABILITY)
     trajectory, encoder = Trajectory(process, keys["process"], batch), scheme.encoder(keys, batch)
     receivers: dict[str, tuple[str, Receiver]] = {"legitimate": ("innovation", scheme.estimator(keys, batch))}

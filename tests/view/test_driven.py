@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from read_back import rows
-from test_picture import filled
 
 from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
@@ -13,6 +11,8 @@ from evedrop.loading import checked, load
 from evedrop.view.picture import opened
 from evedrop.view.plant_slots import Showing
 from evedrop.view.replay import replay
+from tests.view.read_back import rows
+from tests.view.test_picture import filled
 
 SLOTS = 300
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
-from simulated_run import Simulated
 
 from evedrop.errors import UsageError
 from evedrop.view.picture import opened, picture, picture_apart
 from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer_process import guarded
 from tests.conftest import wait_until
+from tests.view.simulated_run import Simulated
 
 
 def recorded(run: Simulated, rrd: Path) -> Path:

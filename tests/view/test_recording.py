@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from read_back import lane, rows
 from rerun.chunk import RrdReader
-from simulated_run import Simulated
 
 from evedrop.view import plane
 from evedrop.view.recording import Scene, ViewRecording
 from tests.conftest import LIMIT
+from tests.view.read_back import lane, rows
+from tests.view.simulated_run import Simulated
 
 SLOTS = 400
 
@@ -160,7 +160,7 @@ def test_slots_that_cannot_be_drawn_end_the_recording_and_not_the_run(
 FULL_DISK = """
 import os, resource, signal, sys
 sys.path.insert(0, sys.argv[1])
-from simulated_run import orbit, simulate
+from tests.view.simulated_run import orbit, simulate
 from pathlib import Path
 from evedrop.view.recording import ViewRecording
 run = simulate(orbit(), 3000)

@@ -7,13 +7,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from read_back import lane, rows
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.view.replay import replay
+from tests.view.read_back import lane, rows
 
 SLOTS = 120
 EVE = {"eve": {"strategy": "naive", "link": {"quality": 0.7}}}
@@ -100,7 +100,7 @@ def test_tables_that_do_not_fit_are_refused(what: str, study: Path, tmp_path: Pa
 
 def test_another_process_is_refused(study: Path, tmp_path: Path) -> None:
     """The tables of two states beside a scenario of one: a line at once, where a recording would never be finished."""
-    one = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
+    one: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
     folder = montecarlo("eavesdroppers", trials=2, slots=SLOTS, out=tmp_path / "run", **one).folder
     shutil.copy(study / "trials.parquet", folder)
     with pytest.raises(UsageError, match=r"trials\.parquet has 2 states and scenario\.toml 1; run the scenario again"):

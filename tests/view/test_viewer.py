@@ -15,7 +15,6 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from rerun.chunk import RrdReader
-from simulated_run import Simulated
 
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
@@ -23,6 +22,7 @@ from evedrop.view.growing_recording import Followed, feed
 from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer import Viewer, WebAddress, choose, open_run
 from tests.conftest import LIMIT, wait_until
+from tests.view.simulated_run import Simulated
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 SLOTS = 3000

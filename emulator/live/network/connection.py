@@ -81,7 +81,7 @@ class Connection:
             self._token_key = None
             if self._token is not None and not self.session.is_closed():
                 with suppress(zenoh.ZError):
-                    self._token.undeclare()  # type: ignore[no-untyped-call]
+                    self._token.undeclare()
 
     def renew(self) -> None:
         """Open another session, since this one confuses keys; at most once per second."""
@@ -176,4 +176,4 @@ class Connection:
 def _close(session: zenoh.Session) -> None:
     """Close a session. If its router is stopped, Zenoh gives up after ten seconds; the session is of no use then either."""
     with suppress(zenoh.ZError):
-        session.close()  # type: ignore[no-untyped-call]
+        session.close()

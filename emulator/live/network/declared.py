@@ -144,7 +144,7 @@ class Question:
         """Send the answer, if the asking process is still connected."""
         with suppress(zenoh.ZError):
             self._query.reply(self._key, head_of(self._key) + payload)
-        self._query.drop()  # type: ignore[no-untyped-call]
+        self._query.drop()
 
 
 @final
@@ -162,7 +162,7 @@ class Questions:
         message = b"" if query.payload is None else query.payload.to_bytes()
         payload = self._dropped.contents(self._key, self._head, message)
         if payload is None:
-            query.drop()  # type: ignore[no-untyped-call]
+            query.drop()
         else:
             self._receive(Question(self._key, query, payload))
 

@@ -26,7 +26,7 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
                 file.write(json.dumps({**news, "at": time.monotonic()}) + "\n")
             show(line, news)
 
-        module.ProgressLine.tell = tell  # type: ignore[attr-defined]
+        module.ProgressLine.tell = tell
 
     def _wired(module: ModuleType) -> None:
         import dataclasses
@@ -44,7 +44,7 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
                 endpoint = campaign.recv(1000).decode()
             return honest(dataclasses.replace(brief, router=endpoint), directory)
 
-        module.Brief.write = write  # type: ignore[attr-defined]
+        module.Brief.write = write
 
     _CHANGES = {"evedrop.cli.report": _telling, "evedrop.live.protocol.brief": _wired}
 
@@ -65,4 +65,4 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
                 spec.loader.exec_module = exec_module  # type: ignore[method-assign]
             return spec
 
-    sys.meta_path.insert(0, _Finder)  # type: ignore[arg-type]
+    sys.meta_path.insert(0, _Finder)

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bench import Bench, bench_of, scenario_of
+
+from tests.live.network.bench import Bench, bench_of, scenario_of
 
 
 @pytest.fixture

@@ -12,16 +12,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zenoh
-from bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
 
 from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.envelope import enclosed
+from tests.live.network.bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
 
 EVE = "eve"
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -34,7 +35,6 @@ LINKS = 10  # attempts at a link between routers
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file: none of them may leave a trace in it."""
     with bench_of(scenario_of(slots=100_000), tmp_path_factory.mktemp("access")) as one:
-        one.due = 0
         yield one
 
 
@@ -87,7 +87,7 @@ def talk(stage: Bench) -> None:
     assert stage.progress["observer"].hear()[1] == wire.progress(1)
 
 
-MODES = {
+MODES: dict[str, dict[str, Any]] = {
     "client": {},
     "peer": {"mode": "peer"},
     "router": {"mode": "router", "listen": {"endpoints": []}},
@@ -102,7 +102,12 @@ def test_eavesdropper_hears_only_its_own_downlink(mode: str, stage: Bench) -> No
         for key, ear in ears.items():
             attacker.declare_subscriber(key, ear)
         own, ears_of_own = stage.keys.downlink(EVE), ears[stage.keys.downlink(EVE)]
-        until(lambda: flow(stage) or not ears_of_own.messages.empty(), "a delivery to the attacker")
+
+        def delivered() -> bool:
+            flow(stage)
+            return not ears_of_own.messages.empty()
+
+        until(delivered, "a delivery to the attacker")
         first = stage.due
         talk(stage)
         slots = range(first, stage.due)
@@ -177,6 +182,12 @@ def test_eavesdropper_gets_nothing_by_asking(stage: Bench) -> None:
     assert asked == []
 
 
+def key_of(reply: zenoh.Reply) -> str:
+    """The key of a reply that is not an error."""
+    assert reply.ok is not None, reply
+    return str(reply.ok.key_expr)
+
+
 def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
     """It learns of no token but its own, neither by watching, with history, nor by asking; the observer sees them."""
     with connect(stage.briefs[EVE]) as attacker, ExitStack() as stack:
@@ -188,7 +199,7 @@ def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
             if key.startswith("@"):
                 continue
             attacker.liveliness().declare_subscriber(key, ear, history=True)
-            found = [str(reply.ok.key_expr) for reply in attacker.liveliness().get(key, timeout=5.0)]
+            found = [key_of(reply) for reply in attacker.liveliness().get(key, timeout=5.0)]
             assert found == ([key] if key == alive[EVE] else [])
         seen = {stage.tokens.hear()[0] for _ in PROCESSES}
         assert seen == set(alive.values())
@@ -272,7 +283,7 @@ def test_no_session_without_credentials(who: str, mode: str, stage: Bench) -> No
     flow(stage)
 
 
-LOOP = {
+LOOP: dict[str, dict[str, Any]] = {
     "plant": {"inputs": ["u"], "input_matrix": [[1.0], [0.0]]},
     "controller": {"strategy": "lqr", "state_weights": [1.0, 0.0], "input_weights": [1.0]},
 }

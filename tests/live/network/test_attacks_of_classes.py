@@ -219,7 +219,11 @@ def said_by(lies: dict[str, Any]) -> Any:
     answers = Answers()
     truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
     said = {**truth, "outcomes": True, "outcomes_at": SHARES, **lies}
-    given = {"class": ["STRATEGIES"], "outcomes": ["STRATEGIES", {}, 0.5], "outcomes_at": ["STRATEGIES", {}, 0.5, 0.5]}
+    given: dict[str, list[Any]] = {
+        "class": ["STRATEGIES"],
+        "outcomes": ["STRATEGIES", {}, 0.5],
+        "outcomes_at": ["STRATEGIES", {}, 0.5, 0.5],
+    }
     known = {
         json.dumps(["spy:Spy", do, *given.get(do, ["STRATEGIES", {}])]): {"is": answer}
         for do, answer in {"class": FACTS, **said}.items()

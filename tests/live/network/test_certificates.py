@@ -9,13 +9,12 @@ import datetime
 import json
 import socket
 import ssl
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import zenoh
-from bench import Bench, Ear, bench_of, connect, scenario_of, until
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
@@ -31,6 +30,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import Brief, Identity, read_brief
 from evedrop.ports import free_port
+from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 EVE, MALLORY = "eve", "mallory"
 NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)
@@ -41,7 +41,6 @@ ONCE = {"timeout_ms": 0, "exit_on_failure": True}
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file."""
     with bench_of(scenario_of(slots=100_000), tmp_path_factory.mktemp("tls"), "tls") as one:
-        one.due = 0
         yield one
 
 
@@ -64,12 +63,18 @@ def expired() -> Identity:
     return Authority("old", datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=365)).identity(EVE)
 
 
-STRANGERS = {
+def identity_of(brief: Brief) -> Identity:
+    """The identity in a brief of a run with certificates."""
+    assert brief.identity is not None
+    return brief.identity
+
+
+STRANGERS: dict[str, Callable[[Brief], Identity]] = {
     "of another run": lambda _: Authority("r00000000").identity(EVE),
     "self-signed": lambda _: self_signed(),
     "expired": lambda _: expired(),
     "another run's, this run's authority": lambda brief: replace(
-        Authority(brief.run).identity(EVE), authority=brief.identity.authority
+        Authority(brief.run).identity(EVE), authority=identity_of(brief).authority
     ),
 }
 
@@ -119,7 +124,13 @@ def test_a_certificate_opens_nothing_under_another_user(user: str, shown: str, s
             rightful.declare_subscriber(key, own)
         attacker.put(telemetry, b"forged")
         attacker.put(stage.keys.control("sensor"), b"forged")
-        until(lambda: flow(stage) or stage.settle("sensor") or not own.messages.empty(), "what is rightfully heard")
+
+        def heard() -> bool:
+            flow(stage)
+            stage.settle("sensor")
+            return not own.messages.empty()
+
+        until(heard, "what is rightfully heard")
         for _ in range(3):
             flow(stage)
             stage.settle("sensor")
@@ -135,7 +146,12 @@ def test_with_the_own_certificate_an_eavesdropper_hears_its_own_alone(stage: Ben
         ears = {key: Ear() for key in (stage.keys.downlink(EVE), stage.keys.downlink(MALLORY), stage.keys.uplink)}
         for key, ear in ears.items():
             attacker.declare_subscriber(key, ear)
-        until(lambda: flow(stage) or not ears[stage.keys.downlink(EVE)].messages.empty(), "its own delivery")
+
+        def heard() -> bool:
+            flow(stage)
+            return not ears[stage.keys.downlink(EVE)].messages.empty()
+
+        until(heard, "its own delivery")
         flow(stage)
         assert {key for ear in ears.values() for key, _ in ear.all()} == {stage.keys.downlink(EVE)}
 
@@ -320,4 +336,6 @@ def test_the_routers_certificate_passes_the_strictest_check(stage: Bench) -> Non
     strict.verify_flags |= ssl.VERIFY_X509_STRICT
     address = ("127.0.0.1", int(brief.router.rpartition(":")[2]))
     with socket.create_connection(address) as link, strict.wrap_socket(link, server_hostname="127.0.0.1") as shown:
-        assert shown.getpeercert()["subject"] == ((("commonName", "router"),),)
+        certificate = shown.getpeercert()
+        assert certificate is not None
+        assert certificate["subject"] == ((("commonName", "router"),),)

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bench import Bench, bench_of, scenario_of
 
 from evedrop.cli import main as cli
 from evedrop.live.network.health import is_there
+from tests.live.network.bench import Bench, bench_of, scenario_of
 
 EVE = "eve"
 

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from bench import LIMIT_SECONDS, Ear, connect, until
 
 from evedrop import montecarlo
 from evedrop.live.protocol import codec as wire
@@ -29,6 +28,7 @@ from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import stream_key
+from tests.live.network.bench import LIMIT_SECONDS, Ear, connect, until
 
 SCENARIO = """
 title = "Under attack"

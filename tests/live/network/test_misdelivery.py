@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import zenoh
-from bench import LIMIT_SECONDS, scenario_of, until
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
@@ -26,6 +25,7 @@ from evedrop.live.protocol.codec import Reader, control, progress
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
+from tests.live.network.bench import LIMIT_SECONDS, is_matched, scenario_of, until
 from tests.proxy import Cable, cable
 
 GOOD = progress(7)
@@ -63,7 +63,7 @@ class Stage:
     def reads(self, key: str) -> None:
         """Wait until somebody reads a key."""
         publisher = self.router.declare_publisher(key)
-        until(lambda: publisher.matching_status.matching, f"a reader of {key}")
+        until(lambda: is_matched(publisher), f"a reader of {key}")
         publisher.undeclare()
 
     def put(self, key: str, messages: list[bytes]) -> None:
@@ -125,7 +125,7 @@ def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None
     with Session(stage.briefs["observer"]) as session:
         session.asked(key, asked.put)
         querier = stage.router.declare_querier(key)
-        until(lambda: querier.matching_status.matching, "somebody to be asked")
+        until(lambda: is_matched(querier), "somebody to be asked")
         for message in foreign(stage.keys, key):
             assert list(stage.router.get(key, payload=message, timeout=2.0)) == []
         assert asked.empty()

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import zenoh
-from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.control_file import Control
@@ -21,6 +20,7 @@ from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
+from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
 PATIENCE = 5.0

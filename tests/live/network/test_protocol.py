@@ -38,7 +38,9 @@ Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
 
 def parts_of(block: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     """Shape, value and bytes of a message's golden block."""
-    shape, value, raw = re.fullmatch(r"(?:shape (.*?)\n)?value (.*)\nbytes (.*)", block, re.S).groups()
+    found = re.fullmatch(r"(?:shape (.*?)\n)?value (.*)\nbytes (.*)", block, re.S)
+    assert found is not None, block
+    shape, value, raw = found.groups()
     return json.loads(shape or "{}"), json.loads(value), bytes.fromhex(raw)
 
 
@@ -85,10 +87,10 @@ def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
 
 def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As a receiver makes it."""
-    columns = (np.array(value[name], float) for name in ("P", "trace"))
-    x_hat, action = np.array(value["x_hat"], float), np.array(value["action"], np.uint8)
-    late = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
-    return telemetry.Report(value["k"], x_hat, action, *columns, next(late), digests_of(value), next(late)).pack()
+    x_hat, P, trace = (np.array(value[name], float) for name in ("x_hat", "P", "trace"))
+    action = np.array(value["action"], np.uint8)
+    late, used = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
+    return telemetry.Report(value["k"], x_hat, action, P, trace, late, digests_of(value), used).pack()
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -112,7 +114,11 @@ def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> di
     inputs = shape.get("inputs", 0)
     truth = telemetry.read_truth(wire.Reader(KEY, raw), value["k"], extent_of(shape))
     found = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
-    return {**found, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()} if inputs else found
+    if not inputs:
+        return found
+    assert truth.u is not None
+    assert truth.failed is not None
+    return {**found, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()}
 
 
 def decode_known(name: str) -> Decode:
@@ -447,6 +453,7 @@ def test_digest() -> None:
     log = BeliefLog(2, 2, 3)
     blocks = [log.add(k, Belief(x_hat[k], P[k], gamma[k])) for k in range(3)]
     assert blocks[:2] == [None, None]
+    assert blocks[2] is not None
     first, digests = blocks[2]
     assert first == 0
     assert [bytes(row).hex() for row in digests] == golden["blocks"]
@@ -476,8 +483,8 @@ def test_table_of_keys_is_the_access_table() -> None:
     granted: dict[tuple[str, str], set[str]] = {}
     loops = [Wiring("estimate", True), Wiring("truth", True)]
     for grant in (grant for loop in loops for grant in grants("r", receivers, loop)):
-        for what, keys in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
-            for key in filter(None, keys):
+        for what, given in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
+            for key in filter(None, given):
                 granted.setdefault((what, key), set()).add(grant.process)
     keys = RunKeys("r")
     no_row = {

@@ -10,11 +10,11 @@ from collections.abc import Callable
 import msgpack
 import numpy as np
 import pytest
-from bench import LIMIT_SECONDS, Bench
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
+from tests.live.network.bench import LIMIT_SECONDS, Bench
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:

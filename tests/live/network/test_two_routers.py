@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import pytest
 import zenoh
-from bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_places, places_at
@@ -25,6 +24,7 @@ from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
+from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 EVE = "eve"
 RECEIVERS = ("legitimate", "eve", "mallory", "nadia")
@@ -36,7 +36,6 @@ def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     """A router and a relay for all tests of this file, in clear and with certificates."""
     scenario = scenario_of(slots=100_000, network={"routers": 2})
     with bench_of(scenario, tmp_path_factory.mktemp("linked"), request.param) as one:
-        one.due = 0
         yield one
 
 
@@ -74,7 +73,12 @@ def test_an_eavesdropper_at_the_relay_hears_its_own_alone(stage: Bench) -> None:
             attacker.declare_subscriber(key, ear)
         watching = Ear()
         attacker.liveliness().declare_subscriber("evedrop/**", watching, history=True)
-        until(lambda: flow(stage) or not ears[keys.downlink(EVE)].messages.empty(), "its own delivery")
+
+        def heard() -> bool:
+            flow(stage)
+            return not ears[keys.downlink(EVE)].messages.empty()
+
+        until(heard, "its own delivery")
         for _ in range(4):
             flow(stage)
             stage.settle("sensor")

@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bench import scenario_of
 
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network import connecting
 from evedrop.live.network.session import Session
 from evedrop.ports import free_port
+from tests.live.network.bench import scenario_of
 
 
 def test_a_process_says_that_it_waits_for_its_router(

@@ -121,7 +121,7 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
     """A scenario with one eavesdropper of each strategy."""
     link = {"link": {"quality": 0.8}}
     suspicious = {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, **link}
-    table = {
+    table: dict[str, Any] = {
         "title": "Briefs",
         "slots": 50,
         "seed": seed,
@@ -286,7 +286,8 @@ def test_every_brief_lacks_nothing_unnoticed(name: str, tmp_path: Path) -> None:
         if entry not in OPTIONAL and not shared:
             assert without is not None, path
             assert path in without, (path, without)
-        for other in ([["x"]], {"x": {"y": []}}, "\x00", -1.5):
+        strange: tuple[Any, ...] = ([["x"]], {"x": {"y": []}}, "\x00", -1.5)
+        for other in strange:
             table[entry] = other
             refused = refusal(found, tmp_path)  # whatever it is, nothing but a BriefError
             if not isinstance(other, type(before)) and before is not None and path not in ("part.modules",):
