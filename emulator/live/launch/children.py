@@ -19,7 +19,8 @@ from typing import Any, final
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
@@ -96,7 +97,7 @@ class Children:
         """Whether the run is over, and all processes have been told to leave."""
         self._finishing = False
         self._restarts = 0
-        self._briefs: dict[str, Brief] = {}
+        self._briefs: dict[str, AnyBrief] = {}
         self._killed: set[int] = set()
         """Ids of processes whose end is not a failure: those killed by the scenario, and routers that were restarted."""
 
@@ -118,16 +119,16 @@ class Children:
             if process.stdin is not None:
                 process.stdin.close()
 
-    def start(self, brief: Brief, again: bool = False) -> None:
+    def start(self, brief: AnyBrief, again: bool = False) -> None:
         """Start the process of a brief, or restart it. Its output goes to its log, an observer's news to the launcher.
 
         Raises RunError if the system cannot start it.
         """
         conducts = brief.role == "observer"
         self._briefs[brief.process] = brief
-        if brief.part.get("outages"):
+        if isinstance(brief.part, ReceiverPart) and brief.part.outages:
             state_file = str((self._private / f"{brief.process}.state").absolute())
-            brief = replace(brief, part={**brief.part, "state_file": state_file})
+            brief = replace(brief, part=replace(brief.part, state_file=state_file))
         environment = {
             **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
@@ -135,7 +136,7 @@ class Children:
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUNBUFFERED": "1",
         }
-        if brief.role in {"router", "relay"}:
+        if isinstance(brief.part, RoutingPart):
             environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
         try:
             path = brief.write(self._private)
