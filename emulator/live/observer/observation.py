@@ -29,6 +29,7 @@ from evedrop.live.observer.verification import Verifier, extent_of
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
+from evedrop.live.protocol.news import RunEnded, RunProgress
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
@@ -307,7 +308,7 @@ class ObservedRun:
         rate = (self._joiner.done - done) / (now - before)
         self._told, self._recent = now, (now, self._joiner.done)
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
-        tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
+        tell(**RunProgress(self._joiner.done, rate, "slots/s", errors).news)
 
     @property
     def _at(self) -> str:
@@ -369,8 +370,7 @@ class ObservedRun:
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        accused = list(self._accused)
-        tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
+        tell(**RunEnded(status, how, self._suspects, self._accused, view).news)
         if self._by_hand:
             with suppress(FileNotFoundError):
                 report(self.folder, status, how)
