@@ -77,17 +77,30 @@ def maybe(check: Check) -> Check:
     return lambda path, found: iter(()) if found is None else check(path, found)
 
 
-def listed(check: Check, least: int = 0) -> Check:
+def listed(check: Check) -> Check:
     """A check for a list of values that pass another check."""
 
     def all_of(path: str, found: Any) -> Iterator[str]:
-        if not isinstance(found, list) or len(found) < least:
-            yield from _wrong(path, found, f"a list of {least} or more entries" if least else "a list")
+        if not isinstance(found, list):
+            yield from _wrong(path, found, "a list")
             return
         for i, one in enumerate(found):
             yield from check(f"{path}.{i}", one)
 
     return all_of
+
+
+def row(*checks: Check) -> Check:
+    """A check for a list with one value for each of these checks."""
+
+    def each(path: str, found: Any) -> Iterator[str]:
+        if not isinstance(found, list) or len(found) != len(checks):
+            yield from _wrong(path, found, f"a list of {len(checks)} entries")
+            return
+        for i, (check, one) in enumerate(zip(checks, found, strict=True)):
+            yield from check(f"{path}.{i}", one)
+
+    return each
 
 
 def named(check: Check) -> Check:

@@ -32,6 +32,7 @@ from evedrop.live.protocol.brief_entries import (
     number,
     positive,
     read,
+    row,
     table,
     table_of,
     text,
@@ -47,11 +48,11 @@ _TEXTS = listed(text)
 _SCHEME = table({"scheme": text}, strict=False)
 _SIZES = table(dict.fromkeys(KINDS, whole(1)))
 _WINDOW = whole(0, MOST_SLOTS)
-_OUTAGES = listed(listed(anything, 3))
+_OUTAGES = listed(row(SLOT, SLOT, flag))
 _SCORE = whole(-NEVER)
 _CHART: Check = maybe(table(dict.fromkeys(("acknowledged", "missing", "threshold"), _SCORE)))
 _WAY_BACK: Check = maybe(
-    table({"quality": number, "attack": text, "jammer": maybe(text), "spans": maybe(listed(listed(SLOT, 2)))})
+    table({"quality": number, "attack": text, "jammer": maybe(text), "spans": maybe(listed(row(SLOT, SLOT)))})
 )
 _CHANGES = listed(table({"at": SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)}))
 
@@ -74,9 +75,11 @@ class LinkEntry:
     settings: Mapping[str, Any] = field(metadata=entry(table({"loss": named(anything)}, strict=False)))
     window: int = field(metadata=entry(_WINDOW))
     changes: Sequence[Change] = field(metadata=entry(_CHANGES, lambda found: [Change(**one) for one in found]))
-    outages: Sequence[Sequence[int]] = field(metadata=entry(listed(listed(SLOT, 3))))
+    outages: Sequence[Sequence[int]] = field(metadata=entry(listed(row(SLOT, SLOT, SLOT))))
     """[first slot, first slot after, `Fate` of packets] each."""
-    correlation: Sequence[Any] | None = field(metadata=entry(maybe(listed(anything, 2))))
+    correlation: tuple[str, float] | None = field(
+        metadata=entry(maybe(row(text, number)), lambda found: None if found is None else tuple(found))
+    )
     """[receiver, strength]."""
 
     @classmethod
@@ -87,10 +90,9 @@ class LinkEntry:
 
     @property
     def schedule(self) -> LinkSchedule:
-        """The link's schedule. Raises ValueError if an outage is malformed."""
+        """The link's schedule. Raises ValueError if an outage has no such `Fate`."""
         outages = tuple(ReceiverOutage(start, stop, Fate(reason)) for start, stop, reason in self.outages)
-        correlation: Any = None if self.correlation is None else tuple(self.correlation)
-        return LinkSchedule(self.settings, self.window, tuple(self.changes), outages, correlation)
+        return LinkSchedule(self.settings, self.window, tuple(self.changes), outages, self.correlation)
 
 
 @dataclass(frozen=True)

@@ -238,6 +238,23 @@ def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
         assert [secret for secret in secrets if secret and secret in shown] == []
 
 
+@pytest.mark.parametrize("role", ["legitimate", "smart"])
+@pytest.mark.parametrize(
+    ("outage", "said"),
+    [
+        ([[], 3, True], "part.outages.0.0 is list of 0, expected a whole number"),
+        ([2, 3, 1], "part.outages.0.2 is 1, expected true or false"),
+        ([2, 3], "part.outages.0 is list of 2, expected a list of 3 entries"),
+        ([2, 3, True, 4], "part.outages.0 is list of 4, expected a list of 3 entries"),
+    ],
+)
+def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, tmp_path: Path) -> None:
+    """Before the receiver takes part in the run."""
+    found = json.loads(made(scenario_of())[role].text)
+    found["part"]["outages"] = [outage]
+    assert said in str(refusal(found, tmp_path))
+
+
 @pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "observer"])
 def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
     """As those of the brief itself."""
