@@ -21,7 +21,8 @@ from processes import Usage, watch
 
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_parts import ObserverPart, SensorPart
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.packets import uplink
 from evedrop.loading import load
@@ -95,7 +96,7 @@ def _routed_latency(slots: int, rate: float) -> tuple[float, float]:
     return max(delay[0] for delay in delays), max(delay[1] for delay in delays)
 
 
-def _send(brief: Brief) -> None:
+def _send(brief: Brief[SensorPart]) -> None:
     import numpy as np  # noqa: PLC0415
 
     z = np.zeros((2, 1))
@@ -108,14 +109,14 @@ def _send(brief: Brief) -> None:
         session.wait_for("start")
         start = time.monotonic()
         for k in range(brief.slots):
-            time.sleep(max(0.0, start + k * float(brief.part["pace"]) - time.monotonic()))
+            time.sleep(max(0.0, start + k * brief.part.pace - time.monotonic()))
             times.append(time.monotonic())
             send(uplink(k, z))
         session.wait_for("end")
     print(json.dumps(times), flush=True)
 
 
-def _receive(brief: Brief) -> None:
+def _receive(brief: AnyBrief) -> None:
     times = []
     with Session(brief) as session:
         deliveries = session.inbox(session.keys.downlink(brief.process))
@@ -129,11 +130,11 @@ def _receive(brief: Brief) -> None:
     print(json.dumps(times), flush=True)
 
 
-def _watch(brief: Brief) -> None:
+def _watch(brief: Brief[ObserverPart]) -> None:
     """The conductor's part: start when all are there, end when the journal is complete."""
     from evedrop.live.observer.conductor import Conductor, Stop  # noqa: PLC0415
 
-    receivers = tuple(brief.part["scenario"]["eavesdroppers"])
+    receivers = tuple(brief.part.scenario["eavesdroppers"])
     with Session(brief) as session:
         conductor = Conductor(session, (LEGITIMATE, *receivers), Stop())
         conductor.assemble()

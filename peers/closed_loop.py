@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from base64 import b64decode
-from collections.abc import Mapping
-from typing import Any, final
-
-import numpy as np
+from typing import final
 
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_closed_loop import EstimatorLoop, SensorPlantEntry, decoded
+from evedrop.live.protocol.brief_parts import SensorPart
 from evedrop.live.protocol.closed_loop import known, read_decided
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.local_filter import LocalFilter
-from evedrop.model.plant import Drive, Plant
+from evedrop.model.plant import Drive
 from evedrop.model.process import Floats, Trajectory
 from evedrop.model.receiver import Belief, Flags, Receiver
 
 
-def disturbances_in(text: str, slots: int) -> Floats:
-    """Decode the disturbances of a brief, (slots, q)."""
-    return np.frombuffer(b64decode(text), "<f8").reshape(slots, -1)
-
-
-def kept_decisive(session: Session, key: str, brief: Brief, period: int) -> ReplayBuffer:
+def kept_decisive(session: Session, key: str, brief: AnyBrief, period: int) -> ReplayBuffer:
     """A replay buffer for messages of decision slots: each may be needed until the next decision slot."""
     return session.kept(key, brief.flow.window + 1 + period, back=period)
 
@@ -53,11 +46,11 @@ class Decided:
 class Actuator:
     """The plant at the sensor: moves the state, and waits for the inputs after every slot."""
 
-    def __init__(self, brief: Brief, session: Session) -> None:
-        plant, loop = Plant.of(brief.part["plant"]), brief.part["controller"]
+    def __init__(self, brief: Brief[SensorPart], entry: SensorPlantEntry, session: Session) -> None:
+        plant, loop = entry.plant, brief.part.controller
         self.inputs = 0 if loop is None else plant.inputs
         """How many inputs the controller decides."""
-        self._drive = Drive(plant, disturbances_in(brief.part["plant"]["disturbances"], brief.slots))
+        self._drive = Drive(plant, decoded(entry.disturbances, brief.slots))
         key = brief.stream_keys.get("measurement", b"")
         measures = plant.output_matrix is not None
         self._local = LocalFilter(brief.model.process, plant, key, brief.batch) if measures else None
@@ -65,10 +58,10 @@ class Actuator:
         self._period = 1
         self._put = None
         if loop is not None:
-            self._period = loop["period"]
+            self._period = loop.period
             self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.longest_outage)
             self._put = (
-                kept_decisive(session, session.keys.state, brief, self._period) if loop["acts_on"] == "truth" else None
+                kept_decisive(session, session.keys.state, brief, self._period) if loop.acts_on == "truth" else None
             )
 
     def pushed(self, k: int) -> Floats:
@@ -103,17 +96,14 @@ class Actuator:
 class Consultation:
     """The closed loop at the legitimate estimator: sends its estimate, and may receive the inputs."""
 
-    def __init__(self, brief: Brief, session: Session, receiver: Receiver) -> None:
-        loop: Mapping[str, Any] = brief.part["controller"]
-        self._period = loop["period"]
+    def __init__(self, brief: AnyBrief, loop: EstimatorLoop, session: Session, receiver: Receiver) -> None:
+        self._period = loop.period
         self._put = (
-            kept_decisive(session, session.keys.estimate, brief, self._period)
-            if loop["acts_on"] == "estimate"
-            else None
+            kept_decisive(session, session.keys.estimate, brief, self._period) if loop.acts_on == "estimate" else None
         )
         self._told: tuple[InputAwareEstimator, Decided] | None = None
-        if isinstance(receiver, InputAwareEstimator):
-            shape = (len(loop["plant"]["input_lower"]), brief.trials)
+        if isinstance(receiver, InputAwareEstimator) and loop.plant is not None:
+            shape = (len(loop.plant.input_lower), brief.trials)
             self._told = receiver, Decided(session, self._period, shape, brief.flow.longest_outage)
 
     def before(self, k: int) -> None:

@@ -8,23 +8,23 @@ from evedrop.live.network.reporting import DecisionReporter
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_closed_loop import decoded
+from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.live.protocol.closed_loop import decided, read_known
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.controllers import CONTROLLERS
-from evedrop.model.controllers.controller import Assignment
-from evedrop.model.plant import Plant
 from evedrop.names import CONTROLLER
-from evedrop.peers.closed_loop import disturbances_in, kept_decisive
+from evedrop.peers.closed_loop import kept_decisive
 
 
-def steer(brief: Brief) -> None:
+def steer(brief: Brief[ControllerPart]) -> None:
     """Run the controller of a brief."""
     part, process = brief.part, brief.model.process
-    plant = Plant.of(part["plant"])
-    assignment = Assignment.of(process, plant, part["assignment"])
-    disturbances = disturbances_in(part["disturbances"], brief.slots)
-    controller = CONTROLLERS[part["strategy"]](assignment, brief.trials)
-    on_truth = part["acts_on"] == "truth"
+    plant = part.plant.plant
+    assignment = part.assignment.assignment(process, plant)
+    disturbances = decoded(part.disturbances, brief.slots)
+    controller = CONTROLLERS[part.strategy](assignment, brief.trials)
+    on_truth = part.acts_on == "truth"
     with Session(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
         inbox, put = session.inbox(key), kept_decisive(session, session.keys.input, brief, assignment.period)

@@ -14,7 +14,8 @@ from evedrop.live.network.declared import Inbox
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_delivery
 from evedrop.live.protocol.telemetry import leaving
@@ -25,7 +26,7 @@ from evedrop.peers.closed_loop import Consultation
 
 
 def follow(
-    brief: Brief,
+    brief: Brief[ReceiverPart],
     receiver: Receiver,
     acknowledges: bool = False,
     consult: Callable[[Session], Consultation] | None = None,
@@ -35,8 +36,8 @@ def follow(
     It may acknowledge packets, and send its estimate to a controller. Deliveries that it already had are acknowledged
     again, and otherwise ignored.
     """
-    name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part["window"]
-    outages = {start: (stop, keeps) for start, stop, keeps in brief.part["outages"]}
+    name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part.window
+    outages = {start: (stop, keeps) for start, stop, keeps in brief.part.outages}
     follower = Follower(receiver, window, brief.first)
     if brief.first:
         _remember(brief, follower, outages)
@@ -91,7 +92,9 @@ def follow(
 class ReceiverReplies:
     """A receiver's messages to processes other than the observer: acknowledgements, and its estimate to a controller."""
 
-    def __init__(self, brief: Brief, session: Session, acknowledges: bool, consultation: Consultation | None) -> None:
+    def __init__(
+        self, brief: AnyBrief, session: Session, acknowledges: bool, consultation: Consultation | None
+    ) -> None:
         self._trials = brief.trials
         self._acknowledge = session.outlet(session.keys.acknowledged) if acknowledges else None
         self._consultation = consultation
@@ -130,21 +133,21 @@ def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
     return acknowledgement(k, read_acknowledgement(delivery, k, trials))
 
 
-def _save(brief: Brief, belief: Belief) -> None:
+def _save(brief: Brief[ReceiverPart], belief: Belief) -> None:
     """Save a belief for this process if it is restarted; does nothing if the brief names no state file."""
-    if "state_file" not in brief.part:
+    if brief.part.state_file is None:
         return
-    path = Path(brief.part["state_file"])
+    path = Path(brief.part.state_file)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
         np.savez(file, belief.x_hat, belief.P, belief.action, *belief.memory)
 
 
-def _remember(brief: Brief, follower: Follower, outages: dict[int, tuple[int, bool]]) -> None:
+def _remember(brief: Brief[ReceiverPart], follower: Follower, outages: dict[int, tuple[int, bool]]) -> None:
     """Restore the belief that this process had when it was ended, if it keeps its state over this outage."""
     start, keeps = next((start, keeps) for start, (stop, keeps) in outages.items() if stop == brief.first)
-    if not keeps:
+    if not keeps or brief.part.state_file is None:
         return
-    with np.load(brief.part["state_file"]) as saved:
+    with np.load(brief.part.state_file) as saved:
         x_hat, P, action, *memory = (saved[f"arr_{i}"] for i in range(len(saved.files)))
         follower.belief = Belief(x_hat, P, action, tuple(memory))
     follower.miss(range(start, brief.first))

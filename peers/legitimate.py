@@ -5,18 +5,18 @@ from __future__ import annotations
 from functools import partial
 
 from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_parts import LegitimatePart
 from evedrop.model.input_aware import InputAwareEstimator
-from evedrop.model.plant import Plant
 from evedrop.model.schemes import scheme_of
 from evedrop.peers.closed_loop import Consultation
 from evedrop.peers.following import follow
 
 
-def estimate(brief: Brief) -> None:
+def estimate(brief: Brief[LegitimatePart]) -> None:
     """Run the legitimate estimator of a brief."""
-    scheme = scheme_of(brief.model.process, brief.part["scheme"])
-    receiver, loop = scheme.estimator(brief.stream_keys, brief.batch), brief.part["controller"]
-    if loop is not None and loop["plant"] is not None:
-        receiver = InputAwareEstimator(receiver, Plant.of(loop["plant"]), brief.part["window"])
-    consult = partial(Consultation, brief, receiver=receiver) if loop is not None else None
+    scheme = scheme_of(brief.model.process, brief.part.scheme)
+    receiver, loop = scheme.estimator(brief.stream_keys, brief.batch), brief.part.controller
+    if loop is not None and loop.plant is not None:
+        receiver = InputAwareEstimator(receiver, loop.plant.plant, brief.part.window)
+    consult = partial(Consultation, brief, loop, receiver=receiver) if loop is not None else None
     follow(brief, receiver, scheme.needs_acknowledgements, consult)

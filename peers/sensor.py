@@ -12,11 +12,11 @@ from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_parts import SensorPart
 from evedrop.live.protocol.codec import Reader, read_progress, shown
 from evedrop.live.protocol.packets import PacketExtras, barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
-from evedrop.model.numeric.detection import Chart, CusumBatch
-from evedrop.model.plant import Plant
+from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
@@ -83,12 +83,12 @@ class Barriers:
     """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command."""
 
     def __init__(
-        self, brief: Brief, session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
+        self, brief: Brief[SensorPart], session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
     ) -> None:
         self._session, self._window = session, window
-        self._barriers = set(brief.part["holds"])
+        self._barriers = set(brief.part.holds)
         self._telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
-        watches = brief.part["chart"] is not None
+        watches = brief.part.chart is not None
         inputs, measures = (0, False) if actuator is None else (actuator.inputs, actuator.measures)
         self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches, inputs, measures)
 
@@ -120,13 +120,13 @@ class Barriers:
 class Acknowledgements:
     """Waits for the acknowledgements of each slot before the next is sent, and watches for attacks on them."""
 
-    def __init__(self, brief: Brief, session: Session, encoder: Encoder) -> None:
+    def __init__(self, brief: Brief[SensorPart], session: Session, encoder: Encoder) -> None:
         self._encoder, self._trials = encoder, brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
         self._due = GapDetector(self._key, brief.flow.longest_outage)
-        chart = brief.part["chart"]
-        self._watch = CusumBatch(Chart(**chart), brief.trials) if chart is not None else None
+        chart = brief.part.chart
+        self._watch = CusumBatch(chart, brief.trials) if chart is not None else None
 
     def wait(self, k: int, packet: Packet) -> Flags | None:
         """Wait for the acknowledgements of slot k; returns where they raise an alarm, (R,), or None if they are not watched."""
@@ -136,21 +136,20 @@ class Acknowledgements:
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
 
 
-def sense(brief: Brief) -> None:
+def sense(brief: Brief[SensorPart]) -> None:
     """Run the sensor of a brief."""
-    process, keys = brief.model.process, brief.stream_keys
-    scheme = scheme_of(process, brief.part["scheme"])
+    process, keys, part = brief.model.process, brief.stream_keys, brief.part
+    scheme = scheme_of(process, part.scheme)
     encoder = scheme.encoder(keys, brief.batch)
-    initial, plant = scheme.initial_state(keys, brief.batch), brief.part["plant"]
-    noise = None if plant is None else Plant.of(plant).noise
+    initial = scheme.initial_state(keys, brief.batch)
+    noise = None if part.plant is None else part.plant.plant.noise
     trajectory = Trajectory(process, keys["process"], brief.batch, initial, noise)
-    betrayed = set(brief.part["leaks"].values())
-    pace = float(brief.part["pace"])
+    betrayed, pace = set(part.leaks.values()), part.pace
     with Session(brief) as session:
-        send = session.kept(session.keys.uplink, head=resend, back=brief.part["history"])
-        window = Window(session, (*brief.part["receivers"], OBSERVER), brief.flow.window, send)
+        send = session.kept(session.keys.uplink, head=resend, back=part.history)
+        window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, send)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
-        actuator = Actuator(brief, session) if plant is not None else None
+        actuator = Actuator(brief, part.plant, session) if part.plant is not None else None
         barriers = Barriers(brief, session, window, scheme, actuator)
         session.ready()
         session.wait_for("start")
@@ -173,7 +172,7 @@ def sense(brief: Brief) -> None:
                 x, predicted = actuator.transmitted(k, true, trajectory)
             packet = encoder.encode(k, x, predicted)
             if packet.z.shape != x.shape:
-                found, name = packet.z.shape, brief.part["scheme"]["scheme"]
+                found, name = packet.z.shape, part.scheme["scheme"]
                 raise RunError(
                     f"slot {k}: encode of the scheme {name} gave z of shape {found}; expected {x.shape}; correct the class"
                 )

@@ -17,7 +17,8 @@ from evedrop.errors import BriefError, UsageError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from evedrop.live.protocol.brief import Brief
+    from evedrop.live.protocol.brief import AnyBrief, Brief
+    from evedrop.live.protocol.brief_parts import ObserverPart
 
 
 _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by hand
@@ -40,6 +41,7 @@ def brief(options: argparse.Namespace) -> int:
 def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
     from evedrop.live.protocol.brief import read_brief
+    from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart
     from evedrop.plugins import look_in
 
     os.umask(0o077)  # only this user may read its files
@@ -48,54 +50,72 @@ def process(options: argparse.Namespace) -> int:
     if options.role != "observer":  # which ends in order
         leave_on_signals()
     brief = read_brief(options.brief, options.role)
-    if getattr(options, "out", None) is not None:
-        brief = replace(brief, part={**brief.part, "results": str(options.out)})
-    if brief.part.get("modules") is not None:
-        look_in(str(brief.part["modules"]))
+    if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
+        brief = replace(brief, part=replace(brief.part, results=str(options.out)))
+    if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
+        look_in(brief.part.modules)
     try:
         return _play(brief, getattr(options, "serve", None))
     except BriefError as error:
         raise BriefError(f"{options.brief}: {error}") from error
 
 
-def _play(brief: Brief, serve: str | None) -> int:
+def _play(brief: AnyBrief, serve: str | None) -> int:
     """Run the process of a brief; returns its exit status. serve: where an observer shows the run to browsers."""
     from evedrop.errors import NotRegistered
+    from evedrop.live.protocol.brief import has_part
+    from evedrop.live.protocol.brief_parts import ObserverPart
     from evedrop.live.protocol.brief_use import expect_usable
 
     if brief.identity is not None:
         from evedrop.live.network.certificates import check_identity
 
         check_identity(brief.identity, brief.process)
-    match brief.role:
-        case "router":
-            from evedrop.live.network.router import route as play
-        case "relay":
-            from evedrop.live.network.relay import relay as play
-        case "sensor":
-            from evedrop.peers.sensor import sense as play
-        case "legitimate":
-            from evedrop.peers.legitimate import estimate as play
-        case "eavesdropper":
-            from evedrop.peers.eavesdropper import eavesdrop as play
-        case "controller":
-            from evedrop.peers.controller import steer as play
-        case "observer":
-            from evedrop.live.observer.news import Heartbeat
+    if has_part(brief, ObserverPart):
+        from evedrop.live.observer.news import Heartbeat
 
-            with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
-                return _observe(brief, serve)
-        case _:
-            raise BriefError(f"unknown role {brief.role}; give one that `evedrop --help` lists")
+        with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
+            return _observe(brief, serve)
+    expect_usable(brief)
     try:
-        expect_usable(brief)
-        play(brief)
+        _take_part(brief)
     except NotRegistered as error:
         raise BriefError(f"it names {error.name}{error.why or ', which is not a class here'}") from error
     return 0
 
 
-def _observe(brief: Brief, serve: str | None) -> int:
+def _take_part(brief: AnyBrief) -> None:
+    """Run the process of a brief that is not the observer's."""
+    from evedrop.live.protocol import brief_parts as parts
+    from evedrop.live.protocol.brief import has_part
+
+    if has_part(brief, parts.RouterPart):
+        from evedrop.live.network.router import route
+
+        route(brief)
+    elif has_part(brief, parts.RelayPart):
+        from evedrop.live.network.relay import relay
+
+        relay(brief)
+    elif has_part(brief, parts.SensorPart):
+        from evedrop.peers.sensor import sense
+
+        sense(brief)
+    elif has_part(brief, parts.LegitimatePart):
+        from evedrop.peers.legitimate import estimate
+
+        estimate(brief)
+    elif has_part(brief, parts.EavesdropperPart):
+        from evedrop.peers.eavesdropper import eavesdrop
+
+        eavesdrop(brief)
+    elif has_part(brief, parts.ControllerPart):
+        from evedrop.peers.controller import steer
+
+        steer(brief)
+
+
+def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
     from pydantic import ValidationError
 
     from evedrop.live.observer.observer import observe

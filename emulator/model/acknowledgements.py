@@ -6,6 +6,7 @@ Source: docs/mathematics.md, attacks on acknowledgements.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
@@ -40,6 +41,17 @@ ATTACKS: Mapping[str, Attack] = {
     "forge": _forge,
 }
 """critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0."""
+
+
+@dataclass(frozen=True)
+class WayBackSpec:
+    """The way back as the router needs to know it."""
+
+    quality: float
+    attack: str
+    jammer: str | None
+    spans: Sequence[Sequence[int]] | None
+    """Slots [from, to) in which the attack is on; None: in all slots."""
 
 
 @final

@@ -8,10 +8,9 @@ Source: docs/mathematics.md, closed loop.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -46,33 +45,6 @@ class Plant:
     def inputs(self) -> int:
         """The number of inputs."""
         return int(self.input_matrix.shape[1])
-
-    @property
-    def spec(self) -> dict[str, Any]:
-        """The plant as plain numbers, with None for a limit that does not exist."""
-        limits = {
-            name: [value if np.isfinite(value) else None for value in getattr(self, name).tolist()]
-            for name in ("input_lower", "input_upper", "state_lower", "state_upper")
-        }
-        matrices = ("input_matrix", "disturbance_matrix", "noise", "start")
-        measured = ("output_matrix", "measurement_noise") if self.output_matrix is not None else ()
-        return {**{name: getattr(self, name).tolist() for name in (*matrices, *measured)}, **limits}
-
-    @classmethod
-    def of(cls, spec: Mapping[str, Any]) -> Plant:
-        """The plant of a `spec`."""
-        n = len(spec["start"])
-        limits = {
-            name: np.array([without if value is None else value for value in spec[name]], np.float64)
-            for name, without in (
-                ("input_lower", -np.inf), ("input_upper", np.inf), ("state_lower", -np.inf), ("state_upper", np.inf)
-            )
-        }  # fmt: skip
-        matrices = {
-            name: np.array(spec[name], np.float64).reshape(n, -1) for name in ("input_matrix", "disturbance_matrix")
-        }
-        measured = {name: np.array(spec[name]) for name in ("output_matrix", "measurement_noise") if name in spec}
-        return cls(**matrices, noise=np.array(spec["noise"]), start=np.array(spec["start"]), **limits, **measured)
 
     def limited(self, u: Floats) -> Floats:
         """The inputs u (m, R), clipped to their limits."""

@@ -6,12 +6,12 @@ Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.acknowledgements import AckChannel, rates_of
+from evedrop.model.acknowledgements import AckChannel, WayBackSpec, rates_of
 from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE
@@ -19,16 +19,6 @@ from evedrop.scenario import Scenario
 from evedrop.streams import Batch
 
 _ATTACK_LOOKED_FOR = "all"  # by the sensor of a scenario without an attack
-
-
-class WayBackSpec(NamedTuple):
-    """The way back as the router needs to know it."""
-
-    quality: float
-    attack: str
-    jammer: str | None
-    spans: list[list[int]] | None
-    """Slots [from, to) in which the attack is on; None: in all slots."""
 
 
 def way_back_of(scenario: Scenario) -> WayBackSpec | None:

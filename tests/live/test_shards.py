@@ -17,6 +17,7 @@ from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shard import shards_of
 from evedrop.live.launch.shards import OneProgress
+from evedrop.live.protocol.news import RunEnded
 from evedrop.loading import load
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results
@@ -173,7 +174,7 @@ def test_progress_is_that_of_the_slowest() -> None:
     second({"event": "progress", "done": 20, "rate": 4.0, "rate_unit": "slots/s", "squared_errors": {"smart": 4.0}})
     assert [news["event"] for news in told] == ["started", "progress"]
     assert (told[1]["done"], told[1]["rate"], told[1]["squared_errors"]) == (20, 4.0, {"smart": 3.0})
-    second({"event": "ended", "status": 0})
+    second(RunEnded(0, "complete").news)
     first({"event": "progress", "done": 70, "rate": 9.0, "rate_unit": "slots/s", "squared_errors": {"smart": 1.0}})
     assert told[-1]["done"] == 70
 

@@ -107,7 +107,7 @@ def test_who_is_given_what(scheme: str) -> None:
     assert briefs["naive"].keys == briefs["ref"].keys == briefs["spy"].keys == {}
     holders = {name for name, one in briefs.items() if "link/acknowledgements" in one.keys}
     assert holders == ({"router"} if scheme in NEEDS else set())
-    assert briefs["router"].part["leaks"] == briefs["sensor"].part["leaks"] == {"spy": 9}
+    assert briefs["router"].part.leaks == briefs["sensor"].part.leaks == {"spy": 9}
     assert {one.model.header for one in briefs.values()} == {len(kind.header)}
 
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from evedrop.kernels.elementary import semidefinite_factor
+from evedrop.live.protocol.brief_closed_loop import AssignmentEntry, PlantEntry
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.controllers.lqr import Lqr, gain, held
 from evedrop.model.input_aware import InputAwareEstimator, Offset
@@ -149,12 +150,12 @@ def test_a_semidefinite_matrix_is_factored() -> None:
 def test_a_plant_survives_its_brief() -> None:
     """Numbers, and limits that are none, come back from what is written into a brief."""
     of = plant(input_lower=np.array([-1.0, -np.inf]), disturbance_matrix=np.ones((2, 3)))
-    again = Plant.of(of.spec)
+    again = PlantEntry.of(of).plant
     assert all(np.array_equal(getattr(of, name), getattr(again, name)) for name in Plant.__dataclass_fields__)
     asked = assignment(np.eye(2), of, period=3, limit=0.5)
-    back = Assignment.of(asked.process, of, asked.spec)
+    back = AssignmentEntry.of(asked).assignment(asked.process, of)
     assert np.array_equal(back.rate_limits, asked.rate_limits)
-    assert back.spec == asked.spec
+    assert AssignmentEntry.of(back) == AssignmentEntry.of(asked)
 
 
 def test_who_is_told_the_inputs_predicts_with_them() -> None:

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +62,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     scenario = scenario_of(process, slots, first_trial)
     keys, batch = StreamKeys.of(scenario), Batch(slots, 9, first_trial)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
-    peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
+    peer = Estimator(json.loads(made["legitimate"].text))
     model = scenario.process.process
     trajectory = Trajectory(model, keys.process, batch)
     secret = keys.secret(("schedule", "noise"))
@@ -95,7 +94,7 @@ def test_it_refuses_a_gap() -> None:
     """A slot that is not due is an error, as the protocol says."""
     scenario = scenario_of(UNSTABLE, 10, 0)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
-    peer = Estimator(json.loads(json.dumps(asdict(made["legitimate"]))))
+    peer = Estimator(json.loads(made["legitimate"].text))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
         peer.receive(packets.delivery(1, b"\0\0", b""))
 

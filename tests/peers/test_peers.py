@@ -22,7 +22,7 @@ from evedrop.live.network.reporting import is_due
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.live.protocol.brief import Brief, Flow
+from evedrop.live.protocol.brief import AnyBrief, Flow
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks, Digests
@@ -59,7 +59,7 @@ def scenario_of(**changes: Any) -> Scenario:
     return Scenario.model_validate({**table, **changes})
 
 
-def briefs(**changes: Any) -> dict[str, Brief]:
+def briefs(**changes: Any) -> dict[str, AnyBrief]:
     """Briefs with a small window."""
     made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
@@ -76,7 +76,7 @@ class Stage:
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
     """Of the conductor, as `wire.control` makes them."""
 
-    def session(self, brief: Brief) -> FakeSession:
+    def session(self, brief: AnyBrief) -> FakeSession:
         """In the place of `Session`."""
         return FakeSession(self, RunKeys(brief.run))
 
@@ -330,7 +330,7 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
 class Sensing:
     """A sensor in a thread of its own."""
 
-    def __init__(self, stage: Stage, brief: Brief) -> None:
+    def __init__(self, stage: Stage, brief: AnyBrief) -> None:
         self.stage = stage
         self.keys = RunKeys(brief.run)
         self.thread = threading.Thread(target=sense, args=(brief,), daemon=True)
@@ -365,7 +365,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     assert stage.put.empty()
     stage.commands.put(wire.control("start"))
     sensing.packets(0, WINDOW)
-    everybody = [*brief.part["receivers"], "observer"]
+    everybody = [*brief.part.receivers, "observer"]
     assert len(everybody) == 5
     sent = WINDOW
     for done in (
@@ -388,11 +388,11 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
 def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     """All packets from the slot that is asked for on, and as many before it as the router needs, after a word of them."""
     brief = briefs()["sensor"]
-    brief = replace(brief, part={**brief.part, "history": 3})
+    brief = replace(brief, part=replace(brief.part, history=3))
     sensing = Sensing(stage, brief)
     stage.commands.put(wire.control("start"))
     sensing.packets(0, WINDOW)
-    for name in (*brief.part["receivers"], "observer"):
+    for name in (*brief.part.receivers, "observer"):
         sensing.progress(name, 8)
     sensing.packets(WINDOW, WINDOW + 8)
     stage.kept[sensing.keys.uplink].again(4, 10)

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from evedrop.live.protocol.brief import Identity
+from evedrop.live.protocol.brief_parts import Identity
 
 _BEFORE = datetime.timedelta(days=1)  # so that a host whose clock is late or in another zone can take part
 _VALID = datetime.timedelta(days=30)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,17 @@ from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.closed_loop_briefs import LoopBriefs
 from evedrop.live.launch.ports import RouterEndpoints, places_at
 from evedrop.live.launch.routers import Routers, identities_of
-from evedrop.live.protocol.brief import Brief, Flow, Model
+from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model
+from evedrop.live.protocol.brief_parts import (
+    EavesdropperPart,
+    LegitimatePart,
+    LinkEntry,
+    ObserverPart,
+    Part,
+    RelayPart,
+    RouterPart,
+    SensorPart,
+)
 from evedrop.live.protocol.message_limits import Sizes
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
 from evedrop.model.schemes import scheme_of
@@ -86,7 +96,7 @@ def briefs_of(
     observation: ObserverTask,
     ends_with_stdin: bool = True,
     patience: int = _LAUNCHED_PATIENCE,
-) -> dict[str, Brief]:
+) -> dict[str, AnyBrief]:
     """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
 
     places: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
@@ -111,17 +121,16 @@ def briefs_of(
     loop, flow = LoopBriefs(scenario), flow_of(scenario)
     limits = sizes_of(scenario, flow.batch).of_kinds
 
-    def imports(process: str, part: Mapping[str, Any]) -> bool:
-        """Whether a process may need a class that is not built in. The router may: an operator can set another link model."""
-        own = process != OBSERVER and (process == ROUTER or any(named_in(part)))
-        return own and scenario.modules is not None
+    def modules(**named: Any) -> str | None:
+        """The folder of own classes for a process whose part names one."""
+        return scenario.modules if any(named_in(named)) else None
 
-    def brief(process: str, role: str, owned: Mapping[str, bytes], part: Mapping[str, Any]) -> Brief:
+    def brief(process: str, owned: Mapping[str, bytes], part: Part) -> AnyBrief:
         return Brief(
             run=run,
             process=process,
-            role=role,
-            router=str(places.router.listen if role == "router" else routers.endpoint(process)),
+            role=part.role,
+            router=str(places.router.listen if process == ROUTER else routers.endpoint(process)),
             user=process,
             password=routers.password(process),
             slots=scenario.slots,
@@ -131,78 +140,74 @@ def briefs_of(
             flow=flow,
             model=model,
             keys={name: key.hex() for name, key in owned.items()},
-            part={**part, "modules": scenario.modules} if imports(process, part) else part,
+            part=part,
             ends_with_stdin=ends_with_stdin,
             patience=patience,
             identity=identities.get(process),
         )
 
     courses = {name: scenario.course(name) for name in scenario.receivers}
-    links = {name: course.plain() for name, course in courses.items()}
     link_keys = keys.links(courses)
     if back is not None:
         link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.way_back
-    made = [
-        brief(
-            ROUTER,
-            "router",
-            link_keys,
-            {
-                "links": links,
-                "pace": scenario.pace,
-                "users": routers.at_router,
-                "leaks": leaks,
-                "acknowledgements": None if back is None else back._asdict(),
-                "controller": loop.wiring,
-                "zid": routers.zid,
-                "limits": limits,
-            },
-        ),
-        brief(
-            SENSOR,
-            "sensor",
-            {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)},
-            {
-                "scheme": spec,
-                "pace": scenario.pace,
-                "receivers": list(scenario.receivers),
-                "holds": sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
-                "history": history_of(scenario),
-                "leaks": leaks,
-                "chart": None if chart is None else asdict(chart),
-                "plant": loop.plant,
-                "controller": loop.of_sensor,
-            },
-        ),
-        brief(
-            LEGITIMATE,
-            "legitimate",
-            keys.secret(scheme.estimator_streams),
-            {"scheme": spec, **_presence(scenario, LEGITIMATE), "controller": loop.of_legitimate},
-        ),
-        brief(
-            OBSERVER,
-            "observer",
-            {},
-            {
-                "scenario": scenario.model_dump(mode="json"),
-                "results": str(observation.results),
-                "recording": observation.recording,
-                "operator": users[OPERATOR],
-                "shard": observation.shard,
-                "operator_identity": asdict(identities[OPERATOR]) if identities else None,
-                "classes": _answers(scenario),
-            },
-        ),
-    ]
+    router = RouterPart(
+        links={name: LinkEntry.of(course) for name, course in courses.items()},
+        pace=scenario.pace,
+        users=routers.at_router,
+        leaks=leaks,
+        acknowledgements=back,
+        controller=loop.wiring,
+        zid=routers.zid,
+        limits=limits,
+        modules=scenario.modules,  # whatever it names: an operator can set another link model
+    )
+    made = [brief(ROUTER, link_keys, router)]
+    if places.relay is not None and routers.zid is not None:
+        listen = str(places.relay.listen)
+        relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, loop.wiring, limits)
+        made.append(brief(RELAY, {}, relay))
+    sensor = SensorPart(
+        scheme=spec,
+        pace=scenario.pace,
+        receivers=scenario.receivers,
+        holds=sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
+        history=history_of(scenario),
+        leaks=leaks,
+        chart=chart,
+        plant=loop.plant,
+        controller=loop.of_sensor,
+        modules=modules(scheme=spec),
+    )
+    made.append(brief(SENSOR, {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)}, sensor))
+    legitimate = LegitimatePart(
+        scheme=spec,
+        window=scenario.window(LEGITIMATE),
+        outages=_outages(scenario, LEGITIMATE),
+        controller=loop.of_legitimate,
+        modules=modules(scheme=spec),
+    )
+    made.append(brief(LEGITIMATE, keys.secret(scheme.estimator_streams), legitimate))
+    observer = ObserverPart(
+        scenario=scenario.model_dump(mode="json"),
+        results=str(observation.results),
+        recording=observation.recording,
+        operator=users[OPERATOR],
+        shard=observation.shard,
+        operator_identity=identities.get(OPERATOR),
+        classes=_answers(scenario),
+    )
+    made.append(brief(OBSERVER, {}, observer))
     if loop.of_controller is not None:
-        made.append(brief(CONTROLLER, "controller", {}, loop.of_controller))
-    if places.relay is not None:
-        part = routers.relay_part(scenario.receivers, places.relay)
-        made.insert(1, brief(RELAY, "relay", {}, {**part, "controller": loop.wiring, "limits": limits}))
+        made.append(brief(CONTROLLER, {}, loop.of_controller))
     for name, table in scenario.eavesdroppers.items():
-        part = {"strategy": table.strategy, "parameters": table.parameters, **_presence(scenario, name)}
-        made.append(brief(name, "eavesdropper", keys.eavesdropper(name, table.strategy, table.parameters), part))
+        eavesdropper = EavesdropperPart(
+            strategy=table.strategy,
+            parameters=table.parameters,
+            window=scenario.window(name),
+            outages=_outages(scenario, name),
+            modules=modules(strategy=table.strategy, parameters=table.parameters),
+        )
+        made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))
     return {one.process: one for one in made}
 
 
@@ -224,10 +229,9 @@ def _answers(scenario: Scenario) -> dict[str, Any]:
     return ANSWERS.of(foreign)
 
 
-def _presence(scenario: Scenario, receiver: str) -> dict[str, Any]:
-    """A receiver's window for late packets, and its own outages only."""
-    outages = [[one.start, one.stop, one.keeps_state] for one in scenario.timeline.outages[receiver]]
-    return {"window": scenario.window(receiver), "outages": outages}
+def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:
+    """A receiver's own outages only."""
+    return [(one.start, one.stop, one.keeps_state) for one in scenario.timeline.outages[receiver]]
 
 
 def write_briefs(scenario: Scenario, places: RouterEndpoints, results: Path, folder: Path, patience: int) -> list[Path]:

@@ -14,18 +14,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, final
+from typing import final
 
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
+from evedrop.live.protocol.news import News, ProcessRequest, RunEnded
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
 from evedrop.signals import held_back
 
-News = Mapping[str, Any]
 GRACE_SECONDS = 3.0  # for all processes to leave
 ROUTER_RESTARTS = 3  # how often a router that a signal ended is restarted: the run goes on with the new one
 SILENCE_SECONDS = 30.0  # after which a silent observer is given up: it sends a heartbeat every second
@@ -96,7 +97,7 @@ class Children:
         """Whether the run is over, and all processes have been told to leave."""
         self._finishing = False
         self._restarts = 0
-        self._briefs: dict[str, Brief] = {}
+        self._briefs: dict[str, AnyBrief] = {}
         self._killed: set[int] = set()
         """Ids of processes whose end is not a failure: those killed by the scenario, and routers that were restarted."""
 
@@ -118,16 +119,16 @@ class Children:
             if process.stdin is not None:
                 process.stdin.close()
 
-    def start(self, brief: Brief, again: bool = False) -> None:
+    def start(self, brief: AnyBrief, again: bool = False) -> None:
         """Start the process of a brief, or restart it. Its output goes to its log, an observer's news to the launcher.
 
         Raises RunError if the system cannot start it.
         """
         conducts = brief.role == "observer"
         self._briefs[brief.process] = brief
-        if brief.part.get("outages"):
+        if isinstance(brief.part, ReceiverPart) and brief.part.outages:
             state_file = str((self._private / f"{brief.process}.state").absolute())
-            brief = replace(brief, part={**brief.part, "state_file": state_file})
+            brief = replace(brief, part=replace(brief.part, state_file=state_file))
         environment = {
             **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
@@ -135,7 +136,7 @@ class Children:
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUNBUFFERED": "1",
         }
-        if brief.role in {"router", "relay"}:
+        if isinstance(brief.part, RoutingPart):
             environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
         try:
             path = brief.write(self._private)
@@ -177,12 +178,12 @@ class Children:
         self.start(self._briefs[ended.process], again=True)
         return True
 
-    def act(self, request: News) -> None:
+    def act(self, request: ProcessRequest) -> None:
         """Carry out the observer's request on a process, and confirm it.
 
         Raises RunError if a process cannot be restarted.
         """
-        name, do = str(request["process"]), request["do"]
+        name, do = request.process, request.do
         process = self._processes[name]
         if do == "kill":
             self._killed.add(process.pid)
@@ -191,14 +192,14 @@ class Children:
             if process.stdin is not None:
                 process.stdin.close()
         elif do == "restart":
-            self.start(replace(self._briefs[name], first=int(request["first"])), again=True)
+            self.start(replace(self._briefs[name], first=request.first), again=True)
         else:
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal({"pause": signal.SIGSTOP, "resume": signal.SIGCONT}[str(do)])
+                process.send_signal({"pause": signal.SIGSTOP, "resume": signal.SIGCONT}[do])
         observer = self._processes[OBSERVER].stdin
         if observer is not None:
             with contextlib.suppress(OSError):
-                observer.write(b"%d\n" % request["number"])
+                observer.write(b"%d\n" % request.number)
                 observer.flush()
 
     def news(self, seconds: float) -> News | Exit | None:
@@ -214,8 +215,8 @@ class Children:
         if news["event"] in {"started", "back", "reconnected"}:
             self.started = True
             self._forget_briefs()
-        if news["event"] == "act":
-            self.act(news)
+        if news["event"] == ProcessRequest.event:
+            self.act(ProcessRequest.of(news))
             return None
         self.over = self.over or news["event"] == "over"
         self._finishing = self._finishing or news["event"] == "finishing"
@@ -226,14 +227,14 @@ class Children:
         for path in self._private.glob("*.json"):
             path.unlink(missing_ok=True)
 
-    def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> News | None:
+    def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `ended` news, or None if it sent none.
 
         Once it has begun to finish, it may take its time, as long as it sends heartbeats.
         """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
-        ending: News | None = None
+        ending: RunEnded | None = None
         while self.silent_seconds < SILENCE_SECONDS and (self._finishing or time.monotonic() - begun < _BEGIN_SECONDS):
             news = self.news(0.05)
             if isinstance(news, Exit):
@@ -241,7 +242,7 @@ class Children:
                     break
             elif news is not None:
                 tell(news)
-                ending = news if news["event"] == "ended" else ending
+                ending = RunEnded.of(news) if news["event"] == RunEnded.event else ending
         return ending
 
     def terminate(self, name: str, after: float = 0.0) -> None:
@@ -261,10 +262,10 @@ class Children:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
 
-    def failure_report(self, first: Exit | None, ending: News | None) -> str:
+    def failure_report(self, first: Exit | None, ending: RunEnded | None) -> str:
         """The failure in words: the process at fault, and the last lines of its log and of the complaining process's log."""
-        suspects, accused = (list(ending.get(who, [])) if ending is not None else [] for who in ("suspects", "accused"))
-        why = str(ending["how"]) if ending is not None and ending.get("status") not in {None, 0, 1, 130} else ""
+        suspects, accused = ([], []) if ending is None else (list(ending.suspects), list(ending.accused))
+        why = ending.how if ending is not None and ending.status not in {0, 1, INTERRUPTED} else ""
         lost = None if first is None else self._lost_by_all(first.process, suspects)
         if lost is not None:
             first, suspects = None, [lost]  # the router is at fault, not the process that gave up first

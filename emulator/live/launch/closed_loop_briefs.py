@@ -5,11 +5,18 @@ Source: docs/protocol.md, the brief.
 
 from __future__ import annotations
 
-from base64 import b64encode
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
-from evedrop.live.network.access import Wiring
+from evedrop.live.protocol.brief_closed_loop import (
+    AssignmentEntry,
+    EstimatorLoop,
+    PlantEntry,
+    SensorLoop,
+    SensorPlantEntry,
+    Wiring,
+    encoded,
+)
+from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
 
@@ -23,21 +30,14 @@ class LoopBriefs:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._plant = None if scenario.driven is None else scenario.driven.spec
-        self._disturbances = b64encode(disturbances_of(scenario).astype("<f8").tobytes()).decode()
-        table = scenario.controller
-        self._wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
-        self._period = 1 if table is None else table.period
-
-    @property
-    def wiring(self) -> dict[str, Any] | None:
+        self._disturbances = encoded(disturbances_of(scenario))
+        table, driven = scenario.controller, scenario.driven
+        self.wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
         """The controller's connections, for the router."""
-        return None if self._wiring is None else asdict(self._wiring)
-
-    @property
-    def plant(self) -> dict[str, Any] | None:
+        self.of_sensor = None if table is None else SensorLoop(table.period, table.acts_on)
+        """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
+        self.plant = None if driven is None else SensorPlantEntry.of(driven, disturbances=self._disturbances)
         """The plant with its disturbances, for the sensor."""
-        return None if self._plant is None else {**self._plant, "disturbances": self._disturbances}
 
     def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
         """The keys of the sensor's own streams, without the secret's."""
@@ -46,32 +46,21 @@ class LoopBriefs:
         return {"process": keys.process, **({"measurement": keys.measurement} if measures else {})}
 
     @property
-    def of_sensor(self) -> dict[str, Any] | None:
-        """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
-        return None if self._wiring is None else {"period": self._period, "acts_on": self._wiring.acts_on}
-
-    @property
-    def of_legitimate(self) -> dict[str, Any] | None:
+    def of_legitimate(self) -> EstimatorLoop | None:
         """For the legitimate estimator: when it sends its estimate, and the plant if it knows the inputs; None if neither."""
-        wiring = self._wiring
-        if wiring is None or (wiring.on_truth and not wiring.knows_input):
+        wiring, loop, driven = self.wiring, self.of_sensor, self._scenario.driven
+        if wiring is None or loop is None or (wiring.on_truth and not wiring.knows_input):
             return None
-        return {
-            "period": self._period,
-            "acts_on": wiring.acts_on,
-            "plant": self._plant if wiring.knows_input else None,
-        }
+        plant = PlantEntry.of(driven) if wiring.knows_input and driven is not None else None
+        return EstimatorLoop(loop.period, loop.acts_on, plant)
 
     @property
-    def of_controller(self) -> dict[str, Any] | None:
+    def of_controller(self) -> ControllerPart | None:
         """The controller's part: its strategy, assignment, plant and disturbances."""
-        assignment, table = self._scenario.assignment, self._scenario.controller
-        if assignment is None or table is None:
+        scenario = self._scenario
+        assignment, table, driven = scenario.assignment, scenario.controller, scenario.driven
+        if assignment is None or table is None or driven is None:
             return None
-        return {
-            "strategy": table.strategy,
-            "assignment": assignment.spec,
-            "acts_on": table.acts_on,
-            "plant": self._plant,
-            "disturbances": self._disturbances,
-        }
+        return ControllerPart(
+            table.strategy, AssignmentEntry.of(assignment), table.acts_on, PlantEntry.of(driven), self._disturbances
+        )

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.children import News
 from evedrop.live.launch.ports import loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.live.protocol.news import News
 from evedrop.scenario import Scenario
 from evedrop.signals import stop_on_signals
 from evedrop.view.viewer import choose

@@ -17,10 +17,11 @@ from pathlib import Path
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit, News
+from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
 from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.network.control_file import remove_control
+from evedrop.live.protocol.news import News, RunEnded
 from evedrop.names import OBSERVER
 from evedrop.results.folder import make_private, new_folder
 from evedrop.results.held_folder import HeldFolder
@@ -151,9 +152,9 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
             children.conclude(tell)
             raise Interrupted("interrupted; the results so far are in the results folder")
         if children.silent_seconds > SILENCE_SECONDS:
-            raise RunError(children.failure_report(None, {"suspects": [OBSERVER]}))
+            raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
         news = children.news(_LOOK_SECONDS)
-        ending: News | None = None
+        ending: RunEnded | None = None
         if isinstance(news, Exit):
             if _meant_us_too(news, stop) or (
                 news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
@@ -164,25 +165,21 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
             if news.process != OBSERVER:
                 # An observer that has just ended may still report so; a running one would wait for the lost process in vain.
                 ending = children.conclude(tell)
-            if ending is None or not _ended_well(ending):
+            if ending is None or not ending.well:
                 raise RunError(children.failure_report(news, ending))
         elif news is not None:
             tell(news)
-            ending = news if news["event"] == "ended" else None
+            ending = RunEnded.of(news) if news["event"] == RunEnded.event else None
         if ending is not None:
             break
-    if ending["status"] == Interrupted.exit_status:
+    if ending.status == Interrupted.exit_status:
         raise Interrupted("interrupted; the results so far are in the results folder")
-    if not _ended_well(ending):
+    if not ending.well:
         raise RunError(children.failure_report(None, ending))
     children.wait_all()
-    return int(ending["status"])
+    return ending.status
 
 
 def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
     """Whether the signal that ended a child reaches the launcher, too, within a moment: a closing terminal hangs up on all."""
     return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)
-
-
-def _ended_well(ending: News) -> bool:
-    return ending["status"] in {0, 1}

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
-from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints
-from evedrop.live.protocol.brief import Identity
+from evedrop.live.launch.ports import RouterEndpoints
+from evedrop.live.protocol.brief_parts import Identity
 from evedrop.names import RELAY, ROUTER, SENSOR
 
 
@@ -17,9 +16,9 @@ class Routers:
     """The users of each router, with their passwords."""
 
     places: RouterEndpoints
-    at_router: Mapping[str, str]
+    at_router: Mapping[str, str] = field(repr=False)
     """User of the router → password."""
-    at_relay: Mapping[str, str]
+    at_relay: Mapping[str, str] = field(repr=False)
     zid: str | None
     """The router's Zenoh id, by which the relay recognises it; None without a relay."""
 
@@ -42,11 +41,6 @@ class Routers:
     def password(self, process: str) -> str:
         """The password of a process."""
         return {**self.at_router, **self.at_relay}.get(process, "")
-
-    def relay_part(self, receivers: tuple[str, ...], relay: RouterEndpoint) -> dict[str, Any]:
-        """The relay's part of its brief."""
-        listen = str(relay.listen)
-        return {"users": self.at_relay, "receivers": list(receivers), "listen": listen, "zid": self.zid}
 
 
 def identities_of(run: str, places: RouterEndpoints, users: tuple[str, ...]) -> dict[str, Identity]:

@@ -14,13 +14,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from evedrop.errors import Interrupted, RunError, UsageError
-from evedrop.live.launch.children import News
 from evedrop.live.launch.ports import RouterEndpoints, loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
+from evedrop.live.protocol.news import News, RunEnded, RunProgress
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
@@ -36,7 +36,7 @@ class OneProgress:
         self._slots = shards[0].scenario.slots
         self._tell = tell
         self._lock = threading.Lock()
-        self._latest: dict[int, News] = {}
+        self._latest: dict[int, RunProgress] = {}
         self._waited_for = set(self._trials)
         self.started: float | None = None
         """When the first shard began, by the monotonic clock."""
@@ -57,25 +57,24 @@ class OneProgress:
             self._waited_for.discard(number)
             if not self._waited_for:
                 self._tell(news)
-        elif kind == "progress":
-            self._latest[number] = news
+        elif kind == RunProgress.event:
+            self._latest[number] = RunProgress.of(news)
             if len(self._latest) == len(self._trials):
-                self._tell(self._all())
+                self._tell(self._all().news)
         elif kind != "moved":  # a shard's folder moves with the run's, which is reported separately
-            if kind == "ended" and number in self._latest:  # its last slots were too few for a progress report
-                self._latest[number] = {**self._latest[number], "done": self._slots}
+            if kind == RunEnded.event and number in self._latest:  # its last slots were too few for a progress report
+                self._latest[number] = replace(self._latest[number], done=self._slots)
             self._tell({**news, "shard": number} if kind == "reconnected" else news)
 
-    def _all(self) -> dict[str, Any]:
+    def _all(self) -> RunProgress:
         """The slowest shard's progress and rate, with the errors over all trials."""
-        slowest = min(self._latest.values(), key=lambda news: int(news["done"]))
+        slowest = min(self._latest.values(), key=lambda one: one.done)
         total = sum(self._trials.values())
         errors = {
-            name: sum(self._trials[number] * one["squared_errors"][name] for number, one in self._latest.items())
-            / total
-            for name in slowest["squared_errors"]
+            name: sum(self._trials[number] * one.squared_errors[name] for number, one in self._latest.items()) / total
+            for name in slowest.squared_errors
         }
-        return {**slowest, "squared_errors": errors}
+        return replace(slowest, squared_errors=errors)
 
 
 @final

@@ -7,10 +7,11 @@ Source: docs/protocol.md, keys.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 
@@ -34,26 +35,6 @@ class Grant:
     """Liveliness tokens of the processes on whose behalf it speaks."""
     zid: str | None = None
     """The Zenoh id of a process that has no user name: the router, which does not log in."""
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """A controller's connections."""
-
-    acts_on: str
-    """`estimate` or `truth`."""
-    knows_input: bool
-    """Whether the legitimate estimator is told the inputs."""
-
-    @classmethod
-    def of(cls, part: Mapping[str, Any] | None) -> Wiring | None:
-        """The wiring in a brief's part; None without a controller."""
-        return None if part is None else cls(**part)
-
-    @property
-    def on_truth(self) -> bool:
-        """Whether the controller is told the true state."""
-        return self.acts_on == "truth"
 
 
 def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, relayed: bool = False) -> list[Grant]:

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 from cryptography.x509.oid import NameOID
 
 from evedrop.errors import BriefError
-from evedrop.live.protocol.brief import Identity
+from evedrop.live.protocol.brief_parts import Identity
 
 _AGAIN = "write the briefs again with `evedrop brief`, all of them"
 

@@ -18,7 +18,7 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.endpoint import Endpoint
-from evedrop.live.protocol.brief import Identity
+from evedrop.live.protocol.brief_parts import Identity
 
 WAITING_SECONDS = 3.0
 """How often a process says that it still waits for its router."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 import json
 import os
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, is_folder, is_there, text_of
-from evedrop.live.protocol.brief import Identity
+from evedrop.live.protocol.brief_parts import Identity
 
 _NAME = "control.json"
 _MOST_BYTES = 2**20
@@ -27,7 +27,7 @@ class Control:
     router: str
     """Zenoh endpoint."""
     user: str
-    password: str
+    password: str = field(repr=False)
     identity: Identity | None = None
     """The operator's certificate and key, if the run's router takes certificates."""
 

@@ -8,14 +8,15 @@ import zenoh
 
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.network.session import client_config
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import RelayPart, RoutingPart
 from evedrop.live.protocol.keys import RunKeys
 
 _CONNECT_SECONDS = 3.0
 _ANSWER_SECONDS = 3.0
 
 
-def is_there(brief: Brief) -> bool:
+def is_there(brief: AnyBrief) -> bool:
     """Whether the router sees the process of a brief: connected, ready, and not lost since.
 
     Asks with the credentials of the process itself, which may ask for no other process.
@@ -23,9 +24,9 @@ def is_there(brief: Brief) -> bool:
     zenoh.init_log_from_env_or("off")
     config = client_config(brief)
     config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
-    if brief.role in {"router", "relay"}:
+    if isinstance(brief.part, RoutingPart):
         # The router asks itself. It may listen on every address, which its certificate does not name.
-        listens = brief.part["listen"] if brief.role == "relay" else brief.router
+        listens = brief.part.listen if isinstance(brief.part, RelayPart) else brief.router
         config["connect"]["endpoints"] = [str(Endpoint.of(listens).nearby)]
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
     try:

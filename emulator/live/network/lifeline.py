@@ -8,14 +8,14 @@ import threading
 from typing import final
 
 from evedrop.errors import RunError
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
 
 
 @final
 class Lifeline:
     """Ends its process after `flow.longest_outage` without a connection."""
 
-    def __init__(self, brief: Brief) -> None:
+    def __init__(self, brief: AnyBrief) -> None:
         self._brief = brief
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None

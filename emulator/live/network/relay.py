@@ -7,23 +7,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from evedrop.live.network.access import Wiring, access_control, grants
+from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.linked_routers import at_relay
 from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import Session, client_config, door_of, router_config
 from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_parts import RelayPart
 
 
-def relay(brief: Brief) -> None:
+def relay(brief: Brief[RelayPart]) -> None:
     """Run the relay of a brief until the conductor ends it and all processes connected to it have left.
 
     Raises BriefError if the router does not accept the brief, RunError if no router answers within the brief's patience.
     """
     part = brief.part
-    table = at_relay(
-        brief.run, grants(brief.run, tuple(part["receivers"]), Wiring.of(part["controller"]), relayed=True), part["zid"]
-    )
+    table = at_relay(brief.run, grants(brief.run, tuple(part.receivers), part.controller, relayed=True), part.zid)
     # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
     with connected(door_of(brief), float(brief.patience)):
         pass
@@ -35,14 +34,14 @@ def relay(brief: Brief) -> None:
         until_all_left(present)
 
 
-def _opened(brief: Brief, access: dict[str, Any]) -> Session:
-    with users_file(brief.part["users"]) as users:
-        return Session(brief, _config(brief, str(users), access), brief.part["listen"])
+def _opened(brief: Brief[RelayPart], access: dict[str, Any]) -> Session:
+    with users_file(brief.part.users) as users:
+        return Session(brief, _config(brief, str(users), access), brief.part.listen)
 
 
-def _config(brief: Brief, users: str, access: dict[str, Any]) -> dict[str, Any]:
+def _config(brief: Brief[RelayPart], users: str, access: dict[str, Any]) -> dict[str, Any]:
     """Configuration of a router that also connects to the first router as a client, and reconnects when the link is lost."""
-    listening = router_config(brief, users, access, brief.part["listen"])
+    listening = router_config(brief, users, access, brief.part.listen)
     connecting = client_config(brief)
     auth = {"usrpwd": {**listening["transport"]["auth"]["usrpwd"], **connecting["transport"]["auth"]["usrpwd"]}}
     return {

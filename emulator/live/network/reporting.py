@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.closed_loop import Decisions
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.telemetry import Report, Truth
@@ -21,7 +21,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, trace_of
 
 
-def is_due(brief: Brief, k: int) -> bool:
+def is_due(brief: AnyBrief, k: int) -> bool:
     """Whether slot k ends a report."""
     return (k + 1) % brief.flow.batch == 0 or k + 1 == brief.slots
 
@@ -35,7 +35,7 @@ class TruthReporter:
 
     def __init__(
         self,
-        brief: Brief,
+        brief: AnyBrief,
         put: Callable[[int, bytes], None],
         may_be_silent: bool = False,
         watches: bool = False,
@@ -98,7 +98,7 @@ class TruthReporter:
 class DecisionReporter:
     """The controller's reports: decision times, and digests of the decisions."""
 
-    def __init__(self, brief: Brief, put: Callable[[int, bytes], None], inputs: int, period: int) -> None:
+    def __init__(self, brief: AnyBrief, put: Callable[[int, bytes], None], inputs: int, period: int) -> None:
         self._brief, self._put, self._period = brief, put, period
         self._log = InputLog(inputs, brief.trials, brief.slots)
         self._digests: dict[int, Digests] = {}
@@ -127,7 +127,7 @@ class BeliefReporter:
 
     def __init__(
         self,
-        brief: Brief,
+        brief: AnyBrief,
         put: Callable[[int, bytes], None],
         put_progress: Callable[[int, bytes], None],
         cuts: Iterable[int] = (),

@@ -19,14 +19,16 @@ from typing import Any, final
 import numpy as np
 
 from evedrop.errors import NotRegistered
-from evedrop.live.network.access import Wiring, access_control, grants
+from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.delayed_sender import DelayedSender
 from evedrop.live.network.linked_routers import at_router
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.router_commands import Commands, ReplayRequested
 from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import Session, router_config
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_closed_loop import Wiring
+from evedrop.live.protocol.brief_parts import RouterPart
 from evedrop.live.protocol.codec import Reader, shown
 from evedrop.live.protocol.packets import (
     PacketExtras,
@@ -42,7 +44,7 @@ from evedrop.live.protocol.packets import (
     read_uplink,
 )
 from evedrop.live.protocol.telemetry import Journal
-from evedrop.model.acknowledgements import AckChannel
+from evedrop.model.acknowledgements import AckChannel, WayBackSpec
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
@@ -56,17 +58,19 @@ from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE
 class Downlink:
     """One receiver's link, whose fates are decided a batch of slots ahead, and its outlet."""
 
-    def __init__(self, name: str, course: LinkSchedule, brief: Brief, put: Callable[[bytes, float], None]) -> None:
+    def __init__(
+        self, name: str, course: LinkSchedule, brief: Brief[RouterPart], put: Callable[[bytes, float], None]
+    ) -> None:
         self._course = course
         keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, self._course)}
         self._link = Link(self._course, name, keys, brief.batch)
         self._accountant = Accountant(self._course.window, brief.trials)
         self._transit = Transit()
         self._put = put
-        self._pace = float(brief.part["pace"])
+        self._pace = brief.part.pace
         self._rests: dict[int, float] = {}
         """Slot → the fraction of a slot that the first trial's packet takes in addition, for packets that may still arrive."""
-        self._leak: int | None = brief.part["leaks"].get(name)
+        self._leak = brief.part.leaks.get(name)
         self._slots = range(0)
         self._fates: Fates
         self._own = False
@@ -179,10 +183,10 @@ class Burst:
 class WayBackLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
 
-    def __init__(self, brief: Brief, session: Session, spec: Mapping[str, Any]) -> None:
+    def __init__(self, brief: AnyBrief, session: Session, spec: WayBackSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
-        self._way = AckChannel(spec["attack"], spec["quality"], key, brief.batch, spec["spans"])
-        self._jammer: str | None = spec["jammer"]
+        self._way = AckChannel(spec.attack, spec.quality, key, brief.batch, spec.spans)
+        self._jammer = spec.jammer
         self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged
         self._due = GapDetector(self._key, brief.flow.longest_outage)
@@ -215,10 +219,10 @@ class WayBackLink:
             self._due.missed(k, found)
 
 
-def route(brief: Brief) -> None:
+def route(brief: Brief[RouterPart]) -> None:
     """Run the router of a brief until the conductor ends it and all other processes have left."""
-    table = grants(brief.run, tuple(brief.part["links"]), Wiring.of(brief.part["controller"]))
-    let_in = table if brief.part["zid"] is None else at_router(brief.run, table)
+    table = grants(brief.run, tuple(brief.part.links), brief.part.controller)
+    let_in = table if brief.part.zid is None else at_router(brief.run, table)
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
         present = session.attendance(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
@@ -230,26 +234,27 @@ def route(brief: Brief) -> None:
 class Routing:
     """The router's work on an open session."""
 
-    def __init__(self, brief: Brief, session: Session) -> None:
+    def __init__(self, brief: Brief[RouterPart], session: Session) -> None:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
         self._uplink = session.inbox(session.keys.uplink)
         self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
-        postman = DelayedSender() if brief.part["pace"] else None
+        postman = DelayedSender() if brief.part.pace else None
         self._bursts: list[Burst] = []
 
         def outlet(name: str, course: LinkSchedule) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
-            if postman is None and brief.part["controller"] is not None and not self._is_waited_for(name):
+            wiring = brief.part.controller
+            if postman is None and wiring is not None and not self._is_waited_for(name, wiring):
                 self._bursts.append(Burst(put))
                 return self._bursts[-1].hold
             delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
             return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
 
-        self._courses = {name: LinkSchedule.of(spec) for name, spec in brief.part["links"].items()}
+        self._courses = {name: entry.schedule for name, entry in brief.part.links.items()}
         self._outlets = {name: outlet(name, course) for name, course in self._courses.items()}
-        acknowledgements = brief.part["acknowledgements"]
+        acknowledgements = brief.part.acknowledgements
         self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
@@ -259,13 +264,10 @@ class Routing:
         """Whether to ignore packets until the resend begins."""
         self._begin(0, 0)
 
-    def _is_waited_for(self, receiver: str) -> bool:
+    def _is_waited_for(self, receiver: str, wiring: Wiring) -> bool:
         """Whether the sensor waits in some slots for a receiver's acknowledgement or estimate."""
-        part = self._brief.part
-        wiring = Wiring(**part["controller"])
-        return receiver == LEGITIMATE and (
-            not wiring.on_truth or wiring.knows_input or part["acknowledgements"] is not None
-        )
+        acknowledged = self._brief.part.acknowledgements is not None
+        return receiver == LEGITIMATE and (not wiring.on_truth or wiring.knows_input or acknowledged)
 
     def carry_on(self) -> None:
         """Route all slots, again as often as the conductor asks, until it ends the run."""
@@ -404,6 +406,6 @@ def read_links(command: Reader, names: Collection[str], slots: int) -> dict[str,
     return {name: read_changes(links, name, slots) for name in command.map("links")}
 
 
-def _opened(brief: Brief, access: dict[str, Any]) -> Session:
-    with users_file(brief.part["users"]) as users:
+def _opened(brief: Brief[RouterPart], access: dict[str, Any]) -> Session:
+    with users_file(brief.part.users) as users:
         return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

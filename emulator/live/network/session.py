@@ -31,7 +31,8 @@ from evedrop.live.network.launcher_watch import when_launcher_is_gone
 from evedrop.live.network.lifeline import Lifeline
 from evedrop.live.network.mailbox import allowance
 from evedrop.live.network.resending import ReplayBuffer
-from evedrop.live.protocol.brief import Brief, Identity
+from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, over, refusal
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, reader_of
@@ -121,17 +122,17 @@ def _once(door: RouterAddress) -> zenoh.Config:
     return zenoh.Config.from_json5(json.dumps(config))
 
 
-def router_config(brief: Brief, users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
+def router_config(brief: Brief[RoutingPart], users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
     """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
     transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
         "mode": "router",
-        **({"id": brief.part["zid"]} if brief.role == "router" and brief.part["zid"] is not None else {}),
+        **({"id": brief.part.zid} if isinstance(brief.part, RouterPart) and brief.part.zid is not None else {}),
         "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {**transport, "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
-        "low_pass_filter": low_pass(brief.run, brief.part["limits"]),
+        "low_pass_filter": low_pass(brief.run, brief.part.limits),
     }
 
 
@@ -164,7 +165,7 @@ class Session:
 
     def __init__(
         self,
-        brief: Brief,
+        brief: AnyBrief,
         config: dict[str, Any] | None = None,
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,

@@ -26,8 +26,10 @@ from evedrop.live.observer.stand_in import StandIn
 from evedrop.live.observer.status import status_of
 from evedrop.live.observer.steering import Steering
 from evedrop.live.observer.verification import Verifier, extent_of
-from evedrop.live.protocol.brief import Brief, Identity
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
+from evedrop.live.protocol.news import RunEnded, RunProgress
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
@@ -58,10 +60,14 @@ class ObservedRun:
     """The observer's work on one run."""
 
     def __init__(
-        self, brief: Brief, scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
+        self,
+        brief: Brief[ObserverPart],
+        scenario: Scenario,
+        confirmations: SimpleQueue[bytes],
+        by_hand: bool = False,
     ) -> None:
         """by_hand: whether the processes were started by hand, so that there is no launcher to end them."""
-        self._place = Path(brief.part["results"])
+        self._place = Path(brief.part.results)
         self._held: HeldFolder | None = None
         self._final: dict[str, Any] | None = None
         self._brief = brief
@@ -118,7 +124,7 @@ class ObservedRun:
         """Conduct the run to its end. Raises RunError if it fails, Interrupted if it was told to end."""
         with Session(self._brief, meanwhile=stop.check) as session:
             conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
-            if self._brief.part["recording"]:
+            if self._brief.part.recording:
                 self._showing = showing_of(self._scenario)
                 path = self.folder / "recording.rrd"
                 self._recording = open_recording(self._scenario, self._brief.run, path)
@@ -175,8 +181,7 @@ class ObservedRun:
     @property
     def _control(self) -> Control:
         part = self._brief.part
-        identity = None if part["operator_identity"] is None else Identity(**part["operator_identity"])
-        return Control(self._brief.run, self._brief.router, OPERATOR, part["operator"], identity)
+        return Control(self._brief.run, self._brief.router, OPERATOR, part.operator, part.operator_identity)
 
     def _keep(self, scenario: Scenario) -> None:
         """Replace the scenario; the slots so far satisfy it, too."""
@@ -204,7 +209,7 @@ class ObservedRun:
             return
         if order.request.do == "status":
             order.tell(self._status(conductor))
-        elif self._brief.part["shard"]:
+        elif self._brief.part.shard:
             order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
         else:
             self._steering.take(order, self._joiner.done)
@@ -303,7 +308,7 @@ class ObservedRun:
         rate = (self._joiner.done - done) / (now - before)
         self._told, self._recent = now, (now, self._joiner.done)
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
-        tell("progress", done=self._joiner.done, rate=rate, rate_unit="slots/s", squared_errors=errors)
+        tell(**RunProgress(self._joiner.done, rate, "slots/s", errors).news)
 
     @property
     def _at(self) -> str:
@@ -326,7 +331,7 @@ class ObservedRun:
     def _summary(self, how: str) -> dict[str, Any]:
         """The summary; a shard also dumps its score, for the summary of the whole run."""
         folder = self.folder
-        if self._brief.part["shard"]:
+        if self._brief.part.shard:
             dump_score(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(folder, self._scenario), self._ended - self._started
@@ -365,8 +370,7 @@ class ObservedRun:
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        accused = list(self._accused)
-        tell("ended", status=status, how=how, suspects=self._suspects, accused=accused, view=view)
+        tell(**RunEnded(status, how, self._suspects, self._accused, view).news)
         if self._by_hand:
             with suppress(FileNotFoundError):
                 report(self.folder, status, how)

@@ -23,6 +23,7 @@ from evedrop.live.observer.conductor import Stop
 from evedrop.live.observer.news import set_news_apart, tell
 from evedrop.live.observer.observation import ObservedRun, Report
 from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.folder import new_folder
 from evedrop.results.resolved_scenario import write_resolved
@@ -33,7 +34,7 @@ from evedrop.view.viewer import WebAddress
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
 
 
-def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
+def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None) -> int:
     """Run the observer of a brief; returns the exit status of the run.
 
     report: prints the end of a run that was started by hand. serve: HOST:PORT where browsers may see the run, if anywhere.
@@ -48,8 +49,8 @@ def observe(brief: Brief, report: Report, serve: str | None = None) -> int:
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
-    ANSWERS.learn(brief.part["classes"])  # so that the observer need not run the classes themselves
-    scenario = Scenario.model_validate(brief.part["scenario"])
+    ANSWERS.learn(brief.part.classes)  # so that the observer need not run the classes themselves
+    scenario = Scenario.model_validate(brief.part.scenario)
     observation = ObservedRun(brief, scenario, confirmations, by_hand)
     if by_hand:
         # Connect before writing to the folder: files left by a brief that does not fit would block the next attempt.

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import final
 
 from evedrop.live.network.reporting import BeliefReporter
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
 from evedrop.model.receiver import Belief, prior
 from evedrop.model.slot.intermittent_receiver import Absence
 from evedrop.scenario import Scenario
@@ -24,7 +24,7 @@ class StandIn:
     """
 
     def __init__(
-        self, brief: Brief, scenario: Scenario, receiver: str, away: Away, left: Belief, put: Callable[[bytes], None]
+        self, brief: AnyBrief, scenario: Scenario, receiver: str, away: Away, left: Belief, put: Callable[[bytes], None]
     ) -> None:
         process = scenario.process.process
         fresh = prior(process, scenario.trials, away.start)

@@ -17,6 +17,7 @@ from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
+from evedrop.live.protocol.news import ProcessRequest
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
@@ -166,7 +167,7 @@ class Steering:
             if act.kind in ("kill", "pause"):
                 self._conductor.absent |= set(act.names)
             self._waiting, self._confirmed, self._since = act, False, time.monotonic()
-            self._tell("act", do=act.kind, process=act.names[0], first=k, number=len(self.events))
+            self._tell(**ProcessRequest(act.kind, act.names[0], k, len(self.events)).news)
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""

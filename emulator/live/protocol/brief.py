@@ -9,19 +9,37 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeGuard, TypeVar
 
 import numpy as np
 
 from evedrop.errors import BriefError
 from evedrop.files import Unreadable, opened, why_of
-from evedrop.live.protocol.brief_entries import PARTS, mistakes_in
+from evedrop.live.protocol.brief_entries import (
+    MATRIX,
+    MOST_SLOTS,
+    anything,
+    entry,
+    expect,
+    flag,
+    inner,
+    key,
+    named,
+    number,
+    plain,
+    positive,
+    read,
+    table_of,
+    text,
+    whole,
+)
+from evedrop.live.protocol.brief_parts import PARTS, Identity, Part
 from evedrop.model.process import Process, mistakes_of
 from evedrop.streams import Batch
 
-ROLES = tuple(PARTS)
+_MOST_TRIALS, _LAST_TRIAL = 1_000_000, 2**48
 _MOST_BYTES = 2**30  # the observer's brief holds the complete scenario
 _WRITE_AGAIN = "write it again with `evedrop brief`"
 
@@ -30,13 +48,13 @@ _WRITE_AGAIN = "write it again with `evedrop brief`"
 class Flow:
     """End-to-end flow control, both in slots."""
 
-    window: int
+    window: int = field(metadata=entry(whole(1)))
     """The sensor stays at most this far ahead of the slowest receiver and of the observer."""
-    batch: int
+    batch: int = field(metadata=entry(whole(1)))
     """Telemetry, journal and progress are sent at least this often."""
-    longest_outage: float = 30.0
+    longest_outage: float = field(default=30.0, metadata=entry(positive))
     """Seconds for which a process may be cut off before that ends the run."""
-    largest_message: int = 2**30
+    largest_message: int = field(default=2**30, metadata=entry(whole(1)))
     """Bytes of the largest message of the run: larger ones are not accepted."""
 
 
@@ -44,14 +62,14 @@ class Flow:
 class Model:
     """The public model, which every process may know."""
 
-    A: list[list[float]]
-    Q: list[list[float]]
-    initial_covariance: list[list[float]]
-    state_probability: float
+    A: list[list[float]] = field(metadata=entry(MATRIX))
+    Q: list[list[float]] = field(metadata=entry(MATRIX))
+    initial_covariance: list[list[float]] = field(metadata=entry(MATRIX))
+    state_probability: float = field(metadata=entry(number))
     """μ_d."""
-    header: int = 0
+    header: int = field(default=0, metadata=entry(whole(0, 64)))
     """How many unencrypted numbers a packet has in addition to its payload."""
-    singular_noise: bool = False
+    singular_noise: bool = field(default=False, metadata=entry(flag))
     """Whether Q may be singular."""
 
     @property
@@ -60,46 +78,39 @@ class Model:
         return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
 
 
-@dataclass(frozen=True)
-class Identity:
-    """A process's certificate and key, and the authority that it trusts; each in PEM."""
-
-    authority: str
-    """The certificate of the run's authority, which made all certificates of the run."""
-    certificate: str
-    key: str
-    """The private key of the certificate."""
+P_co = TypeVar("P_co", bound=Part, covariant=True)
+P = TypeVar("P", bound=Part)
 
 
-@dataclass(frozen=True)
-class Brief:
+@dataclass(frozen=True, kw_only=True)
+class Brief(Generic[P_co]):
     """Everything one process may know."""
 
-    run: str
-    process: str
-    role: str
-    router: str
+    run: str = field(metadata=entry(text))
+    process: str = field(metadata=entry(text))
+    role: str = field(metadata=entry(text))
+    router: str = field(metadata=entry(text))
     """Zenoh endpoint, such as tcp/127.0.0.1:17460."""
-    user: str
-    password: str
-    slots: int
-    trials: int
-    first_trial: int
-    recorded: int
+    user: str = field(metadata=entry(text))
+    password: str = field(repr=False, metadata=entry(text))
+    slots: int = field(metadata=entry(whole(1, MOST_SLOTS)))
+    trials: int = field(metadata=entry(whole(1, _MOST_TRIALS)))
+    first_trial: int = field(metadata=entry(whole(0, _LAST_TRIAL)))
+    recorded: int = field(metadata=entry(whole(1, _MOST_TRIALS)))
     """How many of the first trials are recorded in full."""
-    flow: Flow
-    model: Model
-    keys: Mapping[str, str] = field(default_factory=dict)
+    flow: Flow = field(metadata=inner(Flow))
+    model: Model = field(metadata=inner(Model))
+    keys: Mapping[str, str] = field(repr=False, metadata=entry(named(key)))
     """Stream name → key, hexadecimal: the streams this process owns."""
-    part: Mapping[str, Any] = field(default_factory=dict)
+    part: P_co = field(metadata=entry(named(anything)))
     """The role's part of the scenario."""
-    first: int = 0
+    first: int = field(default=0, metadata=entry(whole(0, MOST_SLOTS)))
     """The first slot that this process handles: for a restarted process, where it goes on."""
-    ends_with_stdin: bool = False
+    ends_with_stdin: bool = field(metadata=entry(flag))
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
-    patience: int = 30
+    patience: int = field(default=30, metadata=entry(whole(1)))
     """Seconds for which it waits for the other processes."""
-    identity: Identity | None = None
+    identity: Identity | None = field(default=None, metadata=inner(Identity, or_null=True))
     """Its identity, if the run's router takes certificates."""
 
     @property
@@ -112,15 +123,28 @@ class Brief:
         """The keys of the streams this process owns."""
         return {name: bytes.fromhex(key) for name, key in self.keys.items()}
 
+    @property
+    def text(self) -> str:
+        """The brief as JSON."""
+        return json.dumps(self, default=plain, indent=1)
+
     def write(self, directory: Path) -> Path:
         """Write `<process>.json`, readable by its owner only."""
         path = directory / f"{self.process}.json"
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-            json.dump(asdict(self), file, indent=1)
+            file.write(self.text)
         return path
 
 
-def read_brief(path: Path, role: str | None = None) -> Brief:
+AnyBrief = Brief[Part]
+
+
+def has_part(brief: AnyBrief, kind: type[P]) -> TypeGuard[Brief[P]]:
+    """Whether a brief has this part: whether it is for this role."""
+    return isinstance(brief.part, kind)
+
+
+def read_brief(path: Path, role: str | None = None) -> AnyBrief:
     """Read a brief. Raises BriefError if it cannot be read, is readable by others, or is another role's."""
     try:
         with opened(path) as file:
@@ -142,19 +166,13 @@ def read_brief(path: Path, role: str | None = None) -> Brief:
     return brief
 
 
-def _parsed(found: Any) -> Brief:
-    mistakes = mistakes_in(found)
-    if mistakes:
-        raise ValueError("; ".join(mistakes))
-    identity = found.get("identity")
-    brief = Brief(
-        **{
-            **found,
-            "flow": Flow(**found["flow"]),
-            "model": Model(**found["model"]),
-            "identity": None if identity is None else Identity(**identity),
-        }
-    )
+def _parsed(found: Any) -> AnyBrief:
+    expect(table_of(Brief), "", found)
+    if found["role"] not in PARTS:
+        raise ValueError(f"unknown role {found['role']:.40}, expected one of {', '.join(PARTS)}")
+    kind = PARTS[found["role"]]
+    expect(table_of(kind), "part", found["part"])
+    brief: AnyBrief = read(Brief, {**found, "part": read(kind, found["part"])})
     model = brief.model
     try:
         matrices = [np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance)]

@@ -1,4 +1,6 @@
-"""Checks each entry of a brief by itself, its type and its range, before the brief is used.
+"""The entries of a brief: each field of its dataclasses says how it is checked, read and written.
+
+A value is checked by itself, its type and its range, before an object is made of it.
 
 Source: docs/protocol.md, the brief.
 """
@@ -7,8 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields
+from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, TypeVar
 
 from evedrop.streams import KEY_BYTES
 
@@ -17,8 +21,10 @@ Check = Callable[[str, Any], Iterator[str]]
 
 _SHOWN = 40  # characters of a value that a message repeats
 _MOST_TOLD = 8
-_MOST_SLOTS, _MOST_TRIALS, _LAST_TRIAL = 100_000_000, 1_000_000, 2**48
-_NEVER = 2**62  # a slot that no run reaches
+NEVER = 2**62  # a slot that no run reaches
+MOST_SLOTS = 100_000_000
+
+T = TypeVar("T")
 
 
 def _wrong(path: str, found: Any, expected: str) -> Iterator[str]:
@@ -44,7 +50,7 @@ def anything(path: str, found: Any) -> Iterator[str]:
     yield from ()
 
 
-def whole(least: int, most: int = _NEVER) -> Check:
+def whole(least: int, most: int = NEVER) -> Check:
     """A check for a whole number in this range."""
 
     def check(path: str, found: Any) -> Iterator[str]:
@@ -71,17 +77,30 @@ def maybe(check: Check) -> Check:
     return lambda path, found: iter(()) if found is None else check(path, found)
 
 
-def listed(check: Check, least: int = 0) -> Check:
+def listed(check: Check) -> Check:
     """A check for a list of values that pass another check."""
 
     def all_of(path: str, found: Any) -> Iterator[str]:
-        if not isinstance(found, list) or len(found) < least:
-            yield from _wrong(path, found, f"a list of {least} or more entries" if least else "a list")
+        if not isinstance(found, list):
+            yield from _wrong(path, found, "a list")
             return
         for i, one in enumerate(found):
             yield from check(f"{path}.{i}", one)
 
     return all_of
+
+
+def row(*checks: Check) -> Check:
+    """A check for a list with one value for each of these checks."""
+
+    def each(path: str, found: Any) -> Iterator[str]:
+        if not isinstance(found, list) or len(found) != len(checks):
+            yield from _wrong(path, found, f"a list of {len(checks)} entries")
+            return
+        for i, (check, one) in enumerate(zip(checks, found, strict=True)):
+            yield from check(f"{path}.{i}", one)
+
+    return each
 
 
 def named(check: Check) -> Check:
@@ -118,7 +137,8 @@ def table(needed: Mapping[str, Check], optional: Mapping[str, Check] | None = No
     return each
 
 
-def _key(path: str, found: Any) -> Iterator[str]:
+def key(path: str, found: Any) -> Iterator[str]:
+    """Check that a value is the key of a stream."""
     try:
         size = len(bytes.fromhex(found)) if isinstance(found, str) else 0
     except ValueError:
@@ -127,163 +147,51 @@ def _key(path: str, found: Any) -> Iterator[str]:
         yield f"{path} is not a key, expected {KEY_BYTES} bytes in hexadecimal"
 
 
-KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
-"""The kinds of a run's keys, as they follow the run's name."""
-_MATRIX = listed(listed(number))
-_NUMBERS = listed(number)
-_LIMITS = listed(maybe(number))
-_SLOT = whole(0, _NEVER)
-_IDENTITY = table({"authority": text, "certificate": text, "key": text})
-_SPEC = named(anything)
-_WIRING = maybe(table({"acts_on": text, "knows_input": flag}))
-_PLANT: Mapping[str, Check] = {
-    "input_matrix": _MATRIX,
-    "disturbance_matrix": _MATRIX,
-    "noise": _MATRIX,
-    "start": _NUMBERS,
-    **dict.fromkeys(("input_lower", "input_upper", "state_lower", "state_upper"), _LIMITS),
-}
-_MEASURED: Mapping[str, Check] = {"output_matrix": _MATRIX, "measurement_noise": _MATRIX}
-_OWN: Mapping[str, Check] = {"modules": maybe(text)}
-_OUTAGES = listed(listed(anything, 3))
-
-ENTRIES = table(
-    {
-        **dict.fromkeys(("run", "process", "role", "router", "user", "password"), text),
-        "slots": whole(1, _MOST_SLOTS),
-        "trials": whole(1, _MOST_TRIALS),
-        "first_trial": whole(0, _LAST_TRIAL),
-        "recorded": whole(1, _MOST_TRIALS),
-        "flow": table(
-            {"window": whole(1), "batch": whole(1)}, {"longest_outage": positive, "largest_message": whole(1)}
-        ),
-        "model": table(
-            {"A": _MATRIX, "Q": _MATRIX, "initial_covariance": _MATRIX, "state_probability": number},
-            {"header": whole(0, 64), "singular_noise": flag},
-        ),
-        "keys": named(_key),
-        "part": named(anything),
-        "ends_with_stdin": flag,
-    },
-    {"first": whole(0, _MOST_SLOTS), "patience": whole(1), "identity": maybe(_IDENTITY)},
-)
-"""Checks the entries that every brief has."""
-
-_COURSE = table(
-    {
-        "settings": table({"loss": _SPEC}, strict=False),
-        "window": whole(0, _MOST_SLOTS),
-        "changes": listed(table({"at": _SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)})),
-        "outages": listed(listed(whole(0, _NEVER), 3)),
-        "correlation": maybe(listed(anything, 2)),
-    }
-)
-PARTS: Mapping[str, Check] = {
-    "router": table(
-        {
-            "links": named(_COURSE),
-            "pace": positive,
-            "users": named(text),
-            "leaks": named(_SLOT),
-            "acknowledgements": maybe(
-                table(
-                    {
-                        "quality": number,
-                        "attack": text,
-                        "jammer": maybe(text),
-                        "spans": maybe(listed(listed(_SLOT, 2))),
-                    }
-                )
-            ),
-            "controller": _WIRING,
-            "zid": maybe(text),
-            "limits": table(dict.fromkeys(KINDS, whole(1))),
-        },
-        _OWN,
-        strict=False,
-    ),
-    "relay": table(
-        {
-            "users": named(text),
-            "receivers": listed(text),
-            "listen": text,
-            "zid": text,
-            "controller": _WIRING,
-            "limits": table(dict.fromkeys(KINDS, whole(1))),
-        },
-        strict=False,
-    ),
-    "sensor": table(
-        {
-            "scheme": table({"scheme": text}, strict=False),
-            "pace": positive,
-            "receivers": listed(text),
-            "holds": listed(_SLOT),
-            "history": whole(0, _MOST_SLOTS),
-            "leaks": named(_SLOT),
-            "chart": maybe(
-                table({"acknowledged": whole(-_NEVER), "missing": whole(-_NEVER), "threshold": whole(-_NEVER)})
-            ),
-            "plant": maybe(table({**_PLANT, "disturbances": text}, _MEASURED)),
-            "controller": maybe(table({"period": whole(1), "acts_on": text})),
-        },
-        _OWN,
-        strict=False,
-    ),
-    "legitimate": table(
-        {
-            "scheme": table({"scheme": text}, strict=False),
-            "window": whole(0, _MOST_SLOTS),
-            "outages": _OUTAGES,
-            "controller": maybe(table({"period": whole(1), "acts_on": text, "plant": maybe(table(_PLANT, _MEASURED))})),
-        },
-        _OWN,
-        strict=False,
-    ),
-    "eavesdropper": table(
-        {"strategy": text, "parameters": named(anything), "window": whole(0, _MOST_SLOTS), "outages": _OUTAGES},
-        _OWN,
-        strict=False,
-    ),
-    "controller": table(
-        {
-            "strategy": text,
-            "assignment": table(
-                {
-                    "period": whole(1),
-                    "slot_seconds": positive,
-                    **dict.fromkeys(("state_weights", "input_weights", "rate_weights"), _NUMBERS),
-                    "rate_limits": _LIMITS,
-                    "parameters": named(anything),
-                }
-            ),
-            "acts_on": text,
-            "plant": table(_PLANT, _MEASURED),
-            "disturbances": text,
-        },
-        strict=False,
-    ),
-    "observer": table(
-        {
-            "scenario": named(anything),
-            "results": text,
-            "recording": flag,
-            "operator": text,
-            "classes": named(named(anything)),
-            "operator_identity": maybe(_IDENTITY),
-            "shard": flag,
-        },
-        strict=False,
-    ),
-}
-"""Role → the check for its part of the scenario."""
+MATRIX = listed(listed(number))
+NUMBERS = listed(number)
+LIMITS = listed(maybe(number))
+SLOT = whole(0)
 
 
-def mistakes_in(found: Any) -> list[str]:
-    """The first mistakes in a brief; empty if each entry by itself is right."""
-    mistakes = list(islice(ENTRIES("", found), _MOST_TOLD))
+def entry(check: Check, read: Callable[[Any], Any] | None = None, left_out: bool = False) -> dict[str, Any]:
+    """The metadata of a field that is an entry of a brief.
+
+    read: makes the field's value of the checked entry; by default they are the same. left_out: not written where it is None.
+    """
+    return {"check": check, "read": read or (lambda found: found), "left_out": left_out}
+
+
+def inner(kind: type[Any], or_null: bool = False) -> dict[str, Any]:
+    """The metadata of a field that is a table of entries itself: an object of this dataclass, perhaps None."""
+    check = table_of(kind)
+    if or_null:
+        return entry(maybe(check), lambda found: None if found is None else read(kind, found))
+    return entry(check, partial(read, kind))
+
+
+def table_of(kind: type[Any]) -> Check:
+    """A check for the table of a dataclass of entries; an entry with a default may be missing."""
+    needed: dict[str, Check] = {}
+    optional: dict[str, Check] = {}
+    for one in fields(kind):
+        (needed if one.default is MISSING else optional)[one.name] = one.metadata["check"]
+    return table(needed, optional)
+
+
+def expect(check: Check, path: str, found: Any) -> None:
+    """Raise ValueError with the first mistakes in a value."""
+    mistakes = list(islice(check(path, found), _MOST_TOLD))
     if mistakes:
-        return mistakes
-    if found["role"] not in PARTS:
-        return [f"unknown role {found['role']:.{_SHOWN}}, expected one of {', '.join(PARTS)}"]
-    return list(islice(PARTS[found["role"]]("part", found["part"]), _MOST_TOLD))
+        raise ValueError("; ".join(mistakes))
+
+
+def read(kind: type[T], found: Mapping[str, Any]) -> T:
+    """Make an object of a dataclass of entries from its table, which has passed its check."""
+    given = (one for one in fields(kind) if one.name in found)  # type: ignore[arg-type]
+    return kind(**{one.name: one.metadata["read"](found[one.name]) for one in given})
+
+
+def plain(of: Any) -> dict[str, Any]:
+    """The entries of an object of a dataclass, as they are written; for the `default` of json.dump."""
+    values = ((one, getattr(of, one.name)) for one in fields(of))
+    return {one.name: value for one, value in values if value is not None or not one.metadata.get("left_out")}

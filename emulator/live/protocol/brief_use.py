@@ -5,27 +5,33 @@ Source: docs/protocol.md, the brief.
 
 from __future__ import annotations
 
-from base64 import b64decode
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
 from evedrop.errors import BriefError, NotRegistered
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_closed_loop import PlantEntry, decoded
+from evedrop.live.protocol.brief_parts import (
+    ControllerPart,
+    EavesdropperPart,
+    LegitimatePart,
+    RouterPart,
+    SensorPart,
+)
 from evedrop.model.acknowledgements import ATTACKS
-from evedrop.model.controllers import CONTROLLERS, Assignment
+from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.plant import Plant
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.slot.link import Link, LinkSchedule, streams_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.slot.link import Link, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
 
 _WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
-def expect_usable(brief: Brief) -> None:
+def expect_usable(brief: AnyBrief) -> None:
     """Raise BriefError if a process cannot work with its brief: a key, a class or a number is missing or unusable."""
     try:
         _expect_usable(brief)
@@ -34,93 +40,87 @@ def expect_usable(brief: Brief) -> None:
         raise BriefError(f"it names {name}{error.why or ', which is not a class here'}") from error
 
 
-def _expect_usable(brief: Brief) -> None:
-    match brief.role:
-        case "router":
-            _expect_links(brief)
-        case "sensor":
-            plant = brief.part["plant"]
-            scheme = _scheme(brief)
-            measures = plant is not None and "output_matrix" in plant
+def _expect_usable(brief: AnyBrief) -> None:
+    match brief.part:
+        case RouterPart() as part:
+            _expect_links(brief, part)
+        case SensorPart(plant=plant) as part:
+            scheme = _scheme(brief, part)
+            measures = plant is not None and plant.output_matrix is not None
             _expect_keys(brief, ["process", *(["measurement"] if measures else []), *scheme.secret_streams])
-            _expect_plant(brief, plant)
-        case "legitimate":
-            _expect_keys(brief, _scheme(brief).estimator_streams)
-            _expect_plant(brief, (brief.part["controller"] or {}).get("plant"))
-        case "eavesdropper":
-            kind, parameters = STRATEGIES[brief.part["strategy"]], brief.part["parameters"]
+            if plant is not None:
+                _expect_plant(brief, plant, plant.disturbances)
+        case LegitimatePart(controller=loop) as part:
+            _expect_keys(brief, _scheme(brief, part).estimator_streams)
+            if loop is not None and loop.plant is not None:
+                _expect_plant(brief, loop.plant)
+        case EavesdropperPart(strategy=strategy, parameters=parameters):
+            kind = STRATEGIES[strategy]
             lacking = sorted(set(kind.parameters) - set(parameters))
             if lacking:
                 raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {_WRITE_AGAIN}")
             with _using("part.parameters"):
                 streams = kind.streams(parameters)
             _expect_keys(brief, streams)
-        case "controller":
-            _expect_controller(brief)
+        case ControllerPart() as part:
+            _expect_controller(brief, part)
         case _:
             pass
 
 
-def _expect_keys(brief: Brief, names: Iterable[str]) -> None:
+def _expect_keys(brief: AnyBrief, names: Iterable[str]) -> None:
     for name in names:
         if name not in brief.keys:
             raise BriefError(f"keys.{name} is missing, and {brief.process} cannot work without it; {_WRITE_AGAIN}")
 
 
-def _scheme(brief: Brief) -> Any:
-    kind = SCHEMES[brief.part["scheme"]["scheme"]]
-    given = set(brief.part["scheme"]) - {"scheme"}
-    for name in sorted(set(kind.parameters) ^ given):
+def _scheme(brief: AnyBrief, part: SensorPart | LegitimatePart) -> Scheme:
+    spec = part.scheme
+    kind = SCHEMES[spec["scheme"]]
+    for name in sorted(set(kind.parameters) ^ (set(spec) - {"scheme"})):
         what = "missing" if name in kind.parameters else "not a parameter of the scheme"
         raise BriefError(f"part.scheme.{name} is {what}; {_WRITE_AGAIN}")
     with _using("part.scheme"):
-        return scheme_of(brief.model.process, brief.part["scheme"])
+        return scheme_of(brief.model.process, spec)
 
 
-def _expect_plant(brief: Brief, spec: Mapping[str, Any] | None) -> None:
-    if spec is None:
-        return
+def _expect_plant(brief: AnyBrief, entry: PlantEntry, disturbances: str | None = None) -> None:
     n = brief.model.process.n
     with _using("part.plant"):
-        plant = Plant.of({name: value for name, value in spec.items() if name != "disturbances"})
+        plant = entry.plant
         if plant.noise.shape != (n, n) or plant.start.shape != (n,):
             raise ValueError(f"it does not have {n} states, as the model does")
-        if "disturbances" in spec:
-            _expect_disturbances(brief, spec["disturbances"], plant)
+        if disturbances is None:
+            return
+        found = decoded(disturbances, brief.slots)
+        if found.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(found).all():
+            raise ValueError(f"it has {found.shape[1]} disturbances in each slot, or they are not finite")
 
 
-def _expect_disturbances(brief: Brief, text: str, plant: Plant) -> None:
-    found = np.frombuffer(b64decode(text), "<f8").reshape(brief.slots, -1)
-    if found.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(found).all():
-        raise ValueError(f"it has {found.shape[1]} disturbances in each slot, or they are not finite")
-
-
-def _expect_controller(brief: Brief) -> None:
-    part = brief.part
-    if part["strategy"] not in CONTROLLERS:
+def _expect_controller(brief: AnyBrief, part: ControllerPart) -> None:
+    if part.strategy not in CONTROLLERS:
         known = ", ".join(sorted(CONTROLLERS))
-        raise BriefError(f"part.strategy is {part['strategy']:.40}, expected one of {known}; {_WRITE_AGAIN}")
-    _expect_plant(brief, {**part["plant"], "disturbances": part["disturbances"]})
+        raise BriefError(f"part.strategy is {part.strategy:.40}, expected one of {known}; {_WRITE_AGAIN}")
+    _expect_plant(brief, part.plant, part.disturbances)
     with _using("part.assignment"):
-        assignment = Assignment.of(brief.model.process, Plant.of(part["plant"]), part["assignment"])
-        objections = CONTROLLERS[part["strategy"]].objections(assignment)
+        assignment = part.assignment.assignment(brief.model.process, part.plant.plant)
+        objections = CONTROLLERS[part.strategy].objections(assignment)
     if objections:
         raise BriefError(f"part: the {objections[0][0]} {objections[0][1]}")
 
 
-def _expect_links(brief: Brief) -> None:
-    for name, spec in brief.part["links"].items():
+def _expect_links(brief: AnyBrief, part: RouterPart) -> None:
+    for name, entry in part.links.items():
         with _using(f"part.links.{name}"):
-            course = LinkSchedule.of(spec)
+            course = entry.schedule
         _expect_keys(brief, streams_of(name, course))
         with _using(f"part.links.{name}"):
             keys = brief.stream_keys
             Link(course, name, {stream: keys[stream] for stream in streams_of(name, course)}, brief.batch)
-    acknowledgements = brief.part["acknowledgements"]
-    if acknowledgements is not None:
+    if part.acknowledgements is not None:
         _expect_keys(brief, [f"link/{ACKNOWLEDGEMENTS}"])
-        if acknowledgements["attack"] not in ATTACKS:
-            raise BriefError(f"part.acknowledgements.attack is {acknowledgements['attack']:.40}; {_WRITE_AGAIN}")
+        if part.acknowledgements.attack not in ATTACKS:
+            raise BriefError(f"part.acknowledgements.attack is {part.acknowledgements.attack:.40}; {_WRITE_AGAIN}")
 
 
 @contextmanager

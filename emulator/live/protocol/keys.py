@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
 
+KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
+"""The kinds of a run's keys, as they follow the run's name."""
+
 
 @dataclass(frozen=True)
 class RunKeys:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.live.protocol.brief_entries import KINDS
+from evedrop.live.protocol.keys import KINDS
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.links.link import REASONS
 from evedrop.model.slot.account import COUNTED_BURSTS

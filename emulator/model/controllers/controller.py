@@ -37,34 +37,6 @@ class Assignment:
     parameters: Mapping[str, Any]
     """The strategy's own parameters."""
 
-    @property
-    def spec(self) -> dict[str, Any]:
-        """The assignment as plain numbers, for a brief, without process and plant; None for a limit that does not exist."""
-        weights = {name: getattr(self, name).tolist() for name in ("state_weights", "input_weights", "rate_weights")}
-        limits = [value if np.isfinite(value) else None for value in self.rate_limits.tolist()]
-        return {
-            "period": self.period,
-            "slot_seconds": self.slot_seconds,
-            **weights,
-            "rate_limits": limits,
-            "parameters": dict(self.parameters),
-        }
-
-    @classmethod
-    def of(cls, process: Process, plant: Plant, spec: Mapping[str, Any]) -> Assignment:
-        """The assignment of a `spec`."""
-        arrays = {name: np.array(spec[name], np.float64) for name in ("state_weights", "input_weights", "rate_weights")}
-        limits = np.array([np.inf if value is None else value for value in spec["rate_limits"]], np.float64)
-        return cls(
-            process,
-            plant,
-            spec["period"],
-            spec["slot_seconds"],
-            **arrays,
-            rate_limits=limits,
-            parameters=spec["parameters"],
-        )
-
 
 class Controller(ABC):
     """A control strategy. Each file of this folder defines one, registered by its name in a scenario.

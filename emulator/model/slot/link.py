@@ -106,27 +106,6 @@ class LinkSchedule:
     correlation: tuple[str, float] | None = None
     """The receiver whose losses these are tied to, and how strongly."""
 
-    @classmethod
-    def of(cls, spec: Mapping[str, Any]) -> LinkSchedule:
-        """The schedule from plain values, as `plain` returns them."""
-        return cls(
-            spec["settings"],
-            spec["window"],
-            tuple(Change(**change) for change in spec["changes"]),
-            tuple(ReceiverOutage(start, stop, Fate(reason)) for start, stop, reason in spec["outages"]),
-            tuple(spec["correlation"]) if spec["correlation"] is not None else None,
-        )
-
-    def plain(self) -> dict[str, Any]:
-        """The schedule as values that a brief can contain."""
-        return {
-            "settings": dict(self.settings),
-            "window": self.window,
-            "changes": [{"at": one.at, "settings": one.settings, "cut": one.cut} for one in self.changes],
-            "outages": [[one.start, one.stop, int(one.reason)] for one in self.outages],
-            "correlation": None if self.correlation is None else list(self.correlation),
-        }
-
 
 def streams_of(receiver: str, course: LinkSchedule) -> tuple[str, ...]:
     """The random streams of a receiver's link: losses, delays, all other faults, and correlation."""

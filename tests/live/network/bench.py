@@ -20,7 +20,7 @@ import zenoh
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import loopback_places
 from evedrop.live.network.session import client_config
-from evedrop.live.protocol.brief import Brief, Flow
+from evedrop.live.protocol.brief import AnyBrief, Flow
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
@@ -94,7 +94,7 @@ class Ear:
         return found
 
 
-def connect(brief: Brief, **changes: Any) -> zenoh.Session:
+def connect(brief: AnyBrief, **changes: Any) -> zenoh.Session:
     """A session with a brief's credentials, with a router that may not be up yet; changes replace top-level entries."""
     config = client_config(brief)
     config["connect"]["timeout_ms"] = int(1000 * LIMIT_SECONDS)
@@ -109,7 +109,7 @@ class Bench:
         listen = f"{protocol}/127.0.0.1:{free_port()}"
         places = loopback_places(listen, None, scenario.relayed)
         made = briefs_of(scenario, places, observation, ends_with_stdin=False)
-        self.briefs: Mapping[str, Brief] = {
+        self.briefs: Mapping[str, AnyBrief] = {
             name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
         self.scenario = scenario

@@ -5,6 +5,7 @@ The attacker has the credentials of the real eavesdropper `eve`, which takes par
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -20,7 +21,7 @@ import zenoh
 from evedrop import montecarlo
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
-from evedrop.live.protocol.brief import Brief, read_brief
+from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.loading import load
@@ -78,7 +79,7 @@ class Evidence:
 
     scenario: Scenario
     folder: Path
-    briefs: dict[str, Brief]
+    briefs: dict[str, AnyBrief]
     left_behind: dict[str, dict[str, bytes]]
     """Process → where → all that a process was given or wrote."""
     overheard: dict[str, set[str]]
@@ -100,7 +101,7 @@ def asked_for(keys: RunKeys) -> list[str]:
     return [keys.uplink, keys.journal, *named, *downlinks, *wide, f"{under}/alive/*", f"{under}/downlink/*"]
 
 
-def listen(eve: Brief, keys: RunKeys, stack: ExitStack) -> dict[str, Ear]:
+def listen(eve: AnyBrief, keys: RunKeys, stack: ExitStack) -> dict[str, Ear]:
     """Ask in every way to be told: by subscription, by watching tokens."""
     attacker = stack.enter_context(connect(eve))
     ears = {}
@@ -112,7 +113,7 @@ def listen(eve: Brief, keys: RunKeys, stack: ExitStack) -> dict[str, Ear]:
     return ears
 
 
-def ask(eve: Brief, keys: RunKeys) -> dict[str, set[str]]:
+def ask(eve: AnyBrief, keys: RunKeys) -> dict[str, set[str]]:
     """Ask in every way to be answered: by query, and for tokens."""
     with connect(eve) as attacker:
         own = f"@/{attacker.zid()}/"
@@ -126,7 +127,7 @@ def ask(eve: Brief, keys: RunKeys) -> dict[str, set[str]]:
     return answers
 
 
-def disturb(eve: Brief, keys: RunKeys) -> None:
+def disturb(eve: AnyBrief, keys: RunKeys) -> None:
     """Put what would wreck the run on every key that is not its own, delete everything, feign tokens, offer answers."""
     own = {keys.telemetry("eve"), keys.progress("eve"), keys.alive("eve")}
     with connect(eve) as attacker:
@@ -316,8 +317,9 @@ def test_a_process_is_given_nothing_else_of_the_launchers_environment(name: str,
 def test_an_eavesdropper_is_told_no_truth(name: str, evidence: Evidence) -> None:
     """No state, schedule or scenario is in its brief; what it wrote is empty; other receivers are not even named."""
     brief = evidence.briefs[name]
-    assert set(brief.part) == {"strategy", "parameters", "window", "outages"}
-    assert brief.part["outages"] == []
+    part = json.loads(brief.text)["part"]
+    assert set(part) == {"strategy", "parameters", "window", "outages"}
+    assert part["outages"] == []
     assert evidence.left_behind[name]["log"] == b""
     for other in {"legitimate", "eve", "mallory", "nadia"} - {name}:
         assert other.encode() not in evidence.left_behind[name]["brief"]

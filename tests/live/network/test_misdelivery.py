@@ -20,7 +20,7 @@ from evedrop.live.network.declared import InboxClosedError, Question
 from evedrop.live.network.operator import Answer, Request, ask
 from evedrop.live.network.router_users import users_file
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader, control, progress
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
@@ -56,7 +56,7 @@ class Stage:
         self.keys = RunKeys(self.briefs["eve"].run)
 
     @property
-    def eve(self) -> Brief:
+    def eve(self) -> AnyBrief:
         """Of an eavesdropper."""
         return self.briefs["eve"]
 

@@ -16,7 +16,7 @@ import zenoh
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.operator import Answer, Request, ask, read_request
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
@@ -33,10 +33,10 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         yield one
 
 
-def operator(stage: Bench) -> Brief:
+def operator(stage: Bench) -> AnyBrief:
     """The operator's credentials, as an observer's brief would have them."""
     observer = stage.briefs["observer"]
-    return replace(observer, process="operator", user="operator", password=observer.part["operator"])
+    return replace(observer, process="operator", user="operator", password=observer.part.operator)
 
 
 def control(stage: Bench, **changes: Any) -> Control:

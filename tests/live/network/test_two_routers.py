@@ -20,7 +20,7 @@ from evedrop.live.network.linked_routers import at_relay, at_router
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
@@ -130,8 +130,8 @@ def test_who_belongs_to_the_relay_is_not_let_in_at_the_router(who: str, stage: B
 
 def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
     """A process that connects to the relay with the router's Zenoh id, which it may have learnt, is not taken for the router."""
-    eve: Brief = stage.briefs[EVE]
-    config = {**client_config(eve), "id": stage.briefs["router"].part["zid"], "mode": "router"}
+    eve: AnyBrief = stage.briefs[EVE]
+    config = {**client_config(eve), "id": stage.briefs["router"].part.zid, "mode": "router"}
     stolen = Ear()
     try:
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as attacker:
@@ -150,15 +150,15 @@ def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
 def test_each_process_has_its_own_place(stage: Bench) -> None:
     """The sensor and the relay connect to the router, all others to the relay; each router knows those it lets in, and itself."""
     router, relay = stage.briefs["router"], stage.briefs["relay"]
-    assert set(router.part["users"]) == {"router", "sensor", "relay"}
-    assert set(relay.part["users"]) == {*RECEIVERS, "relay", "observer", "operator"}
+    assert set(router.part.users) == {"router", "sensor", "relay"}
+    assert set(relay.part.users) == {*RECEIVERS, "relay", "observer", "operator"}
     assert {name for name, brief in stage.briefs.items() if brief.router == router.router} == {
         "router",
         "relay",
         "sensor",
     }
     assert relay.keys == {}
-    assert not {"links", "scheme", "scenario"} & set(relay.part)
+    assert not {"links", "scheme", "scenario"} & set(json.loads(relay.text)["part"])
 
 
 def test_what_crosses_is_no_more_than_it_must_be() -> None:

@@ -14,7 +14,9 @@ import pytest
 
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.protocol.brief import Brief, Flow, Model, read_brief
+from evedrop.live.launch.ports import places_at
+from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, read_brief
+from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.loading import load
 from evedrop.scenario import Scenario
@@ -35,8 +37,10 @@ BRIEF = Brief(
     flow=Flow(8, 2),
     model=Model([[1.0, 0.1], [0.0, 1.0]], [[1e-3, 0.0], [0.0, 1e-3]], [[1.0, 0.0], [0.0, 1.0]], 0.5),
     keys={"schedule": "ab" * 32},
-    part={"strategy": "smart", "parameters": {}, "window": 0, "outages": []},
+    part=EavesdropperPart("smart", {}, 0, []),
+    ends_with_stdin=False,
 )
+PLAIN: dict[str, Any] = json.loads(BRIEF.text)
 
 
 def test_reads_back_what_was_written(tmp_path: Path) -> None:
@@ -73,9 +77,7 @@ def test_refuses_another_role(tmp_path: Path) -> None:
 
 def without(name: str) -> dict[str, Any]:
     """The brief without an entry."""
-    found = asdict(BRIEF)
-    del found[name]
-    return found
+    return {entry: value for entry, value in PLAIN.items() if entry != name}
 
 
 @pytest.mark.parametrize(
@@ -84,11 +86,11 @@ def without(name: str) -> dict[str, Any]:
         [],
         "text",
         {},
-        {**asdict(BRIEF), "secret": "00"},
-        {**asdict(BRIEF), "role": "spy"},
-        {**asdict(BRIEF), "flow": {"window": 8}},
-        {**asdict(BRIEF), "flow": {"window": 8, "batch": 2, "more": 1}},
-        {**asdict(BRIEF), "model": []},
+        {**PLAIN, "secret": "00"},
+        {**PLAIN, "role": "spy"},
+        {**PLAIN, "flow": {"window": 8}},
+        {**PLAIN, "flow": {"window": 8, "batch": 2, "more": 1}},
+        {**PLAIN, "model": []},
         without("slots"),
         without("model"),
         without("role"),
@@ -138,7 +140,7 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
     return Scenario.model_validate({**table, **changes})
 
 
-def made(scenario: Scenario) -> dict[str, Brief]:
+def made(scenario: Scenario) -> dict[str, AnyBrief]:
     """The briefs of a scenario."""
     return briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
 
@@ -196,8 +198,11 @@ def test_passwords_and_run_are_made_afresh() -> None:
     assert min(map(len, passwords)) >= 32
     assert first["router"].run != second["router"].run
     users = {n: b.password for n, b in first.items()}
-    assert first["router"].part["users"] == {**users, "operator": first["observer"].part["operator"]}
-    assert first["observer"].part["operator"] not in passwords
+    router, observer = first["router"].part, first["observer"].part
+    assert isinstance(router, RouterPart)
+    assert isinstance(observer, ObserverPart)
+    assert router.users == {**users, "operator": observer.operator}
+    assert observer.operator not in passwords
 
 
 def test_an_added_eavesdropper_changes_nobody_elses_keys() -> None:
@@ -215,12 +220,47 @@ def test_model_is_the_only_thing_all_share() -> None:
     """Every brief holds the public model; no eavesdropper's brief holds anything of the scenario beyond its own part."""
     briefs = made(scenario_of())
     assert len({json.dumps(asdict(brief.model)) for brief in briefs.values()}) == 1
-    assert briefs["doubtful"].part == {
+    assert json.loads(briefs["doubtful"].text)["part"] == {
         "strategy": "suspicious",
         "parameters": {"use_state": 0.9, "use_innovation": 0.1},
         "window": 0,
         "outages": [],
     }
+
+
+def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
+    """Neither keys, passwords, private keys nor the seed: they would be in a traceback, and so in a log."""
+    made_for = places_at("tls/0.0.0.0:7447", "tls/router.lan:7447")
+    for brief in briefs_of(scenario_of(seed=987_654_321), made_for, ObserverTask(Path("nowhere"), False)).values():
+        shown, found = repr(brief), json.loads(brief.text)
+        secrets = [brief.password, *brief.keys.values(), *found["part"].get("users", {}).values()]
+        secrets += [found["part"].get("operator"), found["identity"]["key"], "PRIVATE KEY", "987654321"]
+        assert [secret for secret in secrets if secret and secret in shown] == []
+
+
+@pytest.mark.parametrize("role", ["legitimate", "smart"])
+@pytest.mark.parametrize(
+    ("outage", "said"),
+    [
+        ([[], 3, True], "part.outages.0.0 is list of 0, expected a whole number"),
+        ([2, 3, 1], "part.outages.0.2 is 1, expected true or false"),
+        ([2, 3], "part.outages.0 is list of 2, expected a list of 3 entries"),
+        ([2, 3, True, 4], "part.outages.0 is list of 4, expected a list of 3 entries"),
+    ],
+)
+def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, tmp_path: Path) -> None:
+    """Before the receiver takes part in the run."""
+    found = json.loads(made(scenario_of())[role].text)
+    found["part"]["outages"] = [outage]
+    assert said in str(refusal(found, tmp_path))
+
+
+@pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "observer"])
+def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
+    """As those of the brief itself."""
+    found = json.loads(made(scenario_of())[role].text)
+    found["part"]["seed"] = 3
+    assert "(part.seed is an unknown entry)" in str(refusal(found, tmp_path))
 
 
 OPTIONAL = {
@@ -246,7 +286,7 @@ def every_brief() -> dict[str, dict[str, Any]]:
     for name in KINDS:
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
         for process, brief in made(scenario).items():
-            found[f"{name}/{process}"] = json.loads(json.dumps(asdict(brief)))
+            found[f"{name}/{process}"] = json.loads(brief.text)
     return found
 
 

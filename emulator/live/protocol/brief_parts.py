@@ -1,0 +1,248 @@
+"""The part of a brief that belongs to a role: what a process of this role may know of the scenario.
+
+Source: docs/protocol.md, the brief.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from evedrop.live.protocol.brief_closed_loop import (
+    AssignmentEntry,
+    EstimatorLoop,
+    PlantEntry,
+    SensorLoop,
+    SensorPlantEntry,
+    Wiring,
+)
+from evedrop.live.protocol.brief_entries import (
+    MOST_SLOTS,
+    NEVER,
+    SLOT,
+    Check,
+    anything,
+    entry,
+    flag,
+    inner,
+    listed,
+    maybe,
+    named,
+    number,
+    positive,
+    read,
+    row,
+    table,
+    table_of,
+    text,
+    whole,
+)
+from evedrop.live.protocol.keys import KINDS
+from evedrop.model.acknowledgements import WayBackSpec
+from evedrop.model.links.link import Fate
+from evedrop.model.numeric.detection import Chart
+from evedrop.model.slot.link import Change, LinkSchedule, ReceiverOutage
+
+_TEXTS = listed(text)
+_SCHEME = table({"scheme": text}, strict=False)
+_SIZES = table(dict.fromkeys(KINDS, whole(1)))
+_WINDOW = whole(0, MOST_SLOTS)
+_OUTAGES = listed(row(SLOT, SLOT, flag))
+_SCORE = whole(-NEVER)
+_CHART: Check = maybe(table(dict.fromkeys(("acknowledged", "missing", "threshold"), _SCORE)))
+_WAY_BACK: Check = maybe(
+    table({"quality": number, "attack": text, "jammer": maybe(text), "spans": maybe(listed(row(SLOT, SLOT)))})
+)
+_CHANGES = listed(table({"at": SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)}))
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A process's certificate and key, and the authority that it trusts; each in PEM."""
+
+    authority: str = field(metadata=entry(text))
+    """The certificate of the run's authority, which made all certificates of the run."""
+    certificate: str = field(metadata=entry(text))
+    key: str = field(repr=False, metadata=entry(text))
+    """The private key of the certificate."""
+
+
+@dataclass(frozen=True)
+class LinkEntry:
+    """The course of a link as plain values."""
+
+    settings: Mapping[str, Any] = field(metadata=entry(table({"loss": named(anything)}, strict=False)))
+    window: int = field(metadata=entry(_WINDOW))
+    changes: Sequence[Change] = field(metadata=entry(_CHANGES, lambda found: [Change(**one) for one in found]))
+    outages: Sequence[Sequence[int]] = field(metadata=entry(listed(row(SLOT, SLOT, SLOT))))
+    """[first slot, first slot after, `Fate` of packets] each."""
+    correlation: tuple[str, float] | None = field(
+        metadata=entry(maybe(row(text, number)), lambda found: None if found is None else tuple(found))
+    )
+    """[receiver, strength]."""
+
+    @classmethod
+    def of(cls, schedule: LinkSchedule) -> LinkEntry:
+        """The entry of a link's schedule."""
+        outages = [[one.start, one.stop, int(one.reason)] for one in schedule.outages]
+        return cls(schedule.settings, schedule.window, schedule.changes, outages, schedule.correlation)
+
+    @property
+    def schedule(self) -> LinkSchedule:
+        """The link's schedule. Raises ValueError if an outage has no such `Fate`."""
+        outages = tuple(ReceiverOutage(start, stop, Fate(reason)) for start, stop, reason in self.outages)
+        return LinkSchedule(self.settings, self.window, tuple(self.changes), outages, self.correlation)
+
+
+@dataclass(frozen=True)
+class RouterPart:
+    """What the router knows: all links."""
+
+    role: ClassVar[str] = "router"
+    links: Mapping[str, LinkEntry] = field(
+        metadata=entry(
+            named(table_of(LinkEntry)), lambda found: {name: read(LinkEntry, one) for name, one in found.items()}
+        )
+    )
+    """Receiver → the course of its link."""
+    pace: float = field(metadata=entry(positive))
+    """Seconds a slot; 0: as fast as possible."""
+    users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
+    """User → password."""
+    leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
+    """Receiver → the slot whose state it learns."""
+    acknowledgements: WayBackSpec | None = field(
+        metadata=entry(_WAY_BACK, lambda found: None if found is None else WayBackSpec(**found))
+    )
+    controller: Wiring | None = field(metadata=inner(Wiring, or_null=True))
+    zid: str | None = field(metadata=entry(maybe(text)))
+    """The router's Zenoh id, if there is a relay."""
+    limits: Mapping[str, int] = field(metadata=entry(_SIZES))
+    """Kind of key → bytes of its largest message."""
+    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    """The folder in which modules of own classes are looked for first."""
+
+
+@dataclass(frozen=True)
+class RelayPart:
+    """What the relay knows."""
+
+    role: ClassVar[str] = "relay"
+    users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
+    """User of its site → password."""
+    receivers: Sequence[str] = field(metadata=entry(_TEXTS))
+    listen: str = field(metadata=entry(text))
+    """The endpoint where it listens."""
+    zid: str = field(metadata=entry(text))
+    """The router's Zenoh id."""
+    controller: Wiring | None = field(metadata=inner(Wiring, or_null=True))
+    limits: Mapping[str, int] = field(metadata=entry(_SIZES))
+    """As the router's."""
+
+
+@dataclass(frozen=True)
+class SensorPart:
+    """What the sensor knows."""
+
+    role: ClassVar[str] = "sensor"
+    scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
+    """`scheme`, its name, and its parameters."""
+    pace: float = field(metadata=entry(positive))
+    """As the router's."""
+    receivers: Sequence[str] = field(metadata=entry(_TEXTS))
+    holds: Sequence[int] = field(metadata=entry(listed(SLOT)))
+    """Slots before which it holds."""
+    history: int = field(metadata=entry(_WINDOW))
+    """Slots before the first that is not done which a restarted router must receive again."""
+    leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
+    """As the router's."""
+    chart: Chart | None = field(metadata=entry(_CHART, lambda found: None if found is None else Chart(**found)))
+    """Of its watch for attacks on acknowledgements."""
+    plant: SensorPlantEntry | None = field(metadata=inner(SensorPlantEntry, or_null=True))
+    controller: SensorLoop | None = field(metadata=inner(SensorLoop, or_null=True))
+    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    """As the router's."""
+
+
+@dataclass(frozen=True)
+class LegitimatePart:
+    """What the legitimate estimator knows."""
+
+    role: ClassVar[str] = "legitimate"
+    scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
+    """As the sensor's."""
+    window: int = field(metadata=entry(_WINDOW))
+    """Slots by which a packet may be late."""
+    outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
+    """First slot, first slot after, and whether it keeps its state."""
+    controller: EstimatorLoop | None = field(metadata=inner(EstimatorLoop, or_null=True))
+    """None if it has no part in the loop."""
+    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    """As the router's."""
+    state_file: str | None = field(default=None, metadata=entry(text, left_out=True))
+    """The file in which it keeps its state."""
+
+
+@dataclass(frozen=True)
+class EavesdropperPart:
+    """What an eavesdropper knows."""
+
+    role: ClassVar[str] = "eavesdropper"
+    strategy: str = field(metadata=entry(text))
+    parameters: Mapping[str, Any] = field(metadata=entry(named(anything)))
+    """Of the strategy."""
+    window: int = field(metadata=entry(_WINDOW))
+    """As the legitimate estimator's."""
+    outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
+    """As the legitimate estimator's."""
+    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    """As the router's."""
+    state_file: str | None = field(default=None, metadata=entry(text, left_out=True))
+    """As the legitimate estimator's."""
+
+
+@dataclass(frozen=True)
+class ControllerPart:
+    """What the controller knows."""
+
+    role: ClassVar[str] = "controller"
+    strategy: str = field(metadata=entry(text))
+    assignment: AssignmentEntry = field(metadata=inner(AssignmentEntry))
+    acts_on: str = field(metadata=entry(text))
+    """As in `Wiring`."""
+    plant: PlantEntry = field(metadata=inner(PlantEntry))
+    disturbances: str = field(metadata=entry(text))
+    """As `brief_closed_loop.encoded`."""
+
+
+@dataclass(frozen=True)
+class ObserverPart:
+    """What the observer knows: everything."""
+
+    role: ClassVar[str] = "observer"
+    scenario: Mapping[str, Any] = field(repr=False, metadata=entry(named(anything)))
+    """The whole scenario, with its seed."""
+    results: str = field(metadata=entry(text))
+    """The results folder."""
+    recording: bool = field(metadata=entry(flag))
+    """Whether to write a recording for the view."""
+    operator: str = field(repr=False, metadata=entry(text))
+    """The operator's password."""
+    shard: bool = field(metadata=entry(flag))
+    """Whether the run is a shard of a larger one."""
+    operator_identity: Identity | None = field(metadata=inner(Identity, or_null=True))
+    classes: Mapping[str, Mapping[str, Any]] = field(metadata=entry(named(named(anything))))
+    """The answers of eavesdroppers' own classes, question → answer."""
+
+
+RoutingPart = RouterPart | RelayPart
+ReceiverPart = LegitimatePart | EavesdropperPart
+ImportingPart = RouterPart | SensorPart | LegitimatePart | EavesdropperPart
+"""Of roles that may import own classes."""
+Part = RouterPart | RelayPart | SensorPart | LegitimatePart | EavesdropperPart | ControllerPart | ObserverPart
+PARTS: Mapping[str, type[Part]] = {
+    kind.role: kind
+    for kind in (RouterPart, RelayPart, SensorPart, LegitimatePart, EavesdropperPart, ControllerPart, ObserverPart)
+}
+"""Role → its part."""
