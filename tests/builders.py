@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import Part
 from evedrop.model.process import Process
 from evedrop.results.writer import Results, load_results
 from evedrop.streams import root_of_seed, stream_key
+
+P = TypeVar("P", bound=Part)
 
 UNSTABLE = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), 1e-3 * np.eye(2), np.eye(2))
 """The paper's numerical illustration, with Σ0 = I."""
@@ -56,3 +60,9 @@ def digests_of(results: Results | Path) -> dict[str, str]:
     """Receiver → its digest, of results or of the folder that has them."""
     found = results if isinstance(results, Results) else load_results(results)
     return {name: peer["digest"] for name, peer in found.summary["peers"].items()}
+
+
+def part_of(brief: AnyBrief, kind: type[P]) -> P:
+    """The part of a brief, which must be one of this role."""
+    assert isinstance(brief.part, kind)
+    return brief.part

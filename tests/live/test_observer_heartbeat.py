@@ -31,7 +31,7 @@ elif not sys.orig_argv[-1].endswith('.json'):
     honest = children.Children.news
     def news(self, seconds):
         if self.started:
-            children.SILENCE_SECONDS = launcher.SILENCE_SECONDS = {silence}
+            children.SILENCE_SECONDS = process_set.SILENCE_SECONDS = {silence}
         return honest(self, seconds)
     children.Children.news = news
 """

@@ -12,13 +12,14 @@ from evedrop import montecarlo, run
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.expected.expectations import expectations_of
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.protocol.brief_parts import RouterPart, SensorPart
 from evedrop.loading import checked
 from evedrop.memory.montecarlo import check_mode
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.numeric.detection import Chart
 from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection, chart_of
-from tests.builders import digests_of
+from tests.builders import digests_of, part_of
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
@@ -107,7 +108,7 @@ def test_who_is_given_what(scheme: str) -> None:
     assert briefs["naive"].keys == briefs["ref"].keys == briefs["spy"].keys == {}
     holders = {name for name, one in briefs.items() if "link/acknowledgements" in one.keys}
     assert holders == ({"router"} if scheme in NEEDS else set())
-    assert briefs["router"].part.leaks == briefs["sensor"].part.leaks == {"spy": 9}
+    assert part_of(briefs["router"], RouterPart).leaks == part_of(briefs["sensor"], SensorPart).leaks == {"spy": 9}
     assert {one.model.header for one in briefs.values()} == {len(kind.header)}
 
 

@@ -23,6 +23,7 @@ from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import AnyBrief, Flow
+from evedrop.live.protocol.brief_parts import SensorPart
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks, Digests
@@ -31,6 +32,7 @@ from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
 from evedrop.scenario import Scenario
+from tests.builders import part_of
 from tests.conftest import LIMIT
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
@@ -180,7 +182,12 @@ def deliveries(count: int = SLOTS) -> list[bytes]:
     return made
 
 
-RECEIVERS = {"legitimate": estimate, "naive": eavesdrop, "smart": eavesdrop, "suspicious": eavesdrop}
+RECEIVERS: dict[str, Callable[[Any], None]] = {
+    "legitimate": estimate,
+    "naive": eavesdrop,
+    "smart": eavesdrop,
+    "suspicious": eavesdrop,
+}
 
 
 @pytest.mark.parametrize("name", RECEIVERS)
@@ -304,7 +311,8 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
     stage.fill(RunKeys("r").downlink("legitimate"), [delivered(k) for k in slots])
     stage.commands.put(wire.control("end"))
-    estimate(brief)
+    part_of(brief, LegitimatePart)
+    RECEIVERS["legitimate"](brief)
     expected = [packets.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
     assert stage.all(RunKeys("r").acknowledged) == expected
 
@@ -365,7 +373,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     assert stage.put.empty()
     stage.commands.put(wire.control("start"))
     sensing.packets(0, WINDOW)
-    everybody = [*brief.part.receivers, "observer"]
+    everybody = [*part_of(brief, SensorPart).receivers, "observer"]
     assert len(everybody) == 5
     sent = WINDOW
     for done in (
@@ -388,11 +396,11 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
 def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     """All packets from the slot that is asked for on, and as many before it as the router needs, after a word of them."""
     brief = briefs()["sensor"]
-    brief = replace(brief, part=replace(brief.part, history=3))
+    brief = replace(brief, part=replace(part_of(brief, SensorPart), history=3))
     sensing = Sensing(stage, brief)
     stage.commands.put(wire.control("start"))
     sensing.packets(0, WINDOW)
-    for name in (*brief.part.receivers, "observer"):
+    for name in (*part_of(brief, SensorPart).receivers, "observer"):
         sensing.progress(name, 8)
     sensing.packets(WINDOW, WINDOW + 8)
     stage.kept[sensing.keys.uplink].again(4, 10)

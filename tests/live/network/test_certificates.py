@@ -64,13 +64,13 @@ def expired() -> Identity:
     return Authority("old", datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=365)).identity(EVE)
 
 
-def identity_of(brief: Brief) -> Identity:
+def identity_of(brief: AnyBrief) -> Identity:
     """The identity in a brief of a run with certificates."""
     assert brief.identity is not None
     return brief.identity
 
 
-STRANGERS: dict[str, Callable[[Brief], Identity]] = {
+STRANGERS: dict[str, Callable[[AnyBrief], Identity]] = {
     "of another run": lambda _: Authority("r00000000").identity(EVE),
     "self-signed": lambda _: self_signed(),
     "expired": lambda _: expired(),

@@ -17,9 +17,11 @@ from evedrop.errors import MalformedMessage
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.operator import Answer, Request, ask, read_request
 from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
+from tests.builders import part_of
 from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -36,7 +38,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def operator(stage: Bench) -> AnyBrief:
     """The operator's credentials, as an observer's brief would have them."""
     observer = stage.briefs["observer"]
-    return replace(observer, process="operator", user="operator", password=observer.part.operator)
+    return replace(observer, process="operator", user="operator", password=part_of(observer, ObserverPart).operator)
 
 
 def control(stage: Bench, **changes: Any) -> Control:

@@ -14,11 +14,12 @@ import pytest
 from evedrop.errors import MalformedMessage
 from evedrop.kernels.elementary import normal_quantile
 from evedrop.live.network import operator
-from evedrop.live.network.access import Wiring, grants
+from evedrop.live.network.access import grants
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import envelope, packets, telemetry
 from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import BeliefLog, Blocks, RunDigest

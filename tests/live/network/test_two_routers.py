@@ -21,9 +21,11 @@ from evedrop.live.network.session import client_config
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import RelayPart, RouterPart
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
+from tests.builders import part_of
 from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 EVE = "eve"
@@ -131,7 +133,7 @@ def test_who_belongs_to_the_relay_is_not_let_in_at_the_router(who: str, stage: B
 def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
     """A process that connects to the relay with the router's Zenoh id, which it may have learnt, is not taken for the router."""
     eve: AnyBrief = stage.briefs[EVE]
-    config = {**client_config(eve), "id": stage.briefs["router"].part.zid, "mode": "router"}
+    config = {**client_config(eve), "id": part_of(stage.briefs["router"], RouterPart).zid, "mode": "router"}
     stolen = Ear()
     try:
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as attacker:
@@ -150,8 +152,8 @@ def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
 def test_each_process_has_its_own_place(stage: Bench) -> None:
     """The sensor and the relay connect to the router, all others to the relay; each router knows those it lets in, and itself."""
     router, relay = stage.briefs["router"], stage.briefs["relay"]
-    assert set(router.part.users) == {"router", "sensor", "relay"}
-    assert set(relay.part.users) == {*RECEIVERS, "relay", "observer", "operator"}
+    assert set(part_of(router, RouterPart).users) == {"router", "sensor", "relay"}
+    assert set(part_of(relay, RelayPart).users) == {*RECEIVERS, "relay", "observer", "operator"}
     assert {name for name, brief in stage.briefs.items() if brief.router == router.router} == {
         "router",
         "relay",
