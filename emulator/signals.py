@@ -15,6 +15,7 @@ from types import FrameType
 
 from evedrop.interrupts import INTERRUPTED, SIGNALS, heeded, leave
 
+
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread."""
