@@ -27,7 +27,7 @@ if sys.orig_argv[-1].endswith('/observer.json'):
     heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
 elif not sys.orig_argv[-1].endswith('.json'):
     import evedrop.live.launch.children as children
-    import evedrop.live.launch.launcher as launcher
+    import evedrop.live.launch.process_set as process_set
     honest = children.Children.news
     def news(self, seconds):
         if self.started:

@@ -23,7 +23,7 @@ from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import AnyBrief, Flow
-from evedrop.live.protocol.brief_parts import SensorPart
+from evedrop.live.protocol.brief_parts import LegitimatePart, SensorPart
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks, Digests
