@@ -80,7 +80,7 @@ def misses(
 ) -> list[str]:
     """What was promised and does not hold, now that the launcher has ended; hits: the faults that hit something."""
     left = ours.none_left(before, _LEAVE_SECONDS)
-    found = [f"process {one.pid} is left: {' '.join(one.words)[:120]}" for one in left]
+    found = [f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left]
     ours.end_all(left)
     status = run.launcher.returncode
     found += _of_status(status, run, hits, longest_outage)

@@ -83,6 +83,24 @@ def none_left(before: frozenset[int], seconds: float) -> list[Process]:
         time.sleep(0.05)
 
 
+def doing(pid: int) -> str:
+    """What a process waits for, by thread, and what else holds its standard input: why it did not end."""
+    try:
+        stdin = os.readlink(f"/proc/{pid}/fd/0")
+        waits = [
+            f"{(task / 'stat').read_text().rpartition(')')[2].split()[0]} {(task / 'wchan').read_text()}"
+            for task in sorted(Path(f"/proc/{pid}/task").iterdir())
+        ]
+    except OSError as error:
+        return f"it ended meanwhile ({error})"
+    holders = []
+    for fd in Path("/proc").glob("[0-9]*/fd/*"):
+        with suppress(OSError):
+            if os.readlink(fd) == stdin and fd.parts[2] != str(pid):
+                holders.append(fd.parts[2])
+    return f"threads: {', '.join(waits)}; standard input {stdin}, also held by {', '.join(sorted(set(holders))) or 'nobody'}"
+
+
 def end_all(processes: list[Process]) -> None:
     """End what a failed case has left."""
     for one in processes:
