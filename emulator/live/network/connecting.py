@@ -27,6 +27,8 @@ _ATTEMPT_SECONDS = 3.0
 _UNKNOWN_HOST_SECONDS = 2.5  # the name of a host that is just starting may not be known yet
 _REFUSALS, _REFUSED_SECONDS = 4, 1.5  # a router that is just starting may hang up once
 _QUICK_SECONDS = 2.0  # a refusal comes at once; a slower failure means that the machine is busy
+_IDLE_SECONDS = 1.0  # a router keeps a connection at least so long on which nothing is said
+_AT_ONCE_SECONDS = 0.1
 
 _NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of OpenSSL's X509_V_ERR
 
@@ -105,6 +107,8 @@ def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None
                     f"the router's host {endpoint.host} is not known here ({why}); write it into /etc/hosts, or write the "
                     "briefs again with --connect and a name or address that this host knows"
                 ) from error
+            if failures.refused and _cut_off(endpoint):
+                failures = Failures()
             if failures.refused:
                 raise BriefError(
                     f"{door.router} does not let this brief in, which is of run {door.run}: the router there is of another run, "
@@ -154,6 +158,31 @@ class Failures:
             and self._refusals >= _REFUSALS
             and time.monotonic() - self._refused > _REFUSED_SECONDS
         )
+
+
+def _cut_off(endpoint: Endpoint) -> bool:
+    """Whether it is the network that ends connections, not the program there: it ends those on which nothing is said, too.
+
+    A program that hangs up on everybody does it at once.
+    """
+    longest = 0.0
+    for _ in range(3):
+        began = time.monotonic()
+        try:
+            link = socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS)
+        except OSError:
+            return True
+        with link:
+            link.settimeout(_IDLE_SECONDS)
+            try:
+                if link.recv(1):
+                    return False
+            except TimeoutError:
+                return False
+            except OSError:
+                pass
+        longest = max(longest, time.monotonic() - began)
+    return longest > _AT_ONCE_SECONDS
 
 
 def endpoint_of(router: str, identity: Identity | None) -> Endpoint:

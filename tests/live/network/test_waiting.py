@@ -1,8 +1,12 @@
-"""A process that waits for its router says so."""
+"""A process that waits for its router says so, and takes no cut connection for a refusal."""
 
 from __future__ import annotations
 
+import contextlib
 import re
+import socket
+import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +15,7 @@ import pytest
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network import connecting
+from evedrop.live.network.connecting import RouterAddress
 from evedrop.live.network.session import Session
 from evedrop.ports import free_port
 from tests.live.network.bench import scenario_of
@@ -29,3 +34,40 @@ def test_a_process_says_that_it_waits_for_its_router(
     line = rf"evedrop: eve: waiting for the router at {endpoint}: no answer yet \((0|1) s; Connection refused\)"
     assert [bool(re.fullmatch(line, one)) for one in said] == [True] * len(said)
     assert 2 <= len(said) <= 4
+
+
+@contextlib.contextmanager
+def listener(lasting: float | None) -> Iterator[RouterAddress]:
+    """A listener that ends every connection after so many seconds, or the one who connects ends it."""
+    with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as links:
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    link = links.enter_context(server.accept()[0])
+                    if lasting is not None:
+                        threading.Timer(lasting, lambda link=link: link.shutdown(socket.SHUT_RDWR)).start()
+
+        threading.Thread(target=accept, daemon=True).start()
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        config = {
+            "mode": "client",
+            "connect": {"endpoints": [endpoint], "timeout_ms": 0, "exit_on_failure": True},
+            "scouting": {"multicast": {"enabled": False}},
+            "transport": {"unicast": {"open_timeout": 500}},
+        }
+        yield RouterAddress(endpoint, "r01", config)
+        server.shutdown(socket.SHUT_RDWR)
+
+
+def test_a_network_that_cuts_connections_is_no_refusal() -> None:
+    """Connections that flap are lost in the middle of a handshake, as of a router that refuses; an idle one is lost as well."""
+    with listener(0.3) as door, pytest.raises(RunError, match="no router answered"):
+        connecting.connected(door, 6.0)
+
+
+@pytest.mark.parametrize("lasting", [0.0, None], ids=["hangs up on everybody", "says nothing"])
+def test_what_ends_connections_by_itself_is_not_the_network(lasting: float | None) -> None:
+    """A program that hangs up at once, and one, as a router that refused a brief, that keeps an idle connection."""
+    with listener(lasting) as door:
+        assert not connecting._cut_off(connecting.endpoint_of(door.router, None))

@@ -9,14 +9,15 @@ import argparse
 import contextlib
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.commands import loaded
+from evedrop.cli.command import Command
+from evedrop.cli.commands import ROLES
+from evedrop.cli.options import Option, argument, entries, loaded, scenario, served
 from evedrop.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from evedrop.live.protocol.brief import AnyBrief, Brief
     from evedrop.live.protocol.brief_parts import ObserverPart
 
@@ -144,3 +145,60 @@ def health(options: argparse.Namespace) -> int:
     there = is_there(brief)
     print(f"{brief.process} is {'' if there else 'not '}on the network of {brief.run}")
     return 0 if there else 1
+
+
+def _observed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
+
+
+def _briefs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the briefs")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="the observer's results folder, on its host; relative to its working directory",
+    )
+    parser.add_argument(
+        "--listen",
+        default="tcp/127.0.0.1:17447",
+        metavar="ENDPOINT",
+        help="the endpoint where the router listens, such as tls/router.lan:7447",
+    )
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="the endpoint that the others connect to; default that of --listen"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, if the scenario has two")
+    parser.add_argument(
+        "--relay-connect",
+        metavar="ENDPOINT",
+        help="the endpoint that its processes connect to; default that of --relay",
+    )
+    parser.add_argument(
+        "--wait", type=int, default=600, metavar="SECONDS", help="how long processes wait for each other; default 600"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
+    )
+
+
+def _role(role: str) -> Option:
+    return lambda parser: parser.set_defaults(role=role)
+
+
+_BRIEF = argument("brief", "BRIEF")
+
+COMMANDS = (
+    Command("brief", brief, "write the briefs, to start the processes by hand", (scenario, entries, _briefs)),
+    Command("health", health, "whether the process of a brief is on the network", (_BRIEF,)),
+    *(
+        Command(
+            role,
+            process,
+            f"one process of a run, the {role}",
+            (_BRIEF, _role(role), *((_observed, served) if role == "observer" else ())),
+        )
+        for role in ROLES
+    ),
+)

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from evedrop.cli.command import Command
+from evedrop.cli.options import as_json
 from evedrop.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
@@ -157,3 +159,30 @@ def _lines(found: dict[str, Any]) -> list[str]:
         lines.append(f"link {name}: {one['delivered']} of {one['offered']} packets delivered, {fraction}")
     lines += [f"event at slot {one['slot']}: {one['event']} (by the {one['by']})" for one in found["events"]]
     return lines
+
+
+def _going_on(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run in progress")
+
+
+def _changed_link(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is")
+    parser.add_argument(
+        "changes",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
+    )
+
+
+def _slots(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("slots", type=int, metavar="N", help="number of slots")
+
+
+COMMANDS = (
+    Command("link", link, "change, cut or heal a link of a run in progress", (_going_on, _changed_link)),
+    Command("pause", pause, "hold a run in progress between two slots", (_going_on,)),
+    Command("resume", resume, "let a held run go on", (_going_on,)),
+    Command("step", step, "let a run go on for some slots, and hold it again", (_going_on, _slots)),
+    Command("status", status, "the status of a run in progress", (_going_on, as_json)),
+)

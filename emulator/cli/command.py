@@ -1,0 +1,23 @@
+"""A command of the command line."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from evedrop.cli.options import Option
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: its name, the function that carries it out, its description, and its options."""
+
+    name: str
+    run: Callable[[argparse.Namespace], int]
+    """Takes the options, and returns the exit status. Slow imports belong into it: all commands are loaded for `--help`."""
+    does: str
+    """In a few words, for `--help`."""
+    options: tuple[Option, ...] = ()
+    group: str | None = None
+    """The word before its name, if it is one of several commands about the same thing."""

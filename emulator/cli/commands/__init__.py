@@ -1,0 +1,40 @@
+"""The commands, one module for each or for a few that belong together. A module has a tuple `COMMANDS`.
+
+An installed package adds commands by an entry point of the group `evedrop.commands` that names such a module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
+"""The roles of processes; each is a command that runs one."""
+
+GROUP = "evedrop.commands"
+
+MODULES: Mapping[str, str] = {
+    "list": "scenarios",
+    "new": "scenarios",
+    "demo": "run",
+    "run": "run",
+    "montecarlo": "montecarlo",
+    "link": "steer",
+    "pause": "steer",
+    "resume": "steer",
+    "step": "steer",
+    "status": "steer",
+    "sweep": "sweep",
+    "compare": "compare",
+    "design": "design",
+    "figures": "figures",
+    "view": "view",
+    "diff": "diff",
+    "test": "testing",
+    "check": "check",
+    "links": "links",
+    "selftest": "selftest",
+    "brief": "process",
+    "health": "process",
+    **dict.fromkeys(ROLES, "process"),
+}
+"""First word of a command → its module in this package, in the order of `--help`."""

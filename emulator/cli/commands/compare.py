@@ -1,0 +1,74 @@
+"""`evedrop compare`: every scheme against every adversary."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from evedrop.cli.command import Command
+from evedrop.cli.options import changes_of, entries, output, scenario
+from evedrop.errors import UsageError
+
+
+def compare(options: argparse.Namespace) -> int:
+    """Compare schemes and adversaries."""
+    from evedrop.api import compare as compare_all
+    from evedrop.cli.comparison_report import print_comparison
+    from evedrop.cli.report import ProgressLine
+    from evedrop.loading import value_of
+    from evedrop.memory.montecarlo import Plan
+    from evedrop.results.folder import results_folder
+
+    changes = changes_of(options)
+    parameters = {}
+    for text in options.parameters:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(
+                f"--with {text}: expected SCHEME.PARAMETER=VALUE, such as innovation.state_probability=0.7"
+            )
+        parameters[key] = value_of(value)
+    with (
+        results_folder(options.out, f"compare-{Path(options.scenario).name}") as folder,
+        ProgressLine(0, "trial-slots", options.json) as line,
+    ):
+        found = compare_all(
+            options.scenario,
+            schemes=_names(options.schemes),
+            adversaries=_names(options.adversaries),
+            parameters=parameters,
+            out=folder,
+            plan=Plan(workers=options.workers),
+            tell=line.tell,
+            **{"trials": 200, **changes},
+        )
+    if options.json:
+        print(found.as_json(indent=None))
+    else:
+        print_comparison(found, str(folder))
+    return 0
+
+
+def _names(listed: str | None) -> list[str] | None:
+    return None if listed is None else [name.strip() for name in listed.split(",")]
+
+
+def _compares(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--schemes", metavar="A,B", help="default all")
+    parser.add_argument("--adversaries", metavar="X,Y", help="default all")
+    parser.add_argument(
+        "--with",
+        dest="parameters",
+        action="append",
+        default=[],
+        metavar="SCHEME.PARAMETER=VALUE",
+        help="a parameter of a scheme other than the scenario's own; repeatable",
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of worker processes; does not affect the results"
+    )
+
+
+COMMANDS = (
+    Command("compare", compare, "every scheme against every adversary", (scenario, entries, output, _compares)),
+)

@@ -1,0 +1,35 @@
+"""`evedrop montecarlo`: the trials of a scenario in memory."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+
+from evedrop.cli.command import Command
+from evedrop.cli.in_memory import MEMORY, plan_of
+from evedrop.cli.options import loaded, print_so_far, scenario
+from evedrop.errors import Interrupted
+
+
+def montecarlo(options: argparse.Namespace) -> int:
+    """Run the trials of a scenario in memory."""
+    from evedrop.cli.report import ProgressLine
+    from evedrop.memory.montecarlo import simulate
+    from evedrop.results.folder import results_folder
+
+    options.trials = 1000 if options.trials is None else options.trials
+    plan = plan_of(options)
+    scenario = loaded(options, beyond_horizon=options.mode != "exact")
+    with results_folder(options.out, options.scenario) as folder:
+        with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
+            try:
+                status = simulate(scenario, folder, line.tell, plan)
+            except Interrupted:
+                with contextlib.suppress(OSError):  # as above
+                    print_so_far(line.moved or folder, options.json)
+                raise
+        print_so_far(line.moved or folder, options.json)
+    return status
+
+
+COMMANDS = (Command("montecarlo", montecarlo, "the same trials in memory (default 1000)", (scenario, *MEMORY)),)

@@ -1,0 +1,70 @@
+"""`evedrop run` and `evedrop demo`: live runs."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+from evedrop.cli.command import Command
+from evedrop.cli.holding import hold
+from evedrop.cli.options import entries, loaded, output, print_so_far, scenario
+from evedrop.errors import Interrupted, RunError
+
+if TYPE_CHECKING:
+    from evedrop.view.viewer import Viewer
+
+
+def demo(options: argparse.Namespace) -> int:
+    """Run `vehicle` live."""
+    options.scenario = "vehicle"
+    return run(options)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run a scenario live."""
+    from evedrop.cli.report import ProgressLine
+    from evedrop.live.launch.launcher import launch
+    from evedrop.results.folder import results_folder
+
+    scenario = loaded(options)
+    with results_folder(options.out, options.scenario) as folder:
+        with ProgressLine(scenario.slots, "slots", options.json) as line:
+            try:
+                ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
+            except (RunError, Interrupted):
+                with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
+                    print_so_far(line.moved or folder, options.json)
+                raise
+        print_so_far(ended.folder, options.json)
+    if ended.viewer is not None:
+        _keep_open(ended.viewer)
+    return ended.status
+
+
+def _keep_open(viewer: Viewer) -> None:
+    """Keep the view open until it is closed or Ctrl-C, if started from a terminal; otherwise end it with the command."""
+    if sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
+        where = f" at {viewer.address}" if viewer.address else ""
+        print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
+        hold(viewer)
+    else:
+        viewer.stop()
+
+
+def _live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
+    parser.add_argument(
+        "--listen", metavar="ENDPOINT", help="the router's endpoint: tcp/127.0.0.1:PORT or tls/127.0.0.1:PORT"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
+
+
+_LIVE = (entries, output, _live)
+
+
+COMMANDS = (
+    Command("demo", demo, "the shipped scenario `vehicle`, live, in real time, with the view", _LIVE),
+    Command("run", run, "a live run: processes, network, view, results", (scenario, *_LIVE)),
+)

@@ -1,0 +1,45 @@
+"""`evedrop sweep`: Monte Carlo over a grid."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from evedrop.cli.command import Command
+from evedrop.cli.in_memory import MEMORY, plan_of
+from evedrop.cli.options import changes_of, scenario
+
+
+def sweep(options: argparse.Namespace) -> int:
+    """Run Monte Carlo over a grid."""
+    from evedrop.cli.report import ProgressLine, print_sweep
+    from evedrop.results.folder import results_folder
+    from evedrop.studies.sweep import grid_of, sweep_over
+
+    options.trials = 1000 if options.trials is None else options.trials
+    grid = grid_of(options.over)
+    plan = plan_of(options)
+    with (
+        results_folder(options.out, f"{Path(options.scenario).stem}-sweep") as folder,
+        ProgressLine(0, "trial-slots", options.json) as line,
+    ):
+        table = sweep_over(options.scenario, changes_of(options), grid, folder, line.tell, plan)
+    if options.json:
+        print(json.dumps(table.to_pylist(), ensure_ascii=False))
+    else:
+        print_sweep(table, tuple(grid), str(folder))
+    return 0
+
+
+def _over(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--over",
+        action="append",
+        required=True,
+        metavar="KEY=VALUES",
+        help="an entry and its values, first:last:step or a,b,c; repeatable",
+    )
+
+
+COMMANDS = (Command("sweep", sweep, "Monte Carlo over a grid of values of any entries", (scenario, _over, *MEMORY)),)

@@ -1,0 +1,113 @@
+"""What several commands share: options, the scenario with its changes, and the report of a run.
+
+Slow imports are made only when they are needed, so that `evedrop --help` and a peer start quickly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.scenario import Scenario
+
+Option = Callable[[argparse.ArgumentParser], None]
+"""A function that adds an option, or several, to a command's parser."""
+
+_SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
+
+
+def argument(name: str, shown: str) -> Option:
+    """A path that a command takes."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument(name, type=Path, metavar=shown)
+
+    return add
+
+
+def scenario(parser: argparse.ArgumentParser) -> None:
+    """The scenario."""
+    parser.add_argument("scenario", metavar="SCENARIO", help="a shipped name, a file, or a results folder")
+
+
+def changes(parser: argparse.ArgumentParser) -> None:
+    """Changes of the scenario by dotted key."""
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=_SET_HELP)
+
+
+def entries(parser: argparse.ArgumentParser) -> None:
+    """Changes by dotted key, and options of their own for the entries that are changed most."""
+    changes(parser)
+    for name, what in (
+        ("seed", "seed of all random numbers"),
+        ("slots", "number of slots"),
+        ("trials", "number of trials"),
+        ("first-trial", "number of the first trial"),
+        ("record-trials", "how many trials are recorded in full"),
+    ):
+        parser.add_argument(f"--{name}", type=int, metavar="N", help=what)
+    parser.add_argument("--pace", type=float, metavar="SECONDS", help="seconds per slot; 0 = as fast as possible")
+    parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that is not derived from the seed")
+
+
+def output(parser: argparse.ArgumentParser) -> None:
+    """The results folder, and JSON."""
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
+    parser.add_argument("--json", action="store_true", help="print only the summary, as JSON, on standard output")
+
+
+def as_json(parser: argparse.ArgumentParser) -> None:
+    """JSON instead of text."""
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def served(parser: argparse.ArgumentParser) -> None:
+    """Where a run is shown to browsers."""
+    parser.add_argument(
+        "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
+    )
+
+
+def changes_of(options: argparse.Namespace) -> dict[str, Any]:
+    """The changes of the scenario that `changes` or `entries` took. Raises UsageError for one that is none."""
+    from evedrop.loading import value_of
+
+    changes: dict[str, Any] = {}
+    for change in options.changes:
+        key, equals, value = change.partition("=")
+        if not equals or not key:
+            raise UsageError(f"--set {change}: expected KEY=VALUE, such as --set legitimate.link.quality=0.8")
+        changes[key] = value_of(value)
+    for name in ("seed", "slots", "trials", "first_trial", "record_trials", "pace"):
+        value = getattr(options, name, None)
+        if value is not None:
+            changes[name] = value
+    if getattr(options, "secret", None) is not None:
+        changes["secret_file"] = str(options.secret.absolute())
+    return changes
+
+
+def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
+    """Load the scenario of a command, with its changes; prints warnings."""
+    from evedrop.expected.estimates import warnings_of
+    from evedrop.loading import load
+
+    scenario = load(options.scenario, changes_of(options), beyond_horizon=beyond_horizon)
+    for warning in warnings_of(scenario):
+        print(f"evedrop: warning: {warning}", file=sys.stderr)
+    return scenario
+
+
+def print_so_far(folder: Path, as_json: bool) -> None:
+    """Print the closing report of a run, if it has results."""
+    from evedrop.cli.closing_report import print_results
+
+    with contextlib.suppress(UsageError):
+        print_results(folder, as_json)
