@@ -64,6 +64,20 @@ def finish() -> None:
         silence()
 
 
+def let_go() -> None:
+    """Flush both streams for the last time.
+
+    What nobody can read any more is discarded, or the interpreter would exit with a status of its own.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except (OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def silence() -> None:
     """Discard further standard output, including the flush when the interpreter exits."""
     if sys.stdout is not None:

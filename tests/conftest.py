@@ -223,7 +223,12 @@ class Evedrop:
         )
 
     def __call__(self, *arguments: str) -> Done:
-        """Type a command and wait for its end. It runs in this process: most of a short one's time goes into imports."""
+        """Type a command and wait for its end. It runs in this process: most of a short one's time goes into imports.
+
+        A process of a run does not: a signal would end it at once, and so this one.
+        """
+        if cli.is_role(arguments):
+            return self.process(*arguments)
         with (
             contextlib.chdir(self.folder),
             patch.dict(os.environ, self.environment),

@@ -38,9 +38,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
         ]
     try:
         step = settled_of(process, plant)
-    except ValidationError:
-        return []
-    except ValueError:  # a mistake in the plant, reported elsewhere
+    except ValueError:  # a mistake in process or plant, reported elsewhere
         return []
     process["Q"] = step.innovation.tolist()
     process["singular_noise"] = is_singular(step.innovation)
@@ -49,7 +47,8 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
 
 def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterStep:
     """The steady state of the tables' filter. Raises ValidationError or ValueError if it does not exist."""
-    made = ProcessTable.model_validate({**process, "Q": np.eye(len(process["A"])).tolist(), "singular_noise": False})
+    n = len(process["A"]) if isinstance(process.get("A"), list) else 1
+    made = ProcessTable.model_validate({**process, "Q": np.eye(n).tolist(), "singular_noise": False})
     table = PlantTable.model_validate(without_disturbances(plant))
     A, n = np.array(made.A), len(made.A)
     if table.output_matrix is None or measured_mistakes(plant, n):

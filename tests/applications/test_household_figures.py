@@ -54,7 +54,7 @@ def tables(**changes: Any) -> dict[str, Any]:
         ({"household__stove": "x"}, "household.stove: "),
         ({"expect": [{"figure": "household.bought", "below": 1.0}]}, 'expect.0.figure: is "household.bought"; expected hous'),
         ({"expect": [{"figure": "household.adam.activity_area", "below": 1.0}]}, "expect.0.figure: is "),
-        ({"expect": [{"figure": "household.sold_energy", "below": 1.0, "slots": [0, 2]}]}, "expect.0.slots: is set, but a"),
+        ({"expect": [{"figure": "household.sold_energy", "below": 1.0, "slots": [0, 2]}]}, "expect.0.slots: is set, but the"),
         ({"household": None, "expect": [{"figure": "household.sold_energy", "below": 1.0}]}, "expect.0.figure: is "),
     ],
 )  # fmt: skip

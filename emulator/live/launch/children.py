@@ -89,6 +89,8 @@ class Children:
         self._private = private
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
+        self._unread = 0
+        """How many processes were started again and have not joined the run yet; they may not have read their briefs."""
         self.silent_seconds = 0.0
         """For how long the observer has been silent."""
         self.started = False
@@ -126,6 +128,7 @@ class Children:
         """
         conducts = brief.role == "observer"
         self._briefs[brief.process] = brief
+        self._unread += again
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:
             state_file = str((self._private / f"{brief.process}.state").absolute())
             brief = replace(brief, part=replace(brief.part, state_file=state_file))
@@ -213,8 +216,10 @@ class Children:
             return news
         self.silent_seconds = 0.0
         if news["event"] in {"started", "back", "reconnected"}:
+            self._unread = max(0, self._unread - self.started)
             self.started = True
-            self._forget_briefs()
+            if not self._unread:
+                self._forget_briefs()
         if news["event"] == ProcessRequest.event:
             self.act(ProcessRequest.of(news))
             return None
@@ -223,7 +228,7 @@ class Children:
         return None if news["event"] in {"alive", "over", "finishing", "back"} else news
 
     def _forget_briefs(self) -> None:
-        """Delete the briefs: every process has read its own, and the keys should not stay on disk."""
+        """Delete the briefs: every process has read its own by now, and the keys should not stay on disk."""
         for path in self._private.glob("*.json"):
             path.unlink(missing_ok=True)
 

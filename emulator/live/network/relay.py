@@ -11,7 +11,7 @@ from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.linked_routers import at_relay
 from evedrop.live.network.router_users import until_all_left, users_file
-from evedrop.live.network.session import Session, client_config, door_of, router_config
+from evedrop.live.network.session import ATTEMPT, Session, client_config, door_of, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
 
@@ -47,5 +47,5 @@ def _config(brief: Brief[RelayPart], users: str, access: dict[str, Any]) -> dict
     return {
         **listening,
         "connect": {**connecting["connect"], "timeout_ms": -1, "exit_on_failure": False},
-        "transport": {**listening["transport"], "auth": auth},
+        "transport": {**listening["transport"], "auth": auth, "unicast": dict(ATTEMPT)},
     }

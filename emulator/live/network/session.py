@@ -14,7 +14,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -48,6 +48,8 @@ _SENT_BYTES = 1 << 20  # under way to one reader: a full buffer would keep Zenoh
 _NEVER_MS = 86_400_000
 _ANSWER_BYTES = 64 * 2**20  # for the operator
 _WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
+ATTEMPT: Mapping[str, Any] = {"open_timeout": int(_LEASE_SECONDS * 1000)}
+"""Zenoh's limit of one attempt to connect again: one that a cut connection has swallowed holds up the next for so long."""
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
 
 
@@ -118,7 +120,7 @@ def _once(door: RouterAddress) -> zenoh.Config:
     """The configuration of a session that is closed when its connection is lost: Zenoh must not reconnect it."""
     config = dict(door.config)
     config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
-    config["transport"] = {**config["transport"], "unicast": {"open_timeout": int(_LEASE_SECONDS * 1000)}}
+    config["transport"] = {**config["transport"], "unicast": dict(ATTEMPT)}
     return zenoh.Config.from_json5(json.dumps(config))
 
 

@@ -1,0 +1,40 @@
+"""Commands: of an installed package, and those here, which the registry lists in one line each."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from evedrop.cli.commands import MODULES
+from tests.conftest import Evedrop
+
+COMMAND = """
+from evedrop.cli.command import Command
+
+def greet(options):
+    print(f"hello {options.name}")
+    return 1
+
+COMMANDS = (Command("greet", greet, "say hello", (lambda parser: parser.add_argument("name"),)),)
+"""
+
+
+def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
+    """One file and one line: it is in the help, has options, and its result is the exit status."""
+    (evedrop.folder / "greeting.py").write_text(COMMAND)
+    about = evedrop.folder / "greeting-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[evedrop.commands]\ngreet = greeting\n")
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    assert "greet       say hello" in evedrop.process("--help", env=environment).out
+    done = evedrop.process("greet", "you", env=environment)
+    assert (done.status, done.out, done.err) == (1, "hello you\n", "")
+
+
+def test_every_command_is_in_the_module_that_the_registry_says() -> None:
+    """And every module has commands only that the registry lists."""
+    found: dict[str, str] = {}
+    for name in dict.fromkeys(MODULES.values()):
+        for command in import_module(f"evedrop.cli.commands.{name}").COMMANDS:
+            found[command.group or command.name] = name
+    assert found == dict(MODULES)
