@@ -158,6 +158,9 @@ class Children:
             raise RunError(
                 f"{brief.process} cannot be started ({error}); free system resources and run again"
             ) from error
+        before = self._processes.get(brief.process)
+        if before is not None and before.stdin is not None:
+            before.stdin.close()
         self._processes[brief.process] = process
         threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
 
@@ -216,7 +219,7 @@ class Children:
             return news
         self.silent_seconds = 0.0
         if news["event"] in {"started", "back", "reconnected"}:
-            self._unread = max(0, self._unread - self.started)
+            self._unread = max(0, self._unread - 1) if self.started else 0  # at the start, all have
             self.started = True
             if not self._unread:
                 self._forget_briefs()
