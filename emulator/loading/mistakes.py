@@ -203,7 +203,7 @@ def _links(tables: Mapping[str, Any]) -> dict[str, LinkTable]:
 
 
 def _no_theory(name: str, receiver: Any, encoding: Any, sound: Scenario | None) -> str | None:
-    """Why there is no theory for a receiver; None if there is one, or if the receiver has mistakes of its own.
+    """The reason why no theory covers a receiver; None if a theory does, or if the receiver's own table has mistakes.
 
     sound: the scenario, if it has no other mistakes: its events are then considered too.
     """

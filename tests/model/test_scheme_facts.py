@@ -1,4 +1,4 @@
-"""What a scheme's class says of its packets, and what a subclass may not take over unsaid."""
+"""The facts that a scheme's class declares about its packets. A subclass must declare its own: it does not inherit them."""
 
 from __future__ import annotations
 

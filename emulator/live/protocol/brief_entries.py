@@ -14,6 +14,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
+from evedrop.model.slot.link import NEVER
 from evedrop.streams import KEY_BYTES
 
 Check = Callable[[str, Any], Iterator[str]]
@@ -21,7 +22,6 @@ Check = Callable[[str, Any], Iterator[str]]
 
 _SHOWN = 40  # characters of a value that a message repeats
 _MOST_TOLD = 8
-NEVER = 2**62  # a slot that no run reaches
 MOST_SLOTS = 100_000_000
 
 T = TypeVar("T")

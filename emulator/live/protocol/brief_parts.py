@@ -19,7 +19,6 @@ from evedrop.live.protocol.brief_closed_loop import (
 )
 from evedrop.live.protocol.brief_entries import (
     MOST_SLOTS,
-    NEVER,
     SLOT,
     Check,
     anything,
@@ -42,7 +41,7 @@ from evedrop.live.protocol.keys import KINDS
 from evedrop.model.acknowledgements import WayBackSpec
 from evedrop.model.links.link import Fate
 from evedrop.model.numeric.detection import Chart
-from evedrop.model.slot.link import Change, LinkSchedule, ReceiverOutage
+from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 
 _TEXTS = listed(text)
 _SCHEME = table({"scheme": text}, strict=False)
