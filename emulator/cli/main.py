@@ -109,10 +109,28 @@ def _commands(first: str) -> Iterator[Command]:
     order = [*MODULES]
     yield from sorted(found, key=lambda command: order.index(command.group or command.name))
     if first not in MODULES:
-        from importlib.metadata import entry_points
+        yield from _commands_of_packages()
 
-        for point in entry_points(group=GROUP):
-            yield from import_module(point.value).COMMANDS
+
+def _commands_of_packages() -> Iterator[Command]:
+    """The commands of installed packages; says which cannot be loaded, or have the name of another."""
+    from importlib.metadata import entry_points
+
+    taken = {*MODULES}
+    for point in entry_points(group=GROUP):
+        try:
+            found: Sequence[Command] = import_module(point.value).COMMANDS
+        except Exception as error:  # of the package's author
+            say(f"warning: the commands of {point.value} cannot be loaded ({type(error).__name__}: {error})")
+            continue
+        for command in found:
+            if command.name in taken or command.group is not None:
+                say(
+                    f"warning: the command {command.name} of {point.value} is left out: expected a new name, and no group"
+                )
+            else:
+                taken.add(command.name)
+                yield command
 
 
 class _Version(argparse.Action):

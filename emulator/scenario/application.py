@@ -1,7 +1,7 @@
 """The hook for applications: what a closed loop's plant is used for, such as the household of a microgrid.
 
 An application has a table of its own in a scenario, figures in the summary and in expectations, lines in the closing report,
-panels in the view and a picture of a sweep. No other room names an application: they ask those whose tables a scenario contains.
+panels in the view and a picture of a sweep. No other room names an application: each asks those whose tables a scenario contains.
 
 Source: docs/your-own.md, applications.
 """
@@ -11,10 +11,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
+from evedrop.errors import NotRegistered
 from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
@@ -146,10 +146,11 @@ class PanelFeed(ABC):
 
 
 class Application(ABC):
-    """What a plant with a controller is used for. A class, never an instance, is registered."""
+    """What a plant with a controller is used for. A class, never an instance, is registered.
 
-    name: ClassVar[str]
-    """The name of its table in a scenario and of its entry in the summary."""
+    The name of its entry point is that of its table in a scenario, and of its entry in the summary.
+    """
+
     table: ClassVar[type[Table]]
     """The entries of its table."""
     names: ClassVar[Mapping[str, Kind]]
@@ -202,69 +203,58 @@ class Application(ABC):
         return own | {name: cls.figure(summary, (receiver, name)) for name in cls.receiver_figures}
 
 
-@final
-class _BuiltIn(Mapping[str, type[Application]]):
-    """Name → class. A class is imported when it is looked up, since it may use rooms above this one."""
-
-    def __init__(self, places: Mapping[str, str]) -> None:
-        self._places = places
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._places
-
-    def __getitem__(self, name: str) -> type[Application]:
-        module, _, class_name = self._places[name].partition(":")
-        found: type[Application] = getattr(import_module(module), class_name)
-        return found
-
-
 APPLICATIONS: Registry[Application] = Registry(
     "application",
     Application,  # type: ignore[type-abstract]
     "evedrop.applications",
-    _BuiltIn(
-        {
-            "comfort": "evedrop.applications.heating.comfort:Comfort",
-            "household": "evedrop.applications.microgrid.household:Household",
-        }
-    ),
+    {},
 )
+"""By the name of the table; all are found by entry points, those of Evedrop in its own pyproject.toml."""
 
 
 def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, type[Application]]:
-    """The applications among names, such as those of a scenario's tables; besides: names that cannot be applications."""
+    """The applications among names, such as those of a scenario's tables, as far as they can be loaded.
+
+    besides: names that cannot be applications.
+    """
     return {name: APPLICATIONS[name] for name in tables if name not in besides and name in APPLICATIONS}
+
+
+def unloadable_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, str]:
+    """The applications among names that cannot be loaded, with the reason, in words that follow the name."""
+    found = {}
+    for name in tables:
+        if name not in besides and name in APPLICATIONS.names:
+            try:
+                _ = APPLICATIONS[name]
+            except NotRegistered as error:
+                found[name] = error.why
+    return found
 
 
 def application_mistakes(applications: Mapping[str, type[Application]], tables: Mapping[str, Any]) -> Iterator[str]:
     """Mistakes of applications across tables: no plant, names that the plant does not have, and a receiver of the same name."""
     for name, application in applications.items():
-        yield from _mistakes_of(application, tables[name], tables)
+        yield from _mistakes_of(name, application, tables)
         if name in (tables.get("eavesdroppers") or {}):
             yield f"eavesdroppers.{name}: is a name that the {name}'s figures use; expected another"
 
 
-def _mistakes_of(application: type[Application], table: Any, tables: Mapping[str, Any]) -> Iterator[str]:
-    plant, process = tables.get("plant"), tables.get("process")
+def _mistakes_of(name: str, application: type[Application], tables: Mapping[str, Any]) -> Iterator[str]:
+    table, plant, process = tables[name], tables.get("plant"), tables.get("process")
     if not isinstance(plant, Mapping) or not isinstance(tables.get("controller"), Mapping):
         described = "which it describes; expected both, or no such table"
-        yield f"{application.name}: is given without a [plant] and a [controller], {described}"
+        yield f"{name}: is given without a [plant] and a [controller], {described}"
         return
     if not isinstance(table, Mapping):
         return
     for entry, kind in application.names.items():
-        name = table.get(entry)
-        if not isinstance(name, str):
+        given = table.get(entry)
+        if not isinstance(given, str):
             continue
         where, holder = (f"process.{kind}", process) if kind == "states" else (f"plant.{kind}", plant)
         names = holder.get(kind) if isinstance(holder, Mapping) else None
         there = [one for one in names if isinstance(one, str)] if isinstance(names, list) else []
-        if name not in there:
-            choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(name)}, …]"
-            yield f"{application.name}.{entry}: is {as_toml(name)}, which is not among {where}; {choice}"
+        if given not in there:
+            choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(given)}, …]"
+            yield f"{name}.{entry}: is {as_toml(given)}, which is not among {where}; {choice}"

@@ -264,7 +264,7 @@ class Around:
         links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
         first = figure.partition(".")[0]
         if first not in self.receivers and first in APPLICATIONS:
-            return self._application_mistakes(figure, APPLICATIONS[first])
+            return self._application_mistakes(figure, first, APPLICATIONS[first])
         if figure not in [*own, *links]:
             names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(FIGURES)})"
             of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
@@ -276,8 +276,8 @@ class Around:
             return [("figure", f"is {as_toml(figure)}, but {why}; expected another figure")]
         return []
 
-    def _application_mistakes(self, figure: str, application: type[Application]) -> list[Found]:
-        name, own, of_receivers = application.name, application.figures, application.receiver_figures
+    def _application_mistakes(self, figure: str, name: str, application: type[Application]) -> list[Found]:
+        own, of_receivers = application.figures, application.receiver_figures
         if name not in self.applications:
             wanted = f"expected a table [{name}], or another figure"
             return [("figure", f"is {as_toml(figure)}, but there is no {name}; {wanted}")]

@@ -22,7 +22,7 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
-from pydantic_core import InitErrorDetails
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import Assignment
@@ -33,7 +33,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
-from evedrop.scenario.application import applications_in
+from evedrop.scenario.application import applications_in, unloadable_in
 from evedrop.scenario.events import EventTable
 from evedrop.scenario.expect import ExpectTable
 from evedrop.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
@@ -263,9 +263,14 @@ class Scenario(Table):
         """Check the tables of applications beside the fields, so that a mistake in either hides none in the other."""
         if not isinstance(found, Mapping):
             return check(found)
-        applications = applications_in(found, cls.model_fields)
+        applications, broken = applications_in(found, cls.model_fields), unloadable_in(found, cls.model_fields)
         made: dict[str, Table] = {}
-        mistakes: list[InitErrorDetails] = []
+        mistakes = [
+            InitErrorDetails(
+                type=PydanticCustomError("mistakes", "one", {"mistakes": [(name, f"is a table{why}")]}), input=None
+            )
+            for name, why in broken.items()
+        ]
         for name, application in applications.items():
             try:
                 made[name] = application.table.model_validate(found[name])
@@ -273,7 +278,7 @@ class Scenario(Table):
                 mistakes += [again(detail, name) for detail in error.errors(include_url=False)]
         scenario = None
         try:
-            scenario = check({name: value for name, value in found.items() if name not in applications})
+            scenario = check({name: value for name, value in found.items() if name not in {*applications, *broken}})
         except ValidationError as error:
             mistakes = [again(detail) for detail in error.errors(include_url=False)] + mistakes
         if scenario is None or mistakes:

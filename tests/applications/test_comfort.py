@@ -140,3 +140,21 @@ def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) 
     )
     assert done.status == 0, done.err
     assert "platoon" not in APPLICATIONS.names
+
+
+def test_an_application_that_cannot_be_loaded_is_a_mistake_of_who_uses_it(evedrop: Evedrop) -> None:
+    """With the reason, beside the scenario's other mistakes; scenarios without its table do not notice."""
+    (evedrop.folder / "platooning.py").write_text("import nothing_of_this_name\n")
+    about = evedrop.folder / "platooning-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: platooning\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[evedrop.applications]\nplatoon = platooning:Platoon\n")
+    (evedrop.folder / "two.toml").write_text(SCENARIO.replace("slots = 200", "slots = -1"))
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    done = evedrop.process("check", "two.toml", env=environment)
+    assert done.status == 2
+    assert "Traceback" not in done.err
+    assert "platoon: is a table, which an installed package says is platooning:Platoon, and the module" in done.err
+    assert "No module named 'nothing_of_this_name'" in done.err
+    assert "slots: is -1" in done.err
+    assert evedrop.process("check", "eavesdroppers", "microgrid", env=environment).status == 0

@@ -103,7 +103,10 @@ def test_a_broken_solver_is_told_in_one_line(
     (tmp_path / "osqp.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "osqp", raising=False)
-    assert cli.main(["check", "microgrid-mpc"]) == 2
+    try:
+        assert cli.main(["check", "microgrid-mpc"]) == 2
+    finally:
+        sys.modules.pop("osqp", None)  # the broken one, which other tests must not find
     told = capsys.readouterr().err
     assert f"controller.strategy: is mpc, whose solver is broken ({said}" in told
     assert "expected pip install --force-reinstall osqp first, or the strategy lqr" in told

@@ -31,6 +31,25 @@ def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
     assert (done.status, done.out, done.err) == (1, "hello you\n", "")
 
 
+def test_a_package_that_is_broken_breaks_no_help(evedrop: Evedrop) -> None:
+    """One that cannot be imported, and one that takes the name of a command, are named; all other commands are there."""
+    (evedrop.folder / "broken.py").write_text("raise RuntimeError('not today')\n")
+    (evedrop.folder / "taking.py").write_text(COMMAND.replace('"greet", greet', '"run", greet'))
+    about = evedrop.folder / "both-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: both\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[evedrop.commands]\nbroken = broken\nrun = taking\n")
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    done = evedrop.process("--help", env=environment)
+    assert done.status == 0
+    assert "a live run: processes, network, view, results" in done.out
+    assert done.err.splitlines() == [
+        "evedrop: warning: the commands of broken cannot be loaded (RuntimeError: not today)",
+        "evedrop: warning: the command run of taking is left out: expected a new name, and no group",
+    ]
+    assert evedrop.process("list", env=environment).err == ""
+
+
 def test_every_command_is_in_the_module_that_the_registry_says() -> None:
     """And every module has commands only that the registry lists."""
     found: dict[str, str] = {}

@@ -138,7 +138,6 @@ class ComfortFeed(PanelFeed):
 class Comfort(Application):
     """A room with a heater."""
 
-    name = "comfort"
     table = ComfortTable
     names: ClassVar[Mapping[str, Kind]] = {"temperature": "states", "heater": "inputs"}
     figures = ("discomfort", "heating_energy")

@@ -31,7 +31,6 @@ ENERGY, GUESSES = "energy", "guesses"
 class Household(Application):
     """A house behind a meter."""
 
-    name = "household"
     table = HouseholdTable
     names: ClassVar[Mapping[str, Kind]] = {
         "grid": "inputs",
