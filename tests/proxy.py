@@ -25,6 +25,8 @@ class Cable:
         self._flows.set()
         self._accepts = True
         self._ends: list[socket.socket] = []
+        self._swallows = False
+        self._swallowed: list[socket.socket] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
     @property
@@ -56,6 +58,16 @@ class Cable:
         for end in self._close():
             end.close()
 
+    def swallow(self) -> None:
+        """Reset all connections; the next one is taken, and never answered. Those after it are passed on."""
+        self._swallows = True
+        self.flap()
+
+    @property
+    def swallowed(self) -> int:
+        """How many connections were taken and not answered."""
+        return len(self._swallowed)
+
     def silence(self) -> None:
         """Pass nothing on any more; nobody is told."""
         self._flows.clear()
@@ -72,6 +84,8 @@ class Cable:
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self._close()
+        for end in self._swallowed:
+            end.close()
 
     def _close(self) -> list[socket.socket]:
         ends, self._ends = self._ends, []
@@ -84,6 +98,10 @@ class Cable:
         with suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
+                if self._swallows:
+                    self._swallows = False
+                    self._swallowed.append(near)
+                    continue
                 self._flows.wait()
                 try:
                     if not self._accepts:

@@ -44,12 +44,22 @@ def test_its_figures_are_sums_over_slots(tmp_path: Path) -> None:
         assert found["receivers"][name]["known_fraction"] == pytest.approx(np.mean(known))
 
 
-def test_workers_change_nothing(tmp_path: Path) -> None:
-    """The totals of two workers are those of one, to the bit."""
+def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
+    """Two workers or one: the same bits. And they are the means of the trials' parts, weighted by their trials."""
     scenario = load("heated-room", SHORT)
-    one = montecarlo(scenario, trials=600, out=tmp_path / "one", plan=Plan(workers=1)).summary
-    two = montecarlo(scenario, trials=600, out=tmp_path / "two", plan=Plan(workers=2)).summary
-    assert one["comfort"] == two["comfort"]
+    one = montecarlo(scenario, trials=600, out=tmp_path / "one", plan=Plan(workers=1)).summary["comfort"]
+    assert montecarlo(scenario, trials=600, out=tmp_path / "two", plan=Plan(workers=2)).summary["comfort"] == one
+    first, rest = (
+        montecarlo(scenario, trials=trials, first_trial=at, out=tmp_path / str(at), plan=Plan(workers=1)).summary[
+            "comfort"
+        ]
+        for at, trials in ((0, 450), (450, 150))
+    )
+    for name in ("discomfort", "heating_energy"):
+        assert one[name] == pytest.approx(0.75 * first[name] + 0.25 * rest[name], rel=1e-12)
+    for receiver, found in one["receivers"].items():
+        known = [part["receivers"][receiver]["known_fraction"] for part in (first, rest)]
+        assert found["known_fraction"] == pytest.approx(0.75 * known[0] + 0.25 * known[1], rel=1e-12)
 
 
 def test_the_view_is_given_every_curve_of_its_panels() -> None:

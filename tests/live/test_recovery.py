@@ -153,6 +153,22 @@ def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop,
     assert [one["process"] for one in done.summary["outages"]] == [name]
 
 
+def test_a_relay_gives_up_an_attempt_that_is_not_answered(tmp_path: Path) -> None:
+    """Whose connection was lost while it was being opened. Zenoh's own limit, ten seconds, is longer than this outage may be."""
+    scenario = scenario_in(tmp_path, slots=3000, pace=0.002, longest_outage=8.0, more="[network]\nrouters = 2")[1]
+    ports = [free_port() for _ in range(2)]
+    near, far = (f"tcp/127.0.0.1:{port}" for port in ports)
+    with cable(ports[0]) as between, by_hand(scenario, tmp_path, near, relay=far) as run:
+        run.write(relay=between.endpoint)
+        run.start()
+        run.running(more_than=300)
+        between.swallow()
+        wait_until(lambda: between.swallowed, "an attempt that is not answered")
+        assert set(run.statuses().values()) == {0}, run.log("observer").read_text()
+        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
+        assert [one["process"] for one in run.summary["outages"]] == ["router"]
+
+
 def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path: Path) -> None:
     """A router that is started while the run is paused knows the changes that were made; the folder gives the same again."""
     path, _ = scenario_in(tmp_path, slots=3000, pace=0.002, more=CHANGING)

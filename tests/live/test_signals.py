@@ -9,6 +9,7 @@ import pytest
 from evedrop.errors import Interrupted
 from evedrop.live.observer.conductor import Stop
 from evedrop.signals import stop_on_signals
+from tests.conftest import LIMIT
 
 
 def test_what_is_ignored_from_birth_stays_ignored() -> None:
@@ -31,13 +32,22 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
 
 def test_a_signal_may_come_while_the_lock_of_the_event_is_held() -> None:
     """The main thread is stopped inside `Event.wait`: it must not wait for itself, and a hundred signals are as good as one."""
-    before = signal.getsignal(signal.SIGINT)
-    with stop_on_signals() as stop:
-        with stop._cond:  # type: ignore[attr-defined]
-            for _ in range(100):
-                signal.raise_signal(signal.SIGINT)
-        assert stop.wait(60)
-    assert signal.getsignal(signal.SIGINT) is before
+    code = (
+        "import signal\nfrom evedrop.signals import stop_on_signals\n"
+        "before = signal.getsignal(signal.SIGINT)\n"
+        "with stop_on_signals() as stop:\n"
+        "    with stop._cond:\n        for _ in range(100):\n            signal.raise_signal(signal.SIGINT)\n"
+        "    print(stop.wait(60))\n"
+        "print(signal.getsignal(signal.SIGINT) is before)\n"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        code,
+    ]  # in a process of its own: one that waits for itself could not be ended otherwise
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT)
+    assert done.stdout.split() == ["True", "True"]
+    assert done.stderr == ""
 
 
 def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:

@@ -178,6 +178,24 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"process__Q": "filter"},
         'process.Q: is "filter", but the sensor has none; expected a matrix, or output_matrix and measurement_noise in [p',
     ),
+    "filtered without A": (
+        {
+            "process__Q": "filter",
+            "process__A": None,
+            "plant__output_matrix": [[1.0, 0.0]],
+            "plant__measurement_noise": [[0.01]],
+        },
+        "process.A: is missing; expected A = ",
+    ),
+    "filtered, A is none": (
+        {
+            "process__Q": "filter",
+            "process__A": False,
+            "plant__output_matrix": [[1.0, 0.0]],
+            "plant__measurement_noise": [[0.01]],
+        },
+        "process.A: is false; expected ",
+    ),
     "measured without noise": (
         {"plant__output_matrix": [[1.0, 0.0]]},
         "plant.measurement_noise: is missing, but output_matrix is given; expected measurement_noise = [[0.01]], or neither",
