@@ -174,6 +174,18 @@ def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
     two = montecarlo("microgrid", out=tmp_path / "two", plan=Plan(workers=2), **options)
     assert one.summary["household"] == two.summary["household"]
     assert one.summary["household"]["windows"] == 2
+    first, rest = (
+        montecarlo(
+            "microgrid",
+            out=tmp_path / str(at),
+            plan=Plan(workers=1),
+            **{**options, "trials": trials, "first_trial": at},
+        ).summary["household"]
+        for at, trials in ((0, 400), (400, 101))
+    )
+    for name in ("bought_energy", "sold_energy", "net_difference", "summed_difference"):
+        mean = (400 * first[name] + 101 * rest[name]) / 501
+        assert one.summary["household"][name] == pytest.approx(mean, rel=1e-9)
 
 
 def test_expectations_of_a_house_are_judged(tmp_path: Path) -> None:
