@@ -57,28 +57,30 @@ class _Named:
 
 def finish() -> None:
     """Flush standard output; ignores errors, because another error is being reported."""
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:
-        silence()
+    _flush(sys.stdout)
 
 
 def let_go() -> None:
-    """Flush both streams for the last time.
-
-    What nobody can read any more is discarded, or the interpreter would exit with a status of its own.
-    """
+    """Flush both streams for the last time; if one fails, the interpreter would otherwise exit with a status of its own."""
     for stream in (sys.stdout, sys.stderr):
-        try:
-            if stream is not None:
-                stream.flush()
-        except (OSError, ValueError):
-            with contextlib.suppress(OSError, ValueError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        _flush(stream)
 
 
 def silence() -> None:
     """Discard further standard output, including the flush when the interpreter exits."""
-    if sys.stdout is not None:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    _discard(sys.stdout)
+
+
+def _flush(stream: TextIO | None) -> None:
+    """Flush a stream; discards what nobody can read any more."""
+    try:
+        if stream is not None:
+            stream.flush()
+    except (OSError, ValueError):
+        _discard(stream)
+
+
+def _discard(stream: TextIO | None) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        if stream is not None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
