@@ -6,6 +6,7 @@ The first signal counts: while the block that it ends is left in order, further 
 from __future__ import annotations
 
 import _thread
+import faulthandler
 import os
 import signal
 import threading
@@ -14,6 +15,9 @@ from contextlib import contextmanager
 from types import FrameType
 
 from evedrop.interrupts import INTERRUPTED, SIGNALS, heeded, leave
+
+SHOW_STACKS = signal.SIGUSR1
+"""The signal upon which a process of a run writes the stack of every thread to its log."""
 
 
 @contextmanager
@@ -88,3 +92,8 @@ def leave_on_signals() -> None:
         os._exit(INTERRUPTED)
 
     threading.Thread(target=wait, name="signals", daemon=True).start()
+
+
+def show_stacks_on_request() -> None:
+    """Write the stack of every thread to standard error upon `SHOW_STACKS`, even while native code holds Python's lock."""
+    faulthandler.register(SHOW_STACKS, all_threads=True)

@@ -12,6 +12,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from evedrop.signals import SHOW_STACKS
+
+_STACKS_SECONDS = 1.0
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER
 _NEW_MOUNTS = 0x00020000  # CLONE_NEWNS
 
@@ -98,7 +101,24 @@ def doing(pid: int) -> str:
         with suppress(OSError):
             if os.readlink(fd) == stdin and fd.parts[2] != str(pid):
                 holders.append(fd.parts[2])
-    return f"threads: {', '.join(waits)}; standard input {stdin}, also held by {', '.join(sorted(set(holders))) or 'nobody'}"
+    return (
+        f"threads: {', '.join(waits)}; standard input {stdin}, also held by {', '.join(sorted(set(holders))) or 'nobody'}; "
+        f"stacks: {_stacks(pid)}"
+    )
+
+
+def _stacks(pid: int) -> str:
+    """What each thread of a process does, as the process itself writes it to its log on request."""
+    try:
+        log = open(f"/proc/{pid}/fd/2", errors="replace")  # noqa: SIM115 - closed below, opening alone may fail
+    except OSError as error:
+        return f"no log ({error})"
+    with log:
+        log.seek(0, os.SEEK_END)
+        with suppress(OSError):
+            os.kill(pid, SHOW_STACKS)
+        time.sleep(_STACKS_SECONDS)
+        return log.read()
 
 
 def end_all(processes: list[Process]) -> None:

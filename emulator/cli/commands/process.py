@@ -46,8 +46,9 @@ def process(options: argparse.Namespace) -> int:
     from evedrop.plugins import look_in
 
     os.umask(0o077)  # only this user may read its files
-    from evedrop.signals import leave_on_signals
+    from evedrop.signals import leave_on_signals, show_stacks_on_request
 
+    show_stacks_on_request()
     if options.role != "observer":  # which ends in order
         leave_on_signals()
     brief = read_brief(options.brief, options.role)

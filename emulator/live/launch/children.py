@@ -25,9 +25,10 @@ from evedrop.live.protocol.news import News, ProcessRequest, RunEnded
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
-from evedrop.signals import held_back
+from evedrop.signals import SHOW_STACKS, held_back
 
 GRACE_SECONDS = 3.0  # for all processes to leave
+_STACKS_SECONDS = 0.3  # for a process that does not leave to write what its threads do into its log
 ROUTER_RESTARTS = 3  # how often a router that a signal ended is restarted: the run goes on with the new one
 SILENCE_SECONDS = 30.0  # after which a silent observer is given up: it sends a heartbeat every second
 _BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
@@ -116,6 +117,9 @@ class Children:
             try:
                 process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
+                process.send_signal(SHOW_STACKS)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_STACKS_SECONDS)
                 process.kill()
                 process.wait()
             if process.stdin is not None:

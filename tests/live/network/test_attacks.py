@@ -176,6 +176,21 @@ def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str
     live.nothing_left()
 
 
+def test_a_process_that_heeds_no_signal_is_killed_and_its_log_says_what_it_did(evedrop: Evedrop) -> None:
+    """Native code that holds Python's lock keeps all of Python waiting; the stacks are written all the same."""
+    scenario, name, does = SILENT["a receiver in the middle"]
+    holds = "import collections, itertools\ndef hang(): collections.deque(itertools.repeat(0), maxlen=0)\n"
+    live = evedrop.live(
+        scenario, "--pace", "0", "--set", "longest_outage=2", env=with_rogue(evedrop, name, holds + does)
+    )
+    done = live.end()
+    assert done.status == 3, done.err
+    assert done.err.startswith(f"evedrop: {name}: alive, and silent for "), done.err
+    live.nothing_left()
+    stacks = (live.folder / "logs" / f"{name}.log").read_text()
+    assert " in hang" in stacks, stacks
+
+
 @pytest.mark.long
 def test_an_operator_may_pause_for_longer_than_an_outage(evedrop: Evedrop) -> None:
     """Nobody is silent in a run that is held."""
