@@ -113,8 +113,12 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
 
 
 def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> dict[str, Any]:
-    """The summary of docs/results.md; a digest is None if there is none, or if the run was cut short."""
+    """The summary of docs/results.md; a digest is None if there is none, or if the run was cut short.
+
+    An accused process has no digest either: what it reported is contradicted.
+    """
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
+    digests = {name: None if name in ending.accused else one for name, one in digests.items()}
     expected = expectations_of(scenario)
     peers: dict[str, dict[str, Any]] = {
         name: {

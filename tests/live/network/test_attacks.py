@@ -37,6 +37,15 @@ def refused(live: Live, name: str) -> str:
     return done.err
 
 
+DENIES = """
+import numpy as np
+def one(self):
+    action = self.action.copy()
+    if self.first <= {slot} < self.first + len(action):
+        action[{slot} - self.first, 2] = 0 if action[{slot} - self.first, 2] else 3
+    return dict(action=action)
+change(one)
+"""
 LIES = {
     "x_hat = 7, P = 0, no digests": (
         "change(lambda self: dict(x_hat=self.x_hat * 0.0 + 7.0, P=self.P * 0.0, trace=self.trace * 0.0,"
@@ -45,15 +54,13 @@ LIES = {
         r"gives [0-9a-f]{64}; look at logs/smart.log",
     ),
     "one packet of one unrecorded trial": (
-        "import numpy as np\n"
-        "def one(self):\n"
-        "    action = self.action.copy()\n"
-        "    if self.first <= 77 < self.first + len(action):\n"
-        "        action[77 - self.first, 2] = 0 if action[77 - self.first, 2] else 3\n"
-        "    return dict(action=action)\n"
-        "change(one)",
+        DENIES.format(slot=77),
         r"smart contradicts router: in slot 77, trial 2, it says that it received (nothing|the packet) [(]action [03][)], but "
         r"the journal says that it was (not )?delivered; look at logs/smart.log and logs/router.log",
+    ),
+    "the last packet": (
+        DENIES.format(slot=599),
+        "smart contradicts router: in slot 599, trial 2, it says that it received",
     ),
     "a wrong digest at the end": (
         "change(lambda self: dict(digests={block: one + (block > 256) for block, one in self.digests.items()}))",
@@ -69,7 +76,7 @@ LIES = {
     ),
 }
 """What a receiver claims → how, and what is said of it."""
-FEW = ("x_hat = 7, P = 0, no digests", "one packet of one unrecorded trial")
+FEW = ("x_hat = 7, P = 0, no digests", "the last packet")
 
 
 @pytest.mark.parametrize("what", [one if one in FEW else pytest.param(one, marks=pytest.mark.long) for one in LIES])
