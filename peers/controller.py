@@ -12,6 +12,7 @@ from evedrop.live.protocol.brief_closed_loop import decoded
 from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.live.protocol.closed_loop import decided, read_known
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import End
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive
@@ -43,4 +44,4 @@ def steer(brief: Brief[ControllerPart]) -> None:
             took = time.perf_counter() - began
             put(k, decided(k, u, controller.failed))
             reporter.add(k, u, controller.failed, took)
-        session.wait_for("end")
+        session.wait_for(End)

@@ -17,6 +17,7 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_delivery
 from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Receiver
@@ -85,7 +86,7 @@ def follow(
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
         answers.over(deliveries, downlink)
-        session.wait_for("end")
+        session.wait_for(End)
 
 
 @final

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
+from functools import partial
 from typing import final
 
 from evedrop.errors import RunError
@@ -13,7 +14,8 @@ from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import SensorPart
-from evedrop.live.protocol.codec import Reader, read_progress, shown
+from evedrop.live.protocol.codec import Reader, read_progress
+from evedrop.live.protocol.commands import End, Go, Hold, Start
 from evedrop.live.protocol.packets import PacketExtras, barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
 from evedrop.model.numeric.detection import CusumBatch
@@ -43,7 +45,7 @@ class Window:
         self._keys = {name: session.keys.progress(name) for name in followers}
         self._news = Mailbox(self._keys, _PROGRESS_BYTES)
         for name, key in self._keys.items():
-            session.funnel(key, lambda payload, name=name: self._news.put(name, payload))  # type: ignore[misc]
+            session.funnel(key, partial(self._news.put, name))
 
     @property
     def followers(self) -> tuple[str, ...]:
@@ -94,8 +96,8 @@ class Barriers:
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
-        while (command := self._session.commanded()) is not None:
-            if command.text("do") == "hold":
+        while (command := self._session.commanded(self._window.followers)) is not None:
+            if isinstance(command, Hold):
                 self._barriers.add(k)
         return k in self._barriers
 
@@ -105,15 +107,12 @@ class Barriers:
         self._telemetry(k, held(k))
         # The command may arrive more than once, and may belong to an earlier barrier.
         with self._session.place.waiting(self._session.keys.control(SENSOR)):
-            while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
+            while not isinstance(go := self._session.command(self._window.followers), Go) or go.slot != k:
                 pass
-        absent = command.names("absent")
-        if not set(absent) <= set(self._window.followers):
-            raise command.malformed(f"absent = {shown(absent)}", f"some of {', '.join(self._window.followers)}")
-        self._window.go_on(k, absent)
+        self._window.go_on(k, go.absent or ())
         self._barriers = {slot for slot in self._barriers if slot > k}
-        if command.has("until"):
-            self._barriers.add(command.integer("until"))
+        if go.until is not None:
+            self._barriers.add(go.until)
 
 
 @final
@@ -152,7 +151,7 @@ def sense(brief: Brief[SensorPart]) -> None:
         actuator = Actuator(brief, part.plant, session) if part.plant is not None else None
         barriers = Barriers(brief, session, window, scheme, actuator)
         session.ready()
-        session.wait_for("start")
+        session.wait_for(Start)
         start = time.monotonic()
         for k in range(brief.slots):
             session.place.slot = k
@@ -181,4 +180,4 @@ def sense(brief: Brief[SensorPart]) -> None:
             alarms = back.wait(k, packet) if back is not None else None
             steered = actuator.wait(k, true) if actuator is not None else None
             barriers.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
-        session.wait_for("end")
+        session.wait_for(End)

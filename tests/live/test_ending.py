@@ -10,7 +10,8 @@ import pytest
 
 from evedrop.live.observer import conductor
 from evedrop.live.observer.conductor import Conductor, Stop
-from evedrop.live.protocol.codec import Reader, over
+from evedrop.live.protocol.codec import over
+from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.keys import RunKeys
 
 RUN = "r"
@@ -46,7 +47,7 @@ class Network:
         name = key.rpartition("/")[2]
 
         def put(payload: bytes) -> None:
-            assert Reader(key, payload).text("do") == "end"
+            assert payload == End().pack()
             self.told[name] += 1
             if name in self.does:
                 self.does[name](self.told[name])

@@ -13,6 +13,7 @@ import pytest
 
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.commands import Again, Command
 from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
@@ -339,10 +340,10 @@ class Conducted:
         """As the test says."""
         return self.another_router
 
-    def command(self, name: str, do: str, **fields: Any) -> None:
+    def command(self, name: str, command: Command) -> None:
         """Note the rounds."""
-        if name == "sensor" and do == "again":
-            self.rounds.append(fields["k"])
+        if name == "sensor" and isinstance(command, Again):
+            self.rounds.append(command.slot)
 
     def start(self) -> None:
         """Nothing to start."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -24,6 +24,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import AnyBrief, Flow
 from evedrop.live.protocol.brief_parts import LegitimatePart, SensorPart
+from evedrop.live.protocol.commands import Bounds, Command, End, Start, read_command
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks, Digests
@@ -76,11 +77,11 @@ class Stage:
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
     kept: dict[str, ReplayBuffer] = field(default_factory=dict)
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
-    """Of the conductor, as `wire.control` makes them."""
+    """Of the conductor, as its classes pack them."""
 
     def session(self, brief: AnyBrief) -> FakeSession:
         """In the place of `Session`."""
-        return FakeSession(self, RunKeys(brief.run))
+        return FakeSession(self, RunKeys(brief.run), brief.process)
 
     def fill(self, key: str, messages: list[bytes]) -> None:
         """Put messages into an inbox."""
@@ -116,8 +117,8 @@ class FakeInbox:
 class FakeSession:
     """The part of `Session` that peers use."""
 
-    def __init__(self, stage: Stage, keys: RunKeys) -> None:
-        self._stage = stage
+    def __init__(self, stage: Stage, keys: RunKeys, process: str) -> None:
+        self._stage, self._process = stage, process
         self.keys = keys
         self.place = Place()
 
@@ -149,18 +150,19 @@ class FakeSession:
     def ready(self) -> None:
         """Nobody to wait for."""
 
-    def wait_for(self, command: str) -> None:
+    def wait_for(self, kind: type[Command]) -> None:
         """Until the test commands it."""
-        while self.command().text("do") != command:
+        while not isinstance(self.command(), kind):
             pass
 
-    def command(self) -> wire.Reader:
+    def command(self, receivers: Collection[str] | None = None) -> Command:
         """The next command, which the test gives."""
-        return wire.Reader("control", self._stage.commands.get(timeout=LIMIT))
+        message = wire.Reader(self.keys.control(self._process), self._stage.commands.get(timeout=LIMIT))
+        return read_command(message, Bounds(SLOTS, receivers))
 
-    def commanded(self) -> wire.Reader | None:
+    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
         """The next command if the test has given one."""
-        return None if self._stage.commands.empty() else self.command()
+        return None if self._stage.commands.empty() else self.command(receivers)
 
 
 @pytest.fixture
@@ -170,7 +172,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     monkeypatch.setattr(evedrop.peers.following, "Session", one.session)
     monkeypatch.setattr(evedrop.peers.sensor, "Session", one.session)
     yield one
-    one.commands.put(wire.control("end"))
+    one.commands.put(End().pack())
 
 
 def deliveries(count: int = SLOTS) -> list[bytes]:
@@ -196,7 +198,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     brief = briefs()[name]
     keys = RunKeys(brief.run)
     stage.fill(keys.downlink(name), deliveries())
-    stage.commands.put(wire.control("end"))
+    stage.commands.put(End().pack())
     RECEIVERS[name](brief)
     put = []
     while not stage.put.empty():
@@ -225,7 +227,7 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
     for flow in (Flow(1024, 7), Flow(1024, batch)):
         brief = replace(briefs(slots=600)[name], flow=flow, run="r")
         stage.fill(RunKeys("r").downlink(name), deliveries(600))
-        stage.commands.put(wire.control("end"))
+        stage.commands.put(End().pack())
         RECEIVERS[name](brief)
         end, x_hat, P = 0, [], []
         blocks: dict[int, bytes] = {}
@@ -281,7 +283,7 @@ def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
         [*good[:20], *good[23:30], packets.barrier(25), *good[5:40], packets.barrier(7), good[0], *good[30:]],
     ):
         stage.fill(RunKeys("r").downlink(name), messages)
-        stage.commands.put(wire.control("end"))
+        stage.commands.put(End().pack())
         RECEIVERS[name](brief)
         found.append(stage.all(RunKeys("r").telemetry(name)))
     assert found[0] == found[1]
@@ -310,7 +312,7 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
     stage.fill(RunKeys("r").downlink("legitimate"), [delivered(k) for k in slots])
-    stage.commands.put(wire.control("end"))
+    stage.commands.put(End().pack())
     part_of(brief, LegitimatePart)
     RECEIVERS["legitimate"](brief)
     expected = [packets.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
@@ -322,7 +324,7 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
     """Reports that the observer may not have joined yet can be sent again, and no older ones; the last progress too."""
     brief = replace(briefs()[name], run="r")
     stage.fill(RunKeys("r").downlink(name), deliveries())
-    stage.commands.put(wire.control("end"))
+    stage.commands.put(End().pack())
     RECEIVERS[name](brief)
     stage.all("")
     stage.kept[RunKeys("r").telemetry(name)].again(1, 0)
@@ -371,7 +373,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     brief = briefs()["sensor"]
     sensing = Sensing(stage, brief)
     assert stage.put.empty()
-    stage.commands.put(wire.control("start"))
+    stage.commands.put(Start().pack())
     sensing.packets(0, WINDOW)
     everybody = [*part_of(brief, SensorPart).receivers, "observer"]
     assert len(everybody) == 5
@@ -387,7 +389,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
             sensing.progress(name, sent)
         sensing.progress("observer", done)
         sensing.packets(sent, sent := min(SLOTS, done + WINDOW))
-    stage.commands.put(wire.control("end"))
+    stage.commands.put(End().pack())
     sensing.thread.join(LIMIT)
     assert stage.put.get(timeout=LIMIT) == ("closed", b"")
     assert stage.put.empty()
@@ -398,7 +400,7 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     brief = briefs()["sensor"]
     brief = replace(brief, part=replace(part_of(brief, SensorPart), history=3))
     sensing = Sensing(stage, brief)
-    stage.commands.put(wire.control("start"))
+    stage.commands.put(Start().pack())
     sensing.packets(0, WINDOW)
     for name in (*part_of(brief, SensorPart).receivers, "observer"):
         sensing.progress(name, 8)

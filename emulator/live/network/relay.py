@@ -14,6 +14,7 @@ from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import ATTEMPT, Session, client_config, door_of, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
+from evedrop.live.protocol.commands import End
 
 
 def relay(brief: Brief[RelayPart]) -> None:
@@ -30,7 +31,7 @@ def relay(brief: Brief[RelayPart]) -> None:
         present = session.attendance(grant.process for grant in table if grant.token is not None and grant.zid is None)
         session.wait_for_link()
         session.ready()
-        session.wait_for("end")
+        session.wait_for(End)
         until_all_left(present)
 
 

@@ -14,8 +14,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
+from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Protocol, Self, final
@@ -34,6 +35,7 @@ from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, over, refusal
+from evedrop.live.protocol.commands import Abandon, Again, Bounds, Command, End, Where, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, reader_of
 from evedrop.live.protocol.message_limits import low_pass
@@ -198,7 +200,8 @@ class Session:
         self._outlets: dict[str, Outlet] = {}
         self._kept: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
-        self._rounds: SimpleQueue[Reader] = SimpleQueue()
+        self._rounds: SimpleQueue[Again] = SimpleQueue()
+        self._slots = brief.slots
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
         # A router connects to no other process, so it is always on its network.
@@ -293,7 +296,7 @@ class Session:
         """Process → whether it is present, kept up to date by a thread of Zenoh's."""
         present = dict.fromkeys(processes, False)
         for name in present:
-            self.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+            self.watch(name, partial(present.__setitem__, name))
         return present
 
     def linked(self) -> bool:
@@ -359,43 +362,45 @@ class Session:
     def _send_again(self) -> None:
         """Send messages again as asked; on a thread of its own, since the working thread may be waiting for the effect."""
         while True:
-            command = self._rounds.get()
+            asked = self._rounds.get()
             deadline = time.monotonic() + _HEARD_SECONDS
             while self._unread() and time.monotonic() < deadline:
                 time.sleep(_POLL_SECONDS)
             for kept in self._kept:
-                kept.again(command.integer("n"), command.integer("k"))
+                kept.again(asked.round, asked.slot)
 
     def _told(self, payload: bytes) -> None:
         """Sort the conductor's commands; a malformed one is left to the reader of the commands, which raises the error."""
         with suppress(MalformedMessage):
-            command = Reader(self._control, payload)
-            if self._by_hand and command.text("do") == "abandon":
-                # Its messages will not come, and there is no launcher to end it.
-                sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
-                sys.stderr.flush()
-                os._exit(RunError.exit_status)
-            if command.text("do") == "where":
-                self.place.ask()
-                return
-            if self._kept and command.text("do") == "again":
-                command.integer("n"), command.integer("k")
-                self._rounds.put(command)
-                return
+            match self._read(payload):
+                case Abandon(why) if self._by_hand:
+                    # Its messages will not come, and there is no launcher to end it.
+                    sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {why}\n")
+                    sys.stderr.flush()
+                    os._exit(RunError.exit_status)
+                case Where():
+                    self.place.ask()
+                    return
+                case Again() as asked if self._kept:
+                    self._rounds.put(asked)
+                    return
         self._commands.put(payload)
 
-    def wait_for(self, command: str) -> None:
-        """Wait for one command of the conductor: `start` or `end`."""
+    def _read(self, payload: bytes, receivers: Collection[str] | None = None) -> Command:
+        return read_command(Reader(self._control, payload), Bounds(self._slots, receivers))
+
+    def wait_for(self, kind: type[Command]) -> None:
+        """Wait for one command of the conductor: `Start` or `End`."""
         with self.place.waiting(self._control):
-            while self.command().text("do") != command:
+            while not isinstance(self.command(), kind):
                 pass
-        if command == "end":
+        if kind is End:
             self.conclude()
 
-    def command(self) -> Reader:
-        """Wait for the next command of the conductor, named in its field `do`."""
-        return Reader(self._control, self._commands.get())
+    def command(self, receivers: Collection[str] | None = None) -> Command:
+        """Wait for the next command of the conductor; receivers: those that it may name, any by default."""
+        return self._read(self._commands.get(), receivers)
 
-    def commanded(self) -> Reader | None:
+    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
         """The next command of the conductor, or None without waiting."""
-        return None if self._commands.empty() else self.command()
+        return None if self._commands.empty() else self.command(receivers)

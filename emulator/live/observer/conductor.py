@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection
+from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Any, NoReturn, final
+from typing import NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.declared import Question
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.codec import Reader, control, is_over, progress, read_over
+from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
+from evedrop.live.protocol.commands import Abandon, Command, End, Start
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 
 _AFTERTHOUGHT_SECONDS = 0.5  # the user who ended a process may be about to end the observer: then the run did not fail
@@ -66,9 +68,9 @@ class Conductor:
         self.keys.update({name: keys.telemetry(name) for name in reporters})
         self._news = Mailbox(self.keys, session.allowance)
         for source, key in self.keys.items():
-            session.funnel(key, lambda payload, source=source: self._news.put(source, payload))  # type: ignore[misc]
+            session.funnel(key, partial(self._news.put, source))
         for name in self._present:
-            session.watch(name, lambda there, name=name: self._news.put(name, there))  # type: ignore[misc]
+            session.watch(name, partial(self._news.put, name))
         self.misdelivered: dict[str, int] = {}
         """Process that has confirmed its end → how many messages it dropped because they name another key."""
         self.absent: set[str] = set()
@@ -115,7 +117,7 @@ class Conductor:
 
     def start(self) -> None:
         """Let the sensor begin."""
-        self._commands[SENSOR](control("start"))
+        self.command(SENSOR, Start())
 
     def news(self) -> tuple[str, bytes] | None:
         """The next message with its sender, or None if there was none for a moment.
@@ -134,15 +136,15 @@ class Conductor:
         self._stop.check(_AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
-    def command(self, name: str, do: str, **fields: Any) -> None:
+    def command(self, name: str, command: Command) -> None:
         """Send a command to one process."""
-        self._commands[name](control(do, **fields))
+        self._commands[name](command.pack())
 
-    def ask(self, what: str) -> None:
+    def ask(self, command: Command) -> None:
         """Send a command to every process that is present and reports."""
         for name in self.keys:
             if self._present[name]:
-                self.command(name, what)
+                self.command(name, command)
 
     def report(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""
@@ -165,7 +167,7 @@ class Conductor:
                 said = time.monotonic()
                 for name in left:
                     if self._present[name]:
-                        self.command(name, "end")
+                        self.command(name, End())
                         told.add(name)
             self._hear_out(self._next())
         # The relay after the router: the router's messages pass through it.
@@ -189,7 +191,7 @@ class Conductor:
                 return
             if time.monotonic() - said > _END_SECONDS:
                 said = time.monotonic()
-                self.command(name, "end")
+                self.command(name, End())
             self._hear_out(self._next())
 
     def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
@@ -207,7 +209,7 @@ class Conductor:
         for names in (others, [ROUTER], [RELAY]):
             told = [name for name in names if name in self._commands]
             for name in told:
-                self.command(name, "abandon", why=why)
+                self.command(name, Abandon(why))
             deadline = time.monotonic() + _ABANDON_SECONDS
             while any(self._reaches(name) for name in told) and time.monotonic() < deadline:
                 time.sleep(0.01)

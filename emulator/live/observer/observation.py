@@ -29,6 +29,7 @@ from evedrop.live.observer.verification import Verifier, extent_of
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
+from evedrop.live.protocol.commands import Where
 from evedrop.live.protocol.news import RunEnded, RunProgress
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
@@ -134,7 +135,7 @@ class ObservedRun:
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             batch = self._brief.flow.batch
             limit = patience_of(patience, self._scenario.pace, batch)
-            self._stall = Stall(limit, batch, lambda: conductor.ask("where"))
+            self._stall = Stall(limit, batch, lambda: conductor.ask(Where()))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()

@@ -17,6 +17,7 @@ from typing import Any, final
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.commands import Again
 from evedrop.names import OBSERVER, RELAY, ROUTER
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
@@ -138,8 +139,8 @@ class Recovery:
         self._number += 1
         for name, there in self._conductor.processes.items():
             if there:
-                links = {"links": self._steering.changes} if name == ROUTER else {}
-                self._conductor.command(name, "again", n=self._number, k=self._done, **links)
+                links = self._steering.changes if name == ROUTER else None
+                self._conductor.command(name, Again(self._number, self._done, links))
         if self._done == 0:
             self._conductor.start()
         self._steering.remind()

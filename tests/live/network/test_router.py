@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.commands import End
 from tests.live.network.bench import LIMIT_SECONDS, Bench
 
 
@@ -62,7 +63,7 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         key = stage.briefs["router"].stream_keys[f"link/{name}"]
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
-    stage.put("observer", stage.keys.control("router"), wire.control("end"))
+    stage.put("observer", stage.keys.control("router"), End().pack())
     assert stage.router.wait(LIMIT_SECONDS) == 0
     assert stage.log.read_text() == ""
 
