@@ -193,7 +193,7 @@ def start_up(rounds: int) -> None:
             code = (
                 "import sys, time\nfrom pathlib import Path\nfrom evedrop.scenario import load\n"
                 "from evedrop.live.launch.launcher import launch\n"
-                "def tell(news):\n    if news['event'] == 'started': print(time.monotonic(), flush=True)\n"
+                "def tell(news):\n    if news.event == 'started': print(time.monotonic(), flush=True)\n"
                 f"launch(load('eavesdroppers', {{'slots': 10}}), Path({folder!r}) / 'run', {view!r}, None, tell)\n"
             )
             start = time.monotonic()

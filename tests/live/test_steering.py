@@ -11,6 +11,7 @@ from evedrop.live.network.operator import Answer, Request, read_answer
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.commands import Command, Go, Hold, LinkChange
+from evedrop.live.protocol.news import Held, News
 from evedrop.loading import checked
 from evedrop.model.slot.link import Change
 from evedrop.scenario import Scenario
@@ -64,12 +65,12 @@ class Run:
     def __init__(self, *events: dict[str, Any]) -> None:
         self.conductor = Told()
         self.kept: list[Scenario] = []
-        self.news: list[tuple[str, dict[str, Any]]] = []
+        self.news: list[News] = []
         scenario = checked({**TABLES, "event": list(events)}, "test")
         self.steering = Steering(
             scenario,
             self.conductor,  # type: ignore[arg-type]
-            lambda event, **news: self.news.append((event, news)),
+            self.news.append,
             self.kept.append,
         )
 
@@ -170,7 +171,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     assert run.events == []
     run.steering.left("smart", 30)
     run.steering.carry_on(30)
-    assert [event for event, _ in run.news] == ["act"]
+    assert [news.event for news in run.news] == ["act"]
     asked = run.asks("link", event=SET)
     run.steering.carry_on(30)
     assert run.conductor.told() == []
@@ -209,7 +210,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     assert run.conductor.told() == go(12)
     assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
     assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
-    assert ("held", {"before": 12}) in run.news
+    assert Held(12) in run.news
 
 
 def test_resuming_a_run_that_goes_on_holds_nothing() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import signal
 import subprocess
@@ -14,14 +13,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import final
+from typing import IO, Protocol, final
 
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
-from evedrop.live.protocol.news import News, ProcessRequest, RunEnded
+from evedrop.live.protocol.news import (
+    Alive,
+    Back,
+    ConnectionOutage,
+    Finishing,
+    News,
+    ProcessRequest,
+    RunEnded,
+    RunOver,
+    Started,
+    read_news,
+)
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
@@ -79,16 +89,69 @@ class Exit:
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
+class Process(Protocol):
+    """The part of `subprocess.Popen` that the launcher uses."""
+
+    @property
+    def pid(self) -> int:
+        """Its id."""
+
+    @property
+    def stdin(self) -> IO[bytes] | None:
+        """The pipe whose other end it holds."""
+
+    @property
+    def stdout(self) -> IO[bytes] | None:
+        """An observer's news; None for others."""
+
+    def poll(self) -> int | None:
+        """Its status; None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end. Raises subprocess.TimeoutExpired."""
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it."""
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+
+    def kill(self) -> None:
+        """End it."""
+
+
+class Starter(Protocol):
+    """Starts the process of a role with the file of its brief; an observer's news come on `stdout`."""
+
+    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Process:
+        """Start it. Raises OSError."""
+
+
+def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Process:
+    """Start `evedrop ROLE BRIEF` in a session of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "evedrop", role, str(brief)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE if role == OBSERVER else log,
+        stderr=log,
+        start_new_session=True,
+        env=environment,
+        umask=0o077,
+    )
+
+
 @final
 class Children:
     """The processes of a run; all are ended on leaving the block."""
 
-    def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
+    def __init__(
+        self, folder: HeldFolder, private: Path, lock_step: bool = False, starter: Starter = start_process
+    ) -> None:
         """folder: of the results; private: of the briefs; lock_step: whether processes wait for each other every few slots."""
-        self._folder = folder
+        self._folder, self._starter = folder, starter
         self._lock_step = lock_step
         self._private = private
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes: dict[str, Process] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
         self._unread = 0
         """How many processes were started again and have not joined the run yet; they may not have read their briefs."""
@@ -130,7 +193,6 @@ class Children:
 
         Raises RunError if the system cannot start it.
         """
-        conducts = brief.role == "observer"
         self._briefs[brief.process] = brief
         self._unread += again
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:
@@ -149,15 +211,7 @@ class Children:
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "evedrop", brief.role, str(path)],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE if conducts else log,
-                    stderr=log,
-                    start_new_session=True,
-                    env=environment,
-                    umask=0o077,
-                )
+                process = self._starter(brief.role, path, log, environment)
         except OSError as error:
             raise RunError(
                 f"{brief.process} cannot be started ({error}); free system resources and run again"
@@ -168,15 +222,22 @@ class Children:
         self._processes[brief.process] = process
         threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
 
-    def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
+    def _follow(self, name: str, process: Process) -> None:
         if process.stdout is not None:
             with process.stdout as lines:
                 for line in lines:
-                    with contextlib.suppress(ValueError):
-                        self._news.put(json.loads(line))
+                    try:
+                        self._news.put(read_news(line))
+                    except ValueError as error:
+                        self._refuse(name, error)
         status = process.wait()
         if process.pid not in self._killed:
             self._news.put(Exit(name, status))
+
+    def _refuse(self, name: str, error: ValueError) -> None:
+        """Write into a process's log that the launcher cannot read its news."""
+        with contextlib.suppress(OSError), (self._folder.now / "logs" / f"{name}.log").open("a") as log:
+            log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
 
     def restart_router(self, ended: Exit) -> bool:
         """Restart a router if a signal ended it, a few times at most; returns whether it was restarted."""
@@ -222,17 +283,19 @@ class Children:
         if isinstance(news, Exit):
             return news
         self.silent_seconds = 0.0
-        if news["event"] in {"started", "back", "reconnected"}:
-            self._unread = max(0, self._unread - 1) if self.started else 0  # at the start, all have
-            self.started = True
-            if not self._unread:
-                self._forget_briefs()
-        if news["event"] == ProcessRequest.event:
-            self.act(ProcessRequest.of(news))
-            return None
-        self.over = self.over or news["event"] == "over"
-        self._finishing = self._finishing or news["event"] == "finishing"
-        return None if news["event"] in {"alive", "over", "finishing", "back"} else news
+        match news:
+            case Started() | Back() | ConnectionOutage():
+                self._unread = max(0, self._unread - 1) if self.started else 0  # at the start, all have
+                self.started = True
+                if not self._unread:
+                    self._forget_briefs()
+            case ProcessRequest():
+                self.act(news)
+            case RunOver():
+                self.over = True
+            case Finishing():
+                self._finishing = True
+        return None if isinstance(news, Alive | Back | ProcessRequest | RunOver | Finishing) else news
 
     def _forget_briefs(self) -> None:
         """Delete the briefs: every process has read its own by now, and the keys should not stay on disk."""
@@ -254,7 +317,7 @@ class Children:
                     break
             elif news is not None:
                 tell(news)
-                ending = RunEnded.of(news) if news["event"] == RunEnded.event else ending
+                ending = news if isinstance(news, RunEnded) else ending
         return ending
 
     def terminate(self, name: str, after: float = 0.0) -> None:

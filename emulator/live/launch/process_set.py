@@ -21,7 +21,7 @@ from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
 from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.network.control_file import remove_control
-from evedrop.live.protocol.news import News, RunEnded
+from evedrop.live.protocol.news import FolderMoved, News, RunEnded, ViewOpened
 from evedrop.names import OBSERVER
 from evedrop.results.folder import make_private, new_folder
 from evedrop.results.held_folder import HeldFolder
@@ -72,7 +72,7 @@ def launch_one(
                 # The other processes start up at the same time as the viewer.
                 viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
-                    tell({"event": "view", "address": viewer.address, "warning": viewer.warning})
+                    tell(ViewOpened(viewer.address, viewer.warning))
                 children.start(observer)
                 status = _supervise(children, stop, tell)
                 if viewer is not None:
@@ -99,7 +99,7 @@ def _now(held: HeldFolder, tell: Callable[[News], None]) -> Path:
         return held.first
     remove_control(now)
     if now != held.first:
-        tell({"event": "moved", "folder": str(now)})
+        tell(FolderMoved(str(now)))
     return now
 
 
@@ -169,7 +169,7 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
                 raise RunError(children.failure_report(news, ending))
         elif news is not None:
             tell(news)
-            ending = RunEnded.of(news) if news["event"] == RunEnded.event else None
+            ending = news if isinstance(news, RunEnded) else None
         if ending is not None:
             break
     if ending.status == Interrupted.exit_status:

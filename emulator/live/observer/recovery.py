@@ -10,14 +10,15 @@ Source: docs/protocol.md, lost connections.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, final
+from collections.abc import Callable
+from typing import final
 
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.brief_entries import plain
 from evedrop.live.protocol.commands import Again
+from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.names import OBSERVER, RELAY, ROUTER
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
@@ -25,26 +26,12 @@ _IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before 
 _LONGEST_SECONDS = 30.0
 
 
-@dataclass(frozen=True)
-class ConnectionOutage:
-    """A process that was cut off."""
-
-    process: str
-    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
-    slot: int
-    """The first slot that was not joined when the loss was noticed."""
-    until: int | None
-    """The first slot that was not joined when the run went on; None if it did not."""
-    seconds: float
-    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
-
-
 @final
 class Recovery:
     """Notices lost connections and begins rounds of resending. say: sends news to the launcher."""
 
     def __init__(
-        self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: Callable[..., None]
+        self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: Callable[[News], None]
     ) -> None:
         self._conductor, self._steering, self._flow, self._say = conductor, steering, flow, say
         self._batch_seconds = pace * flow.batch
@@ -99,7 +86,7 @@ class Recovery:
         for name, (slot, since) in self._back.items():
             outage = ConnectionOutage(name, slot, done, now - since)
             self.outages.append(outage)
-            self._say("reconnected", **asdict(outage))
+            self._say(outage)
         self._back = {}
 
     def _miss(self, done: int, now: float) -> None:
@@ -155,6 +142,6 @@ class Recovery:
         self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
 
-    def account(self) -> list[Mapping[str, Any]]:
+    def account(self) -> list[dict[str, object]]:
         """The outages in the form of the summary."""
-        return [asdict(outage) for outage in self.outages]
+        return [plain(outage) for outage in self.outages]

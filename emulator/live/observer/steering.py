@@ -18,7 +18,7 @@ from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
-from evedrop.live.protocol.news import ProcessRequest
+from evedrop.live.protocol.news import Back, Held, News, ProcessRequest
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
@@ -40,7 +40,7 @@ class Steering:
         self,
         scenario: Scenario,
         conductor: Conductor,
-        tell: Callable[..., None],
+        tell: Callable[[News], None],
         keep: Callable[[Scenario], None],
     ) -> None:
         self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep
@@ -145,7 +145,7 @@ class Steering:
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
             if act.kind in ("restart", "resume"):
                 self._conductor.absent -= set(act.names)
-                self._tell("back")
+                self._tell(Back())
             self._waiting = None
             return True
         self._despair(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
@@ -168,7 +168,7 @@ class Steering:
             if act.kind in ("kill", "pause"):
                 self._conductor.absent |= set(act.names)
             self._waiting, self._confirmed, self._since = act, False, time.monotonic()
-            self._tell(**ProcessRequest(act.kind, act.names[0], k, len(self.events)).news)
+            self._tell(ProcessRequest(act.kind, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""
@@ -215,7 +215,7 @@ class Steering:
 
     def _pause(self, k: int, said: str | None = None) -> None:
         self.paused = True
-        self._tell("held", before=k)
+        self._tell(Held(k))
         if said is not None:
             self._note(k, said, "operator")
 
