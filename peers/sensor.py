@@ -8,6 +8,7 @@ from functools import partial
 from typing import final
 
 from evedrop.errors import RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
@@ -37,13 +38,20 @@ class Window:
     sent: the sensor's sent messages, which are forgotten as these processes progress.
     """
 
-    def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: ReplayBuffer) -> None:
+    def __init__(
+        self,
+        session: Session,
+        followers: tuple[str, ...],
+        window: int,
+        sent: ReplayBuffer,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
         self._window, self._sent, self._place = window, sent, session.place
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
         self._keys = {name: session.keys.progress(name) for name in followers}
-        self._news = Mailbox(self._keys, _PROGRESS_BYTES)
+        self._news = Mailbox(self._keys, _PROGRESS_BYTES, clock)
         for name, key in self._keys.items():
             session.funnel(key, partial(self._news.put, name))
 

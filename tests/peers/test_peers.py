@@ -13,7 +13,6 @@ import msgpack
 import numpy as np
 import pytest
 
-import evedrop.live.network.mailbox
 import evedrop.peers.following
 import evedrop.peers.sensor
 from evedrop.errors import EvedropError, Gap, MalformedMessage
@@ -34,6 +33,7 @@ from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
 from evedrop.scenario import Scenario
 from tests.builders import part_of
+from tests.clock import T, TestClock
 from tests.conftest import LIMIT
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
@@ -421,25 +421,22 @@ class WouldWaitError(Exception):
     """The sensor would have to wait for news."""
 
 
-class News(SimpleQueue[tuple[str, bytes]]):
-    """A queue that says so instead of waiting."""
+class Impatient(TestClock):
+    """A clock that says so instead of waiting."""
 
-    def get(self, *_: Any, **__: Any) -> tuple[str, bytes]:
-        """The next news that is there."""
-        if self.empty():
+    def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
+        """The next item that is there."""
+        if queue.empty():
             raise WouldWaitError
-        return super().get()
+        return super().next(queue, timeout)
 
 
 @pytest.mark.parametrize("slowest", ["a", "b", "observer"])
-def test_sensor_is_never_a_window_ahead_of_the_slowest(
-    slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stage) -> None:
     """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
-    monkeypatch.setattr(evedrop.live.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
-    window = Window(session, followers, 10, ReplayBuffer(print))  # type: ignore[arg-type]
+    window = Window(session, followers, 10, ReplayBuffer(print), Impatient())  # type: ignore[arg-type]
 
     def reaches(limit: int) -> None:
         window.wait(limit - 1)

@@ -24,6 +24,7 @@ from typing import Any, Protocol, Self, final
 import zenoh
 
 from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connecting import RouterAddress, Waiting, connected, endpoint_of
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.container_heartbeat import HeartbeatFile
@@ -173,6 +174,7 @@ class Session:
         config: dict[str, Any] | None = None,
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
         zenoh.init_log_from_env_or(_LOGGED)
@@ -189,11 +191,11 @@ class Session:
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
-        self._waiting = Waiting(brief.process, brief.router)
+        self._waiting = Waiting(brief.process, brief.router, clock)
         if config is None or listen is None:
             door = door_of(brief)
             once = _once(door)
-            first = connected(door, self.patience, meanwhile)
+            first = connected(door, self.patience, meanwhile, clock)
             self._connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
         else:
             self._connection = Connection(_listening(listen, brief.identity, config), None)

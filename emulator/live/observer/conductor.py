@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Collection
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.declared import Question
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
@@ -29,16 +29,16 @@ _ROUTERS_SECONDS = 5.0  # for a router to confirm
 class Stop:
     """Set by a signal: the run must end now."""
 
-    def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False, clock: Clock = SYSTEM_CLOCK) -> None:
         """orphaned: whether the launcher is gone, which ends the run, too."""
-        self._orphaned = orphaned
+        self._orphaned, self._clock = orphaned, clock
         self.wanted = False
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
-        deadline = time.monotonic() + patience
-        while not (asked := self.wanted or self._orphaned()) and time.monotonic() < deadline:
-            time.sleep(0.01)
+        deadline = self._clock.monotonic() + patience
+        while not (asked := self.wanted or self._orphaned()) and self._clock.monotonic() < deadline:
+            self._clock.sleep(0.01)
         if asked:
             raise Interrupted("interrupted; the results so far are in the results folder")
 
@@ -53,20 +53,21 @@ class Conductor:
         reporters: tuple[str, ...],
         stop: Stop,
         relayed: bool = False,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """reporters: the processes that report besides router and sensor: the receivers, and a controller."""
-        self._session = session
+        self._session, self._clock = session, clock
         self._stop = stop
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
         """Whether the observer is connected to a relay, and not to the router itself."""
         self._router: str | None = None
         self.lost: dict[str, float] = {}
-        """Process that has vanished from the network → when, on the clock of `time.monotonic`."""
+        """Process that has vanished from the network → when, on the clock."""
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
-        self._news = Mailbox(self.keys, session.allowance)
+        self._news = Mailbox(self.keys, session.allowance, clock)
         for source, key in self.keys.items():
             session.funnel(key, partial(self._news.put, source))
         for name in self._present:
@@ -102,10 +103,10 @@ class Conductor:
 
     def assemble(self) -> None:
         """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
-        deadline = time.monotonic() + self._session.patience
+        deadline = self._clock.monotonic() + self._session.patience
         while self.missing:
             self._stop.check()
-            if time.monotonic() > deadline:
+            if self._clock.monotonic() > deadline:
                 # Do not name processes that wait for another one themselves.
                 names = [name for name in self.missing if not self._reaches(name)]
                 names = names or self.missing
@@ -157,14 +158,14 @@ class Conductor:
         """
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
-        deadline = time.monotonic() + patience
+        deadline = self._clock.monotonic() + patience
         said = 0.0
-        while time.monotonic() < deadline:
+        while self._clock.monotonic() < deadline:
             left = [name for name in others if not self._has_ended(name, told)]
             if not left and self._present[ROUTER]:
                 break
-            if time.monotonic() - said > _END_SECONDS:
-                said = time.monotonic()
+            if self._clock.monotonic() - said > _END_SECONDS:
+                said = self._clock.monotonic()
                 for name in left:
                     if self._present[name]:
                         self.command(name, End())
@@ -179,18 +180,18 @@ class Conductor:
         """Whether a process has left for good: it confirmed its end, or it vanished when told to end and did not return."""
         if self._present[name]:
             return False
-        gone = time.monotonic() - self.lost.get(name, -math.inf)
+        gone = self._clock.monotonic() - self.lost.get(name, -math.inf)
         return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
 
     def _end_router(self, name: str) -> None:
         """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
-        deadline = time.monotonic() + _ROUTERS_SECONDS
+        deadline = self._clock.monotonic() + _ROUTERS_SECONDS
         said = 0.0
-        while time.monotonic() < deadline and name not in self.misdelivered:
+        while self._clock.monotonic() < deadline and name not in self.misdelivered:
             if name == RELAY and not self._present[name] and self._session.linked():
                 return
-            if time.monotonic() - said > _END_SECONDS:
-                said = time.monotonic()
+            if self._clock.monotonic() - said > _END_SECONDS:
+                said = self._clock.monotonic()
                 self.command(name, End())
             self._hear_out(self._next())
 
@@ -210,9 +211,9 @@ class Conductor:
             told = [name for name in names if name in self._commands]
             for name in told:
                 self.command(name, Abandon(why))
-            deadline = time.monotonic() + _ABANDON_SECONDS
-            while any(self._reaches(name) for name in told) and time.monotonic() < deadline:
-                time.sleep(0.01)
+            deadline = self._clock.monotonic() + _ABANDON_SECONDS
+            while any(self._reaches(name) for name in told) and self._clock.monotonic() < deadline:
+                self._clock.sleep(0.01)
 
     def _reaches(self, name: str) -> bool:
         """Whether a process has opened its session; it may still wait for others."""
@@ -232,4 +233,4 @@ class Conductor:
         if there:
             self.lost.pop(name, None)
         else:
-            self.lost.setdefault(name, time.monotonic())
+            self.lost.setdefault(name, self._clock.monotonic())

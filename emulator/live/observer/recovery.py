@@ -9,10 +9,10 @@ Source: docs/protocol.md, lost connections.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import final
 
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
@@ -31,8 +31,15 @@ class Recovery:
     """Notices lost connections and begins rounds of resending. say: sends news to the launcher."""
 
     def __init__(
-        self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: Callable[[News], None]
+        self,
+        conductor: Conductor,
+        steering: Steering,
+        flow: Flow,
+        pace: float,
+        say: Callable[[News], None],
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
+        self._clock = clock
         self._conductor, self._steering, self._flow, self._say = conductor, steering, flow, say
         self._batch_seconds = pace * flow.batch
         self._missing: dict[str, tuple[int, float]] = {}
@@ -40,7 +47,7 @@ class Recovery:
         self._done = 0
         self._target = 0
         """Slots below this were under way when a connection was lost."""
-        self._moved = self._joined = time.monotonic()
+        self._moved = self._joined = self._clock.monotonic()
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
@@ -52,7 +59,7 @@ class Recovery:
 
         Raises RunError if a process has been missing for too long.
         """
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if done > self._done:
             self._go_on(done, now)
         if self._conductor.missing:
@@ -135,7 +142,7 @@ class Recovery:
 
     def give_up(self, done: int) -> None:
         """Record the outages that are open when the run ends with slot `done`."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
