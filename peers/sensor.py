@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import final
 
 from evedrop.errors import RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import SensorPart
 from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import End, Go, Hold, Start
@@ -40,7 +41,7 @@ class Window:
 
     def __init__(
         self,
-        session: Session,
+        session: ProcessSession,
         followers: tuple[str, ...],
         window: int,
         sent: ReplayBuffer,
@@ -93,7 +94,12 @@ class Barriers:
     """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command."""
 
     def __init__(
-        self, brief: Brief[SensorPart], session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
+        self,
+        brief: Brief[SensorPart],
+        session: ProcessSession,
+        window: Window,
+        scheme: Scheme,
+        actuator: Actuator | None,
     ) -> None:
         self._session, self._window = session, window
         self._barriers = set(brief.part.holds)
@@ -127,7 +133,7 @@ class Barriers:
 class Acknowledgements:
     """Waits for the acknowledgements of each slot before the next is sent, and watches for attacks on them."""
 
-    def __init__(self, brief: Brief[SensorPart], session: Session, encoder: Encoder) -> None:
+    def __init__(self, brief: Brief[SensorPart], session: ProcessSession, encoder: Encoder) -> None:
         self._encoder, self._trials = encoder, brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
@@ -143,8 +149,8 @@ class Acknowledgements:
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
 
 
-def sense(brief: Brief[SensorPart]) -> None:
-    """Run the sensor of a brief."""
+def sense(brief: Brief[SensorPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+    """Run the sensor of a brief; connect: opens its session."""
     process, keys, part = brief.model.process, brief.stream_keys, brief.part
     scheme = scheme_of(process, part.scheme)
     encoder = scheme.encoder(keys, brief.batch)
@@ -152,7 +158,7 @@ def sense(brief: Brief[SensorPart]) -> None:
     noise = None if part.plant is None else part.plant.plant.noise
     trajectory = Trajectory(process, keys["process"], brief.batch, initial, noise)
     betrayed, pace = set(part.leaks.values()), part.pace
-    with Session(brief) as session:
+    with connect(brief) as session:
         send = session.kept(session.keys.uplink, head=resend, back=part.history)
         window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, send)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None

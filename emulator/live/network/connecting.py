@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import zenoh
 
@@ -20,6 +20,7 @@ from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief_parts import Identity
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 
 _WAITING_SECONDS = 3.0  # how often a process says that it still waits for its router
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
@@ -40,7 +41,7 @@ class RouterAddress:
     router: str
     """Zenoh endpoint."""
     run: str
-    config: dict[str, Any]
+    config: ZenohConfig
     """Zenoh's configuration for one attempt."""
     identity: Identity | None = None
     process: str = "operator"

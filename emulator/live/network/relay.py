@@ -5,8 +5,6 @@ Source: docs/protocol.md, two routers.
 
 from __future__ import annotations
 
-from typing import Any
-
 from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.linked_routers import at_relay
@@ -15,6 +13,7 @@ from evedrop.live.network.session import ATTEMPT, Session, client_config, door_o
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
 from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 
 
 def relay(brief: Brief[RelayPart]) -> None:
@@ -35,12 +34,12 @@ def relay(brief: Brief[RelayPart]) -> None:
         until_all_left(present)
 
 
-def _opened(brief: Brief[RelayPart], access: dict[str, Any]) -> Session:
+def _opened(brief: Brief[RelayPart], access: ZenohConfig) -> Session:
     with users_file(brief.part.users) as users:
         return Session(brief, _config(brief, str(users), access), brief.part.listen)
 
 
-def _config(brief: Brief[RelayPart], users: str, access: dict[str, Any]) -> dict[str, Any]:
+def _config(brief: Brief[RelayPart], users: str, access: ZenohConfig) -> ZenohConfig:
     """Configuration of a router that also connects to the first router as a client, and reconnects when the link is lost."""
     listening = router_config(brief, users, access, brief.part.listen)
     connecting = client_config(brief)

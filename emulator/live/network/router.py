@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from evedrop.errors import NotRegistered
 from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.delayed_sender import DelayedSender
 from evedrop.live.network.linked_routers import at_router
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.router_commands import Commands, ReplayRequested
 from evedrop.live.network.router_users import until_all_left, users_file
@@ -45,6 +46,7 @@ from evedrop.live.protocol.packets import (
     read_uplink,
 )
 from evedrop.live.protocol.telemetry import Journal
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.model.acknowledgements import AckChannel, WayBackSpec
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
@@ -184,7 +186,7 @@ class Burst:
 class WayBackLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
 
-    def __init__(self, brief: AnyBrief, session: Session, spec: WayBackSpec) -> None:
+    def __init__(self, brief: AnyBrief, session: ProcessSession, spec: WayBackSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
         self._way = AckChannel(spec.attack, spec.quality, key, brief.batch, spec.spans)
         self._jammer = spec.jammer
@@ -235,7 +237,7 @@ def route(brief: Brief[RouterPart]) -> None:
 class Routing:
     """The router's work on an open session."""
 
-    def __init__(self, brief: Brief[RouterPart], session: Session) -> None:
+    def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
         self._uplink = session.inbox(session.keys.uplink)
@@ -391,6 +393,6 @@ class Routing:
         self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
 
 
-def _opened(brief: Brief[RouterPart], access: dict[str, Any]) -> Session:
+def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:
     with users_file(brief.part.users) as users:
         return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

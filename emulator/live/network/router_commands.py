@@ -11,7 +11,7 @@ from queue import SimpleQueue
 from typing import final
 
 from evedrop.errors import EvedropError
-from evedrop.live.network.session import Session
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.protocol.commands import Again, Command, End
 from evedrop.names import ROUTER
 
@@ -30,7 +30,7 @@ class Commands:
 
     def __init__(
         self,
-        session: Session,
+        session: ProcessSession,
         receivers: Collection[str],
         knock: Callable[[], None],
         waiting: Iterable[SimpleQueue[bytes | None]],

@@ -14,12 +14,12 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Protocol, Self, final
+from typing import Protocol, Self, final
 
 import zenoh
 
@@ -41,6 +41,7 @@ from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, reader_of
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.whereabouts import Place
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.names import OBSERVER, ROUTER
 
 READY_SECONDS = 30.0
@@ -51,15 +52,15 @@ _SENT_BYTES = 1 << 20  # under way to one reader: a full buffer would keep Zenoh
 _NEVER_MS = 86_400_000
 _ANSWER_BYTES = 64 * 2**20  # for the operator
 _WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
-ATTEMPT: Mapping[str, Any] = {"open_timeout": int(_LEASE_SECONDS * 1000)}
+ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
 """Zenoh's limit of one attempt to connect again: one that a cut connection has swallowed holds up the next for so long."""
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
 
 
-def _transport(identity: Identity | None, largest: int, listens: bool = False) -> dict[str, Any]:
+def _transport(identity: Identity | None, largest: int, listens: bool = False) -> ZenohConfig:
     # A full queue waits a minute, not five seconds, before it drops a reader: the window bounds the messages under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
-    link: dict[str, Any] = {
+    link: ZenohConfig = {
         "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
         "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
@@ -97,7 +98,7 @@ class Credentials(Protocol):
         """Certificate of the user, if the router takes certificates."""
 
 
-def client_config(entry: Credentials) -> dict[str, Any]:
+def client_config(entry: Credentials) -> ZenohConfig:
     """Zenoh configuration of every process but the router: one connection, to the router, and no scouting for others."""
     largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
@@ -127,7 +128,7 @@ def _once(door: RouterAddress) -> zenoh.Config:
     return zenoh.Config.from_json5(json.dumps(config))
 
 
-def router_config(brief: Brief[RoutingPart], users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
+def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
     """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
     transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
@@ -141,7 +142,7 @@ def router_config(brief: Brief[RoutingPart], users_file: str, access: dict[str, 
     }
 
 
-def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -> zenoh.Session:
+def _listening(listen: str, identity: Identity | None, config: ZenohConfig) -> zenoh.Session:
     """Open a router's session. Raises BriefError if it cannot listen at the address in its brief."""
     endpoint = endpoint_of(listen, identity)
     try:
@@ -171,7 +172,7 @@ class Session:
     def __init__(
         self,
         brief: AnyBrief,
-        config: dict[str, Any] | None = None,
+        config: ZenohConfig | None = None,
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
         clock: Clock = SYSTEM_CLOCK,
