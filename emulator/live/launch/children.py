@@ -6,18 +6,18 @@ import contextlib
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import IO, Protocol, final
+from typing import final
 
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
+from evedrop.live.launch.starter import Process, Starter, start_process
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.news import (
@@ -87,57 +87,6 @@ class Exit:
         if self.status == INTERRUPTED:
             return "was interrupted by a signal"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
-
-
-class Process(Protocol):
-    """The part of `subprocess.Popen` that the launcher uses."""
-
-    @property
-    def pid(self) -> int:
-        """Its id."""
-
-    @property
-    def stdin(self) -> IO[bytes] | None:
-        """The pipe whose other end it holds."""
-
-    @property
-    def stdout(self) -> IO[bytes] | None:
-        """An observer's news; None for others."""
-
-    def poll(self) -> int | None:
-        """Its status; None while it runs."""
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
-
-    def send_signal(self, sig: int) -> None:
-        """Send a signal to it."""
-
-    def terminate(self) -> None:
-        """Ask it to end."""
-
-    def kill(self) -> None:
-        """End it."""
-
-
-class Starter(Protocol):
-    """Starts the process of a role with the file of its brief; an observer's news come on `stdout`."""
-
-    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Process:
-        """Start it. Raises OSError."""
-
-
-def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Process:
-    """Start `evedrop ROLE BRIEF` in a session of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", "evedrop", role, str(brief)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE if role == OBSERVER else log,
-        stderr=log,
-        start_new_session=True,
-        env=environment,
-        umask=0o077,
-    )
 
 
 @final

@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import Protocol, final
 
 import zenoh
 
@@ -32,6 +32,30 @@ _IDLE_SECONDS = 1.0  # a router keeps a connection at least so long on which not
 _AT_ONCE_SECONDS = 0.1
 
 _NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of OpenSSL's X509_V_ERR
+
+
+class Credentials(Protocol):
+    """The router's address, and a user with a password: a brief, or the operator's control file."""
+
+    @property
+    def run(self) -> str:
+        """Name of the run."""
+
+    @property
+    def router(self) -> str:
+        """Zenoh endpoint."""
+
+    @property
+    def user(self) -> str:
+        """Name of the user."""
+
+    @property
+    def password(self) -> str:
+        """Password of the user."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Certificate of the user, if the router takes certificates."""
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ from contextlib import suppress
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Protocol, Self, final
+from typing import Self, final
 
 import zenoh
 
 from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.connecting import RouterAddress, Waiting, connected, endpoint_of
+from evedrop.live.network.connecting import Credentials, RouterAddress, Waiting, connected, endpoint_of
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.container_heartbeat import HeartbeatFile
 from evedrop.live.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
@@ -72,30 +72,6 @@ def _transport(identity: Identity | None, largest: int, listens: bool = False) -
         link["tcp"] = {"so_sndbuf": _SENT_BYTES}
     # Shared memory would expose the router's messages for one receiver to all.
     return {"link": link, "shared_memory": {"enabled": False}}
-
-
-class Credentials(Protocol):
-    """The router's address, and a user with a password: a brief, or the operator's control file."""
-
-    @property
-    def run(self) -> str:
-        """Name of the run."""
-
-    @property
-    def router(self) -> str:
-        """Zenoh endpoint."""
-
-    @property
-    def user(self) -> str:
-        """Name of the user."""
-
-    @property
-    def password(self) -> str:
-        """Password of the user."""
-
-    @property
-    def identity(self) -> Identity | None:
-        """Certificate of the user, if the router takes certificates."""
 
 
 def client_config(entry: Credentials) -> ZenohConfig:
