@@ -1,8 +1,9 @@
-"""The launcher's view of its children: their briefs on disk, and the observer's news; no process is started."""
+"""The launcher's view of its children: their briefs on disk, the observer's news, and how a run ended; no process is started."""
 
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -12,8 +13,10 @@ from typing import IO
 
 import pytest
 
+from evedrop.errors import Interrupted
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import Children, Exit
+from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.protocol.news import ConnectionOutage, News, RunEnded, RunProgress, Started, read_news
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
@@ -28,15 +31,16 @@ class Ended:
     pid: int
     stdout: IO[bytes] | None
     stdin: IO[bytes] | None = None
+    status: int = 0
 
     def poll(self) -> int:
         """It has ended."""
-        return 0
+        return self.status
 
     def wait(self, timeout: float | None = None) -> int:
         """It has ended."""
         del timeout
-        return 0
+        return self.status
 
     def send_signal(self, sig: int) -> None:
         """Nobody is there to take it."""
@@ -52,11 +56,12 @@ class Starting:
     """Starts processes that end at once; an observer writes these lines first."""
 
     lines: bytes = b""
+    status: int = 0
     pids: Iterator[int] = field(default_factory=lambda: itertools.count(1))
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Ended:  # noqa: ARG002 - nothing is run
         """Start one."""
-        return Ended(next(self.pids), BytesIO(self.lines) if role == "observer" else None)
+        return Ended(next(self.pids), BytesIO(self.lines) if role == "observer" else None, None, self.status)
 
 
 class Bench:
@@ -95,6 +100,35 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     one = Bench(tmp_path)
     with closing(one.held), one.children:
         yield one
+
+
+def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Bench) -> None:
+    """The observer, told to end, says that it was complete: so its summary does, and the exit status follows."""
+    stop = threading.Event()
+    stop.set()
+    bench.starter.lines = RunEnded(1, "complete").line
+    bench.children.start(bench.briefs["observer"])
+    assert follow_to_end(bench.children, stop, lambda _: None) == 1
+    bench.starter.lines = RunEnded(130, "interrupted").line
+    bench.children.start(bench.briefs["observer"])
+    with pytest.raises(Interrupted):
+        follow_to_end(bench.children, stop, lambda _: None)
+
+
+MISSED = "evedrop: eve: legitimate, observer did not appear within 30 s, and nobody reads evedrop/r/telemetry/eve; start them\n"
+
+
+@pytest.mark.parametrize("first", [Exit("eve", 3), Exit("observer", 3)])
+def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: Exit) -> None:
+    """Cut off from the router, the observer and all others give up after the same time; it is named, and why."""
+    for name in ("eve", "observer"):
+        bench.starter.status = 3
+        bench.children.start(bench.briefs[name])
+    (bench.results / "logs" / "eve.log").write_text(MISSED)
+    report = bench.children.failure_report(first, RunEnded(3, "no router answered at tcp/127.0.0.1:1 within 30 s"))
+    assert report.startswith("observer"), report
+    assert "logs/observer.log" in report
+    assert "logs/eve.log" not in report
 
 
 PROGRESS = RunProgress(3, 2.5, "slots/s", {"eve": float("inf")})

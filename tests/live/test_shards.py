@@ -178,6 +178,20 @@ def test_progress_is_that_of_the_slowest() -> None:
     assert told[-1] == RunProgress(70, 9.0, "slots/s", {"smart": 3.0})
 
 
+def test_a_shard_that_was_ended_early_has_done_no_more_than_it_said() -> None:
+    """Its end adds the last slots to what it has told only if the run was complete."""
+    told: list[News] = []
+    shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
+    one = OneProgress(shards, told.append)
+    first, second = (one.of(shard) for shard in shards)
+    for tell in (first, second):
+        tell(Started())
+        tell(RunProgress(20, 4.0, "slots/s", {"smart": 4.0}))
+    second(RunEnded(130, "interrupted"))
+    first(RunProgress(70, 9.0, "slots/s", {"smart": 1.0}))
+    assert told[-1] == RunProgress(20, 4.0, "slots/s", {"smart": 3.0})
+
+
 def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_status(evedrop: Evedrop) -> None:
     """No shard is done before its slots have passed, and what is expected is judged once, of all trials."""
     done = evedrop(

@@ -47,6 +47,7 @@ _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
 _ROUTER_LOST = "has had no connection with the router"
+_NOT_THERE = re.compile(rf"evedrop: \S+: .*\b{OBSERVER}\b.* did not appear within")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
@@ -293,6 +294,10 @@ class Children:
         lost = None if first is None else self._lost_by_all(first.process, suspects)
         if lost is not None:
             first, suspects = None, [lost]  # the router is at fault, not the process that gave up first
+        if first is not None and self._missed_observer(first.process):
+            return "\n".join(
+                [f"{OBSERVER}: {why}" if why else f"{OBSERVER} did not appear", *self._log_lines(OBSERVER)]
+            )
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
         if accused and why:
@@ -321,13 +326,20 @@ class Children:
                 if name != OBSERVER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                if status and not ({ROUTER, RELAY} & set(suspects) and self._lost_router(name)):
+                for_others = self._missed_observer(name) or (
+                    {ROUTER, RELAY} & set(suspects) and self._lost_router(name)
+                )
+                if status and not for_others:
                     return Exit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return Exit(suspects[0], 0)
             if time.monotonic() > deadline:
                 return None
             time.sleep(0.01)
+
+    def _missed_observer(self, name: str) -> bool:
+        """Whether a process ended because the observer did not appear."""
+        return any(_NOT_THERE.match(line) for line in self._log(name))
 
     def _lost_router(self, name: str) -> bool:
         """Whether a process ended because it could no longer reach its router."""

@@ -66,9 +66,8 @@ class OneProgress:
             case ConnectionOutage():
                 self._tell(replace(news, shard=number))
             case _:
-                if (
-                    isinstance(news, RunEnded) and number in self._latest
-                ):  # its last slots: too few for a progress report
+                if isinstance(news, RunEnded) and news.well and number in self._latest:
+                    # Its last slots were too few for a progress report.
                     self._latest[number] = replace(self._latest[number], done=self._slots)
                 self._tell(news)
 
