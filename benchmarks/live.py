@@ -24,6 +24,7 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import ObserverPart, SensorPart
 from evedrop.live.protocol.codec import progress
+from evedrop.live.protocol.commands import End, Start
 from evedrop.live.protocol.packets import uplink
 from evedrop.loading import load
 from evedrop.names import LEGITIMATE, ROUTER, SENSOR
@@ -106,13 +107,13 @@ def _send(brief: Brief[SensorPart]) -> None:
             session.funnel(session.keys.progress(name), lambda _: None)
         send = session.outlet(session.keys.uplink)
         session.ready()
-        session.wait_for("start")
+        session.wait_for(Start)
         start = time.monotonic()
         for k in range(brief.slots):
             time.sleep(max(0.0, start + k * brief.part.pace - time.monotonic()))
             times.append(time.monotonic())
             send(uplink(k, z))
-        session.wait_for("end")
+        session.wait_for(End)
     print(json.dumps(times), flush=True)
 
 
@@ -126,7 +127,7 @@ def _receive(brief: AnyBrief) -> None:
             deliveries.recv()
             times.append(time.monotonic())
         put_progress(progress(brief.slots))
-        session.wait_for("end")
+        session.wait_for(End)
     print(json.dumps(times), flush=True)
 
 
@@ -192,7 +193,7 @@ def start_up(rounds: int) -> None:
             code = (
                 "import sys, time\nfrom pathlib import Path\nfrom evedrop.scenario import load\n"
                 "from evedrop.live.launch.launcher import launch\n"
-                "def tell(news):\n    if news['event'] == 'started': print(time.monotonic(), flush=True)\n"
+                "def tell(news):\n    if news.event == 'started': print(time.monotonic(), flush=True)\n"
                 f"launch(load('eavesdroppers', {{'slots': 10}}), Path({folder!r}) / 'run', {view!r}, None, tell)\n"
             )
             start = time.monotonic()

@@ -59,7 +59,7 @@ def run(
 
     made = _prepared(scenario, changes)
     with results_folder(out, _name(scenario)) as folder:
-        ended = launch(made, folder, view, listen, tell)
+        ended = launch(made, folder, view, listen, lambda news: tell(news.plain))
         if ended.viewer is not None:
             ended.viewer.stop()
         return load_results(ended.folder)

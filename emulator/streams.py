@@ -24,6 +24,8 @@ from evedrop.kernels.elementary import normal_quantile
 Words = NDArray[np.uint64]
 Floats = NDArray[np.float64]
 
+MOST_SLOTS = 100_000_000
+"""The most slots of a run."""
 KEY_BYTES = 32
 _AES_BLOCK = 16
 _BLOCK_WORDS = 16_384  # words drawn ahead at once: large enough to hide the cost of a call, small enough for the cache

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import final
 
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
-from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_closed_loop import EstimatorLoop, SensorPlantEntry, decoded
 from evedrop.live.protocol.brief_parts import SensorPart
@@ -18,7 +18,7 @@ from evedrop.model.process import Floats, Trajectory
 from evedrop.model.receiver import Belief, Flags, Receiver
 
 
-def kept_decisive(session: Session, key: str, brief: AnyBrief, period: int) -> ReplayBuffer:
+def kept_decisive(session: ProcessSession, key: str, brief: AnyBrief, period: int) -> ReplayBuffer:
     """A replay buffer for messages of decision slots: each may be needed until the next decision slot."""
     return session.kept(key, brief.flow.window + 1 + period, back=period)
 
@@ -27,7 +27,7 @@ def kept_decisive(session: Session, key: str, brief: AnyBrief, period: int) -> R
 class Decided:
     """Receives the controller's decisions, one in every `period` slots."""
 
-    def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
+    def __init__(self, session: ProcessSession, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
         self._key = session.keys.input
         self._inbox = session.inbox(self._key)
@@ -46,7 +46,7 @@ class Decided:
 class Actuator:
     """The plant at the sensor: moves the state, and waits for the inputs after every slot."""
 
-    def __init__(self, brief: Brief[SensorPart], entry: SensorPlantEntry, session: Session) -> None:
+    def __init__(self, brief: Brief[SensorPart], entry: SensorPlantEntry, session: ProcessSession) -> None:
         plant, loop = entry.plant, brief.part.controller
         self.inputs = 0 if loop is None else plant.inputs
         """How many inputs the controller decides."""
@@ -96,7 +96,7 @@ class Actuator:
 class Consultation:
     """The closed loop at the legitimate estimator: sends its estimate, and may receive the inputs."""
 
-    def __init__(self, brief: AnyBrief, loop: EstimatorLoop, session: Session, receiver: Receiver) -> None:
+    def __init__(self, brief: AnyBrief, loop: EstimatorLoop, session: ProcessSession, receiver: Receiver) -> None:
         self._period = loop.period
         self._put = (
             kept_decisive(session, session.keys.estimate, brief, self._period) if loop.acts_on == "estimate" else None

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.reporting import DecisionReporter
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_closed_loop import decoded
 from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.live.protocol.closed_loop import decided, read_known
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import End
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive
 
 
-def steer(brief: Brief[ControllerPart]) -> None:
-    """Run the controller of a brief."""
+def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+    """Run the controller of a brief; connect: opens its session."""
     part, process = brief.part, brief.model.process
     plant = part.plant.plant
     assignment = part.assignment.assignment(process, plant)
     disturbances = decoded(part.disturbances, brief.slots)
     controller = CONTROLLERS[part.strategy](assignment, brief.trials)
     on_truth = part.acts_on == "truth"
-    with Session(brief) as session:
+    with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
         inbox, put = session.inbox(key), kept_decisive(session, session.keys.input, brief, assignment.period)
         # The observer joins slots without the controller's reports, so all kept reports are sent again.
@@ -43,4 +46,4 @@ def steer(brief: Brief[ControllerPart]) -> None:
             took = time.perf_counter() - began
             put(k, decided(k, u, controller.failed))
             reporter.add(k, u, controller.failed, took)
-        session.wait_for("end")
+        session.wait_for(End)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from evedrop.live.protocol.brief import Brief
+from collections.abc import Callable
+
+from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.peers.following import follow
 
 
-def eavesdrop(brief: Brief[EavesdropperPart]) -> None:
-    """Run the eavesdropper of a brief."""
+def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+    """Run the eavesdropper of a brief; connect: opens its session."""
     knowledge = Knowledge(brief.model.process, brief.model.state_probability, brief.part.parameters, brief.stream_keys)
-    follow(brief, STRATEGIES.imported(brief.part.strategy)(knowledge, brief.batch))
+    follow(brief, STRATEGIES.imported(brief.part.strategy)(knowledge, brief.batch), connect=connect)

@@ -10,13 +10,14 @@ from typing import final
 
 import numpy as np
 
-from evedrop.live.network.declared import Inbox
+from evedrop.live.network.process_session import ProcessSession, Received
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_delivery
 from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Receiver
@@ -29,19 +30,20 @@ def follow(
     brief: Brief[ReceiverPart],
     receiver: Receiver,
     acknowledges: bool = False,
-    consult: Callable[[Session], Consultation] | None = None,
+    consult: Callable[[ProcessSession], Consultation] | None = None,
+    connect: Callable[[AnyBrief], ProcessSession] = Session,
 ) -> None:
     """Run a receiver over all slots of its brief, except those in which it is away.
 
     It may acknowledge packets, and send its estimate to a controller. Deliveries that it already had are acknowledged
-    again, and otherwise ignored.
+    again, and otherwise ignored. connect: opens its session.
     """
     name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part.window
     outages = {start: (stop, keeps) for start, stop, keeps in brief.part.outages}
     follower = Follower(receiver, window, brief.first)
     if brief.first:
         _remember(brief, follower, outages)
-    with Session(brief) as session:
+    with connect(brief) as session:
         downlink = session.keys.downlink(name)
         deliveries = session.inbox(downlink)
         put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
@@ -85,7 +87,7 @@ def follow(
             reporter.add(k, belief, (follower.late, follower.late_used))
             k += 1
         answers.over(deliveries, downlink)
-        session.wait_for("end")
+        session.wait_for(End)
 
 
 @final
@@ -93,7 +95,7 @@ class ReceiverReplies:
     """A receiver's messages to processes other than the observer: acknowledgements, and its estimate to a controller."""
 
     def __init__(
-        self, brief: AnyBrief, session: Session, acknowledges: bool, consultation: Consultation | None
+        self, brief: AnyBrief, session: ProcessSession, acknowledges: bool, consultation: Consultation | None
     ) -> None:
         self._trials = brief.trials
         self._acknowledge = session.outlet(session.keys.acknowledged) if acknowledges else None
@@ -116,12 +118,12 @@ class ReceiverReplies:
         if self._consultation is not None:
             self._consultation.after(k, belief)
 
-    def over(self, deliveries: Inbox, key: str) -> None:
+    def over(self, deliveries: Received, key: str) -> None:
         """After the last slot, acknowledge deliveries that still arrive, on a thread of its own that ends with the session."""
         if self._acknowledge is not None:
             threading.Thread(target=self._go_on, args=(deliveries, key), name="acknowledges", daemon=True).start()
 
-    def _go_on(self, deliveries: Inbox, key: str) -> None:
+    def _go_on(self, deliveries: Received, key: str) -> None:
         for delivery in deliveries:
             message = Reader(key, delivery)
             if not is_barrier(message):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import LegitimatePart
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.schemes import scheme_of
@@ -12,11 +15,11 @@ from evedrop.peers.closed_loop import Consultation
 from evedrop.peers.following import follow
 
 
-def estimate(brief: Brief[LegitimatePart]) -> None:
-    """Run the legitimate estimator of a brief."""
+def estimate(brief: Brief[LegitimatePart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+    """Run the legitimate estimator of a brief; connect: opens its session."""
     scheme = scheme_of(brief.model.process, brief.part.scheme)
     receiver, loop = scheme.estimator(brief.stream_keys, brief.batch), brief.part.controller
     if loop is not None and loop.plant is not None:
         receiver = InputAwareEstimator(receiver, loop.plant.plant, brief.part.window)
     consult = partial(Consultation, brief, loop, receiver=receiver) if loop is not None else None
-    follow(brief, receiver, scheme.needs_acknowledgements, consult)
+    follow(brief, receiver, scheme.needs_acknowledgements, consult, connect)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from functools import partial
 from typing import final
 
 from evedrop.errors import RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import SensorPart
-from evedrop.live.protocol.codec import Reader, read_progress, shown
+from evedrop.live.protocol.codec import Reader, read_progress
+from evedrop.live.protocol.commands import End, Go, Hold, Start
 from evedrop.live.protocol.packets import PacketExtras, barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
 from evedrop.model.numeric.detection import CusumBatch
@@ -35,15 +39,22 @@ class Window:
     sent: the sensor's sent messages, which are forgotten as these processes progress.
     """
 
-    def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: ReplayBuffer) -> None:
+    def __init__(
+        self,
+        session: ProcessSession,
+        followers: tuple[str, ...],
+        window: int,
+        sent: ReplayBuffer,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
         self._window, self._sent, self._place = window, sent, session.place
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
         self._keys = {name: session.keys.progress(name) for name in followers}
-        self._news = Mailbox(self._keys, _PROGRESS_BYTES)
+        self._news = Mailbox(self._keys, _PROGRESS_BYTES, clock)
         for name, key in self._keys.items():
-            session.funnel(key, lambda payload, name=name: self._news.put(name, payload))  # type: ignore[misc]
+            session.funnel(key, partial(self._news.put, name))
 
     @property
     def followers(self) -> tuple[str, ...]:
@@ -83,7 +94,12 @@ class Barriers:
     """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command."""
 
     def __init__(
-        self, brief: Brief[SensorPart], session: Session, window: Window, scheme: Scheme, actuator: Actuator | None
+        self,
+        brief: Brief[SensorPart],
+        session: ProcessSession,
+        window: Window,
+        scheme: Scheme,
+        actuator: Actuator | None,
     ) -> None:
         self._session, self._window = session, window
         self._barriers = set(brief.part.holds)
@@ -94,8 +110,8 @@ class Barriers:
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
-        while (command := self._session.commanded()) is not None:
-            if command.text("do") == "hold":
+        while (command := self._session.commanded(self._window.followers)) is not None:
+            if isinstance(command, Hold):
                 self._barriers.add(k)
         return k in self._barriers
 
@@ -105,22 +121,19 @@ class Barriers:
         self._telemetry(k, held(k))
         # The command may arrive more than once, and may belong to an earlier barrier.
         with self._session.place.waiting(self._session.keys.control(SENSOR)):
-            while (command := self._session.command()).text("do") != "go" or command.integer("k") != k:
+            while not isinstance(go := self._session.command(self._window.followers), Go) or go.slot != k:
                 pass
-        absent = command.names("absent")
-        if not set(absent) <= set(self._window.followers):
-            raise command.malformed(f"absent = {shown(absent)}", f"some of {', '.join(self._window.followers)}")
-        self._window.go_on(k, absent)
+        self._window.go_on(k, go.absent or ())
         self._barriers = {slot for slot in self._barriers if slot > k}
-        if command.has("until"):
-            self._barriers.add(command.integer("until"))
+        if go.until is not None:
+            self._barriers.add(go.until)
 
 
 @final
 class Acknowledgements:
     """Waits for the acknowledgements of each slot before the next is sent, and watches for attacks on them."""
 
-    def __init__(self, brief: Brief[SensorPart], session: Session, encoder: Encoder) -> None:
+    def __init__(self, brief: Brief[SensorPart], session: ProcessSession, encoder: Encoder) -> None:
         self._encoder, self._trials = encoder, brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
@@ -136,8 +149,8 @@ class Acknowledgements:
         return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
 
 
-def sense(brief: Brief[SensorPart]) -> None:
-    """Run the sensor of a brief."""
+def sense(brief: Brief[SensorPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+    """Run the sensor of a brief; connect: opens its session."""
     process, keys, part = brief.model.process, brief.stream_keys, brief.part
     scheme = scheme_of(process, part.scheme)
     encoder = scheme.encoder(keys, brief.batch)
@@ -145,14 +158,14 @@ def sense(brief: Brief[SensorPart]) -> None:
     noise = None if part.plant is None else part.plant.plant.noise
     trajectory = Trajectory(process, keys["process"], brief.batch, initial, noise)
     betrayed, pace = set(part.leaks.values()), part.pace
-    with Session(brief) as session:
+    with connect(brief) as session:
         send = session.kept(session.keys.uplink, head=resend, back=part.history)
         window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, send)
         back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
         actuator = Actuator(brief, part.plant, session) if part.plant is not None else None
         barriers = Barriers(brief, session, window, scheme, actuator)
         session.ready()
-        session.wait_for("start")
+        session.wait_for(Start)
         start = time.monotonic()
         for k in range(brief.slots):
             session.place.slot = k
@@ -181,4 +194,4 @@ def sense(brief: Brief[SensorPart]) -> None:
             alarms = back.wait(k, packet) if back is not None else None
             steered = actuator.wait(k, true) if actuator is not None else None
             barriers.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
-        session.wait_for("end")
+        session.wait_for(End)

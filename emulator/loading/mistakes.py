@@ -45,6 +45,7 @@ from evedrop.scenario.tables import (
     Scenario,
 )
 from evedrop.scenario.words import as_toml, listed, no_entry
+from evedrop.streams import MOST_SLOTS
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
 _ROOTS: Mapping[str, type[BaseModel]] = {LinkTable.__name__: LinkTable}
@@ -146,7 +147,7 @@ def across_tables(tables: Mapping[str, Any], beyond_horizon: bool, scenario: Sce
         process = ProcessTable.model_validate(tables.get("process")).process
     except ValidationError:
         process = None
-    if process is not None and not beyond_horizon and type(slots) is int and 1 <= slots <= 100_000_000:
+    if process is not None and not beyond_horizon and type(slots) is int and 1 <= slots <= MOST_SLOTS:
         found += _horizon_mistakes(process, slots)
     if type(trials) is int and type(recorded) is int and recorded > trials > 0:
         found.append(f"record_trials: is {recorded}; expected at most trials, which is {trials}")

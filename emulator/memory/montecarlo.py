@@ -20,7 +20,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import expected_traces_of
 from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BatchResult, Task, tasks_of
-from evedrop.memory.workers import connected, in_processes, in_this_process, on_cluster
+from evedrop.memory.workers import REACH_SECONDS, connected, in_processes, in_this_process, on_cluster
 from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
@@ -53,6 +53,8 @@ class Plan:
     """None: chosen for this machine and the amount of work."""
     scheduler: str | None = None
     """Address of a Dask scheduler whose cluster then does the work."""
+    patience: float = REACH_SECONDS
+    """Seconds for the scheduler to answer."""
 
     def workers_for(self, scenario: Scenario) -> int:
         """The number of workers. Raises UsageError if it is not positive."""
@@ -79,7 +81,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
     def ending(how: str) -> Ending:
         return Ending(time.monotonic() - started, how, replay_of(folder, scenario, plan.mode.value))
 
-    with stop_on_signals() as stop, connected(plan.scheduler) as client:
+    with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
         tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
         with contextlib.closing(HeldFolder(new_folder(folder))) as held, disk_errors(folder):
             write_resolved(folder, scenario)

@@ -25,7 +25,8 @@ from evedrop.scenario.dry_run import foreign
 
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 10.0  # after a stop, for the current chunk of slots
-_REACH_SECONDS = 5.0
+REACH_SECONDS = 5.0
+"""For a Dask scheduler to answer."""
 
 Tell = Callable[[int], None]
 Stopped = Callable[[], bool]
@@ -182,8 +183,8 @@ def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
 
 
 @contextlib.contextmanager
-def connected(scheduler: str | None) -> Iterator[Any]:
-    """A client of the Dask scheduler at an address; None without an address.
+def connected(scheduler: str | None, patience: float = REACH_SECONDS) -> Iterator[Any]:
+    """A client of the Dask scheduler at an address, which answers within `patience` seconds; None without an address.
 
     Raises UsageError if it cannot be reached or the extra `cluster` is not installed.
     """
@@ -199,16 +200,16 @@ def connected(scheduler: str | None) -> Iterator[Any]:
         raise UsageError("--scheduler needs Dask: pip install 'evedrop[cluster]'") from error
 
     async def reach() -> None:  # a client without a scheduler may hang, and prints useless messages
-        reached = connect(scheduler, timeout=_REACH_SECONDS)  # type: ignore[no-untyped-call]
-        comm = await asyncio.wait_for(reached, _REACH_SECONDS)
+        reached = connect(scheduler, timeout=patience)  # type: ignore[no-untyped-call]
+        comm = await asyncio.wait_for(reached, patience)
         await comm.close()
 
     try:
         asyncio.run(reach())
-        client = Client(scheduler, timeout=_REACH_SECONDS, set_as_default=False)  # type: ignore[no-untyped-call]
+        client = Client(scheduler, timeout=patience, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there within {_REACH_SECONDS:g} s; start one with "
+            f"--scheduler {scheduler}: no Dask scheduler answers there within {patience:g} s; start one with "
             "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
         ) from error
     with contextlib.closing(client):

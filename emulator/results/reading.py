@@ -20,9 +20,9 @@ from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is
 from evedrop.results.input_table import inputs_schema_in
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, trials_schema
+from evedrop.streams import MOST_SLOTS
 
 _MOST_BYTES = 2**28
-_LAST_SLOT = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _is_event(found: Any) -> bool:
     return (
         isinstance(found, dict)
         and type(found.get("slot")) is int
-        and 0 <= found["slot"] <= _LAST_SLOT
+        and 0 <= found["slot"] <= MOST_SLOTS
         and all(isinstance(found.get(name), str) for name in ("event", "by"))
     )
 

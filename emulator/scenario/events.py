@@ -12,6 +12,7 @@ from pydantic import Field
 
 from evedrop.scenario.table import Found, Table
 from evedrop.scenario.words import listed
+from evedrop.streams import MOST_SLOTS
 
 LASTING = ("set", "cut", "partition", "kill", "pause", "jam")
 """The kinds that can last `from` one slot `to` another."""
@@ -19,7 +20,7 @@ KINDS = (*LASTING, "heal", "restart", "resume", "note")
 """All kinds; an event has exactly one of them."""
 
 Names = str | list[str]
-Slot = Annotated[int, Field(strict=True, ge=0, le=100_000_000, examples=[400])]
+Slot = Annotated[int, Field(strict=True, ge=0, le=MOST_SLOTS, examples=[400])]
 
 
 class EventTable(Table):

@@ -44,6 +44,7 @@ from evedrop.scenario.table import Found, Probability, ProcessName, Table, again
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.words import as_toml, listed, no_entry
+from evedrop.streams import MOST_SLOTS
 
 SECRET_BYTES = 32
 MOST_SECRET_BYTES = 2**20
@@ -218,7 +219,7 @@ class Scenario(Table):
     """One scenario, with all checks passed."""
 
     title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
-    slots: Annotated[int, Field(ge=1, le=100_000_000, strict=True, examples=[2000])]
+    slots: Annotated[int, Field(ge=1, le=MOST_SLOTS, strict=True, examples=[2000])]
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
     first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0

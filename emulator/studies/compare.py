@@ -54,7 +54,7 @@ def compare_all(matchups: Matchups, folder: Path, tell: Callable[[News], None], 
     told = teller(tell, sum(group.scenario.trials * group.scenario.slots for group in groups))
     played: list[tuple[Group, Merger]] = []
     failure: RunError | None = None
-    with stop_on_signals() as stop, connected(plan.scheduler) as client:
+    with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
         new_folder(folder)
         everything = list(itertools.chain(*tasks))
         with (

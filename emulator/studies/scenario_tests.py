@@ -123,7 +123,7 @@ def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
     if manner.in_memory:
         simulate(scenario, folder, _silent, Plan(workers=manner.workers))
         return folder
-    return launch(scenario, folder, "off", None, _silent).folder
+    return launch(scenario, folder, "off", None, lambda _: None).folder
 
 
 def _silent(news: Mapping[str, Any]) -> None:

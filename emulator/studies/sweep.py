@@ -99,7 +99,7 @@ def sweep_over(
     failure: RunError | None = None
     done = 0
     description = {"scenario": str(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
-    with stop_on_signals() as stop, connected(plan.scheduler) as client:
+    with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
         new_folder(folder)
         told = teller(tell, total)
         everything = list(itertools.chain(*tasks))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -243,13 +244,8 @@ def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, 
     name = "suspicious" if kind is Forgetful else "naive"
     listening = Listening(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
     if kind is Boastful:
-        listening = Listening("boastful", kind, parameters, listening.scheme_of, Innovation)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(STRATEGIES, "_built_in", {"boastful": Boastful})
-            found = broken(eavesdropper_verdicts(listening))
-    else:
-        found = broken(eavesdropper_verdicts(listening))
-    assert said in found[rule]
+        listening = replace(listening, name=f"{__name__}:Boastful")
+    assert said in broken(eavesdropper_verdicts(listening))[rule]
 
 
 class Better(Bernoulli):

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from evedrop.live.observer import conductor
 from evedrop.live.observer.conductor import Conductor, Stop
-from evedrop.live.protocol.codec import Reader, over
+from evedrop.live.protocol.codec import over
+from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.keys import RunKeys
+from tests.clock import TestClock
 
 RUN = "r"
 NAMES = ("router", "relay", "sensor", "legitimate", "smart")
@@ -46,7 +46,7 @@ class Network:
         name = key.rpartition("/")[2]
 
         def put(payload: bytes) -> None:
-            assert Reader(key, payload).text("do") == "end"
+            assert payload == End().pack()
             self.told[name] += 1
             if name in self.does:
                 self.does[name](self.told[name])
@@ -73,21 +73,19 @@ class Network:
 
 
 @pytest.fixture
-def network(monkeypatch: pytest.MonkeyPatch) -> Network:
-    """A network whose conductor has less patience."""
-    for name in ("_END_SECONDS", "_LOOK_SECONDS"):
-        monkeypatch.setattr(conductor, name, 0.02)
-    monkeypatch.setattr(conductor, "_RETURN_SECONDS", 0.3)
+def network() -> Network:
+    """A network whose processes are all there."""
     return Network()
 
 
 def ended(network: Network, patience: float = 30.0) -> tuple[Conductor, float]:
     """The conductor of a run that has told its end, and the seconds that this took."""
-    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True)  # type: ignore[arg-type]
+    clock = TestClock()
+    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=clock)  # type: ignore[arg-type]
     one.assemble()
-    began = time.monotonic()
+    began = clock.now
     one.end(patience)
-    return one, time.monotonic() - began
+    return one, clock.now - began
 
 
 def test_everybody_is_told_once(network: Network) -> None:
@@ -119,7 +117,7 @@ def test_a_process_that_vanishes_without_a_word_is_not_waited_for_long(network: 
     one, seconds = ended(network)
     assert network.told["smart"] == 1
     assert "smart" not in one.misdelivered
-    assert 0.3 <= seconds < 10.0
+    assert 3.0 <= seconds < 4.0
 
 
 def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
@@ -129,11 +127,11 @@ def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
         network.ends("sensor")
         network.watches["smart"](True)
 
-    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True)  # type: ignore[arg-type]
+    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=TestClock())  # type: ignore[arg-type]
     one.assemble()
     network.watches["smart"](False)
     network.does["sensor"] = gone
-    one._note(one._next())
+    assert one.news() is None
     one.end(30.0)
     assert network.told["smart"] == 1
     assert "smart" in one.misdelivered

@@ -13,6 +13,8 @@ import pytest
 
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.commands import Again, Command
+from evedrop.live.protocol.news import News
 from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
@@ -339,10 +341,10 @@ class Conducted:
         """As the test says."""
         return self.another_router
 
-    def command(self, name: str, do: str, **fields: Any) -> None:
+    def command(self, name: str, command: Command) -> None:
         """Note the rounds."""
-        if name == "sensor" and do == "again":
-            self.rounds.append(fields["k"])
+        if name == "sensor" and isinstance(command, Again):
+            self.rounds.append(command.slot)
 
     def start(self) -> None:
         """Nothing to start."""
@@ -356,13 +358,13 @@ class Conducted:
 
 def test_losses_that_overlap_are_one_outage() -> None:
     """One entry for each process that was cut off, from its first loss to when slots are joined again; then another."""
-    conducted, said = Conducted(), list[str]()
+    conducted, said = Conducted(), list[News]()
     recovery = Recovery(
         conducted,  # type: ignore[arg-type]
         conducted,  # type: ignore[arg-type]
         Flow(32, 8, 30.0),
         0.0,
-        lambda event, **outage: said.append(f"{event} {outage['process']}"),
+        said.append,
     )
     recovery.look(10)
     for lost in (
@@ -384,4 +386,4 @@ def test_losses_that_overlap_are_one_outage() -> None:
     recovery.look(13)
     found = [(one.process, one.slot, one.until) for one in recovery.outages]
     assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
-    assert said == [f"reconnected {name}" for name in ("smart", "sensor", "router")]
+    assert said == recovery.outages

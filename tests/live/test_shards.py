@@ -17,7 +17,7 @@ from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shard import shards_of
 from evedrop.live.launch.shards import OneProgress
-from evedrop.live.protocol.news import RunEnded
+from evedrop.live.protocol.news import News, RunEnded, RunProgress, Started
 from evedrop.loading import load
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results
@@ -163,20 +163,33 @@ def test_shards_are_contiguous_and_as_equal_as_can_be() -> None:
 
 def test_progress_is_that_of_the_slowest() -> None:
     """Nothing is told before all have begun, and never more than all have done."""
-    told: list[Mapping[str, Any]] = []
+    told: list[News] = []
     shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
     one = OneProgress(shards, told.append)
     first, second = (one.of(shard) for shard in shards)
-    first({"event": "started"})
-    first({"event": "progress", "done": 50, "rate": 9.0, "rate_unit": "slots/s", "squared_errors": {"smart": 1.0}})
+    first(Started())
+    first(RunProgress(50, 9.0, "slots/s", {"smart": 1.0}))
     assert told == []
-    second({"event": "started"})
-    second({"event": "progress", "done": 20, "rate": 4.0, "rate_unit": "slots/s", "squared_errors": {"smart": 4.0}})
-    assert [news["event"] for news in told] == ["started", "progress"]
-    assert (told[1]["done"], told[1]["rate"], told[1]["squared_errors"]) == (20, 4.0, {"smart": 3.0})
-    second(RunEnded(0, "complete").news)
-    first({"event": "progress", "done": 70, "rate": 9.0, "rate_unit": "slots/s", "squared_errors": {"smart": 1.0}})
-    assert told[-1]["done"] == 70
+    second(Started())
+    second(RunProgress(20, 4.0, "slots/s", {"smart": 4.0}))
+    assert told == [Started(), RunProgress(20, 4.0, "slots/s", {"smart": 3.0})]
+    second(RunEnded(0, "complete"))
+    first(RunProgress(70, 9.0, "slots/s", {"smart": 1.0}))
+    assert told[-1] == RunProgress(70, 9.0, "slots/s", {"smart": 3.0})
+
+
+def test_a_shard_that_was_ended_early_has_done_no_more_than_it_said() -> None:
+    """Its end adds the last slots to what it has told only if the run was complete."""
+    told: list[News] = []
+    shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
+    one = OneProgress(shards, told.append)
+    first, second = (one.of(shard) for shard in shards)
+    for tell in (first, second):
+        tell(Started())
+        tell(RunProgress(20, 4.0, "slots/s", {"smart": 4.0}))
+    second(RunEnded(130, "interrupted"))
+    first(RunProgress(70, 9.0, "slots/s", {"smart": 1.0}))
+    assert told[-1] == RunProgress(20, 4.0, "slots/s", {"smart": 3.0})
 
 
 def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_status(evedrop: Evedrop) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import pytest
 
 from evedrop.errors import Silence
-from evedrop.live.observer import stall
 from evedrop.live.observer.stall import Stall, patience_of, silent_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Whereabouts
+from tests.clock import TestClock
 
 KEYS = RunKeys("r")
 WINDOW = 100
@@ -118,27 +118,15 @@ def test_who_is_silent(what: str) -> None:
     assert silent_of(places, answers, ["controller"]) == silent
 
 
-class Clock:
-    """In the place of the module `time`."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def monotonic(self) -> float:
-        """What the test has set."""
-        return self.now
-
-
 class Run:
     """A run that stands still, watched."""
 
-    def __init__(self, patience: float, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.clock = Clock()
-        monkeypatch.setattr(stall, "time", self.clock)
+    def __init__(self, patience: float) -> None:
+        self.clock = TestClock()
         self.asked = 0
         self.answers: dict[str, Whereabouts] = {}
         self.places = {"sensor": 60, "router": 60, "eve": 50}
-        self.stall = Stall(patience, 10, self.ask)
+        self.stall = Stall(patience, 10, self.ask, self.clock)
 
     def ask(self) -> None:
         """Everybody is asked, and answers."""
@@ -160,9 +148,9 @@ class Run:
         return self.places
 
 
-def test_a_silent_process_is_named_after_the_patience_and_not_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_process_is_named_after_the_patience_and_not_before() -> None:
     """Seconds of a run in which nothing happens are counted, from its last slot on; then the process is named."""
-    run = Run(20.0, monkeypatch)
+    run = Run(20.0)
     run.answers = {"eve": at(55)}
     run.wait(3.0)
     run.wait(0.25, done=50)
@@ -175,11 +163,9 @@ def test_a_silent_process_is_named_after_the_patience_and_not_before(monkeypatch
 
 
 @pytest.mark.parametrize("how", ["held", "missing", "asleep", "joined"])
-def test_time_in_which_nobody_is_expected_to_do_anything_does_not_count(
-    how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_time_in_which_nobody_is_expected_to_do_anything_does_not_count(how: str) -> None:
     """While the run is held or paused, somebody is cut off, this machine sleeps, or slots are joined, nobody is silent."""
-    run = Run(20.0, monkeypatch)
+    run = Run(20.0)
     run.answers = {"eve": at(55)}
     run.wait(15.0)
     if how == "asleep":
@@ -194,17 +180,17 @@ def test_time_in_which_nobody_is_expected_to_do_anything_does_not_count(
         run.wait(25.0, done=run.places["eve"])
 
 
-def test_a_slow_process_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_process_is_not_silent() -> None:
     """One that takes longer for a batch than the patience, but goes on from slot to slot, is waited for."""
-    run = Run(20.0, monkeypatch)
+    run = Run(20.0)
     for slot in range(50, 60):
         run.answers = {"eve": at(slot)}
         run.wait(15.0)
 
 
-def test_slots_beyond_the_next_report_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slots_beyond_the_next_report_are_not_believed() -> None:
     """A process that says again and again that it goes on, but never reports, is silent all the same."""
-    run = Run(20.0, monkeypatch)
+    run = Run(20.0)
     slot = 50
 
     def go_on() -> None:

@@ -10,12 +10,19 @@ import pytest
 from evedrop.live.network.operator import Answer, Request, read_answer
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
+from evedrop.live.protocol.commands import Command, Go, Hold, LinkChange
+from evedrop.live.protocol.news import Held, News
 from evedrop.loading import checked
+from evedrop.model.slot.link import Change
 from evedrop.scenario import Scenario
 from tests.builders import scalar_tables
 
 SLOTS = 100
 TABLES = scalar_tables(1.0, 0.01, slots=SLOTS, eavesdroppers={"smart": {"strategy": "smart", "link": {"quality": 0.7}}})
+
+
+Sent = tuple[str, Command]
+"""A process, and what it is told."""
 
 
 @dataclass
@@ -36,17 +43,17 @@ class Told:
 
     absent: set[str] = field(default_factory=set)
     away: set[str] = field(default_factory=set)
-    sent: list[tuple[Any, ...]] = field(default_factory=list)
+    sent: list[Sent] = field(default_factory=list)
 
-    def command(self, name: str, do: str, **fields: Any) -> None:
+    def command(self, name: str, command: Command) -> None:
         """Keep it."""
-        self.sent.append((name, do, *([fields] if fields else [])))
+        self.sent.append((name, command))
 
     def there(self, name: str) -> bool:
         """Whether it is."""
         return name not in self.away
 
-    def told(self) -> list[tuple[Any, ...]]:
+    def told(self) -> list[Sent]:
         """All since the last time."""
         found, self.sent = self.sent, []
         return found
@@ -58,12 +65,12 @@ class Run:
     def __init__(self, *events: dict[str, Any]) -> None:
         self.conductor = Told()
         self.kept: list[Scenario] = []
-        self.news: list[tuple[str, dict[str, Any]]] = []
+        self.news: list[News] = []
         scenario = checked({**TABLES, "event": list(events)}, "test")
         self.steering = Steering(
             scenario,
             self.conductor,  # type: ignore[arg-type]
-            lambda event, **news: self.news.append((event, news)),
+            self.news.append,
             self.kept.append,
         )
 
@@ -73,7 +80,7 @@ class Run:
         self.steering.take(Order(Request(do, **fields), asked), reported)  # type: ignore[arg-type]
         return asked
 
-    def holds(self, k: int) -> list[tuple[Any, ...]]:
+    def holds(self, k: int) -> list[Sent]:
         """The sensor holds before slot k, and then everybody has reported; what the others were told."""
         self.conductor.told()
         self.steering.held(k)
@@ -92,18 +99,18 @@ SET = {"link": "legitimate", "set": {"quality": 0.2}}
 SETTINGS = {"loss": {"model": "bernoulli", "quality": 0.2}}
 
 
-def go(k: int, **until: int) -> list[tuple[Any, ...]]:
+def go(k: int, until: int | None = None) -> list[Sent]:
     """What is told when the run goes on with slot k, perhaps for some slots."""
-    return [("router", "go", {"k": k}), ("sensor", "go", {"k": k, "absent": [], **until})]
+    return [("router", Go(k)), ("sensor", Go(k, (), until))]
 
 
 def test_a_change_is_made_between_two_slots() -> None:
     """The sensor is asked to hold; when it does the router is told, the scenario kept, the run let go, and the slot answered."""
     run = Run()
     asked = run.asks("link", event=SET)
-    assert run.conductor.told() == [("sensor", "hold")]
-    change = {"link": "legitimate", "changes": [{"at": 17, "settings": SETTINGS}]}
-    assert run.holds(17) == [("router", "change", change), *go(17)]
+    assert run.conductor.told() == [("sensor", Hold())]
+    change = LinkChange("legitimate", (Change(17, SETTINGS),))
+    assert run.holds(17) == [("router", change), *go(17)]
     assert asked.answers == [Answer(17, "from slot 17 on: link legitimate: quality = 0.2")]
     assert run.events == [(17, "link legitimate: quality = 0.2", "operator")]
     assert [one.model_dump(exclude_none=True)["event"] for one in run.kept] == [[{"at": 17, **SET}]]
@@ -114,17 +121,17 @@ def test_what_the_scenario_changes_later_is_told_again() -> None:
     later = {"at": 50, "link": "legitimate", "set": {"reorder": 0.5, "delay": {"model": "constant", "value": 1.0}}}
     run = Run(later, {"at": 60, "cut": "smart"})
     run.asks("link", event=SET)
-    _, _, fields = run.holds(17)[0]
+    _, change = run.holds(17)[0]
     both = {**SETTINGS, "reorder": 0.5, "delay": {"model": "constant", "value": 1.0}}
-    assert fields["changes"] == [{"at": 17, "settings": SETTINGS}, {"at": 50, "settings": both}]
+    assert change == LinkChange("legitimate", (Change(17, SETTINGS), Change(50, both)))
 
 
 def test_two_operators_are_served_in_the_order_they_came() -> None:
     """Both changes are made at one hold, for which the sensor is asked once; the second sees what the first did."""
     run = Run()
     first, second, third = (run.asks("link", event=event) for event in (SET, {"cut": "smart"}, {"cut": "smart"}))
-    assert run.conductor.told() == [("sensor", "hold")]
-    assert [one[1] for one in run.holds(8)] == ["change", "change", "go", "go"]
+    assert run.conductor.told() == [("sensor", Hold())]
+    assert [one.do for _, one in run.holds(8)] == ["change", "change", "go", "go"]
     assert first.answers[0].slot == second.answers[0].slot == 8
     assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected a heal before",)
 
@@ -164,7 +171,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     assert run.events == []
     run.steering.left("smart", 30)
     run.steering.carry_on(30)
-    assert [event for event, _ in run.news] == ["act"]
+    assert [news.event for news in run.news] == ["act"]
     asked = run.asks("link", event=SET)
     run.steering.carry_on(30)
     assert run.conductor.told() == []
@@ -172,7 +179,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     run.steering.done(1)
     run.conductor.away.add("smart")
     run.steering.carry_on(30)
-    assert [one[1] for one in run.conductor.told()] == ["change", "go", "go"]
+    assert [one.do for _, one in run.conductor.told()] == ["change", "go", "go"]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["kill smart", "link legitimate: quality = 0.2"]
 
@@ -181,7 +188,7 @@ def test_a_wish_to_hold_that_meets_one_of_the_scenario_is_done_there() -> None:
     """The hold that was asked for and the scenario's are one; the scenario's event comes first, and nothing is held twice."""
     run = Run({"at": 30, "cut": "smart"})
     asked = run.asks("link", event={"heal": "smart"})
-    assert [one[1] for one in run.holds(30)] == ["change", "go", "go"]
+    assert [one.do for _, one in run.holds(30)] == ["change", "go", "go"]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["cut smart", "heal smart"]
 
@@ -195,7 +202,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     second = run.asks("pause")
     changed = run.asks("link", event=SET)
     run.steering.carry_on(12)
-    assert [one[1] for one in run.conductor.told()] == ["change"]
+    assert [one.do for _, one in run.conductor.told()] == ["change"]
     assert second.answers == [Answer(12, "held already, before slot 12")]
     assert changed.answers[0].slot == 12
     resumed = run.asks("resume")
@@ -203,7 +210,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     assert run.conductor.told() == go(12)
     assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
     assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
-    assert ("held", {"before": 12}) in run.news
+    assert Held(12) in run.news
 
 
 def test_resuming_a_run_that_goes_on_holds_nothing() -> None:
@@ -223,7 +230,7 @@ def test_a_step_lets_slots_pass_and_holds_again() -> None:
     assert run.conductor.told() == go(12, until=17)
     assert run.holds(14) == go(14, until=17)
     changed = run.asks("link", event=SET)
-    assert [one[1] for one in run.holds(15)] == ["change", "go", "go"]
+    assert [one.do for _, one in run.holds(15)] == ["change", "go", "go"]
     assert changed.answers[0].slot == 15
     assert stepped.answers == []
     assert run.holds(17) == []
@@ -235,7 +242,7 @@ def test_a_step_of_a_run_that_goes_on_holds_it_first() -> None:
     """The slots are counted from the slot before which it is held."""
     run = Run()
     stepped = run.asks("step", slots=1)
-    assert run.conductor.told() == [("sensor", "hold")]
+    assert run.conductor.told() == [("sensor", Hold())]
     assert run.holds(20) == go(20, until=21)
     assert run.holds(21) == []
     assert stepped.answers == [Answer(21, "slot 20 passed; held before slot 21")]
@@ -324,7 +331,7 @@ def test_what_was_said_is_said_once_more() -> None:
     run.asks("step", slots=9)
     run.conductor.told()
     run.steering.remind()
-    assert run.conductor.told() == [("sensor", "hold")]
+    assert run.conductor.told() == [("sensor", Hold())]
     run.steering.held(20)
     run.steering.remind()
     assert run.conductor.told() == []
@@ -367,5 +374,5 @@ def test_a_router_that_is_started_anew_is_told_all_changes() -> None:
     run.holds(5)
     run.asks("link", event=SET)
     run.holds(17)
-    first = {"at": 5, "settings": {"loss": {"model": "bernoulli", "quality": 0.5}}}
-    assert run.steering.changes == {"legitimate": [first, {"at": 17, "settings": SETTINGS}]}
+    first = Change(5, {"loss": {"model": "bernoulli", "quality": 0.5}})
+    assert run.steering.changes == {"legitimate": (first, Change(17, SETTINGS))}

@@ -14,7 +14,6 @@ import pytest
 
 from evedrop.api import montecarlo
 from evedrop.errors import UsageError
-from evedrop.memory import workers
 from evedrop.memory.montecarlo import Plan
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
@@ -58,12 +57,6 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
                 process.kill()
                 process.wait()
         log.close()
-
-
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody answers: that is found out soon."""
-    monkeypatch.setattr(workers, "_REACH_SECONDS", 0.5)
 
 
 def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
@@ -119,7 +112,7 @@ def test_a_folder_that_is_not_empty_is_refused_there_too(evedrop: Evedrop, sched
 
 
 @pytest.mark.parametrize("command", ["montecarlo", "sweep"])
-def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, impatient: None, command: str) -> None:
+def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> None:
     """Nobody listens: one line, exit 2, nothing left on disk."""
     over = ("--over", "seed=1,2") if command == "sweep" else ()
     address = f"tcp://127.0.0.1:{free_port()}"
@@ -133,19 +126,21 @@ def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, impatient: None, 
 
 
 @pytest.mark.parametrize("address", ["nonsense", "foo://127.0.0.1:8786"])
-def test_an_address_that_is_none_is_refused(impatient: None, tmp_path: Path, address: str) -> None:
+def test_an_address_that_is_none_is_refused(tmp_path: Path, address: str) -> None:
     """Without a port, of an unknown protocol."""
     with pytest.raises(UsageError, match="no Dask scheduler answers there"):
-        montecarlo("eavesdroppers", slots=9, trials=5, plan=Plan(scheduler=address), out=tmp_path / "run")
+        montecarlo("eavesdroppers", slots=9, trials=5, plan=Plan(scheduler=address, patience=0.5), out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_somebody_else_on_the_port_is_no_scheduler(impatient: None, tmp_path: Path) -> None:
+def test_somebody_else_on_the_port_is_no_scheduler(tmp_path: Path) -> None:
     """A listener that never speaks is given up on after a few seconds."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
         address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
         with pytest.raises(UsageError, match="no Dask scheduler answers there"):
-            montecarlo("eavesdroppers", slots=9, trials=5, plan=Plan(scheduler=address), out=tmp_path / "run")
+            montecarlo(
+                "eavesdroppers", slots=9, trials=5, plan=Plan(scheduler=address, patience=0.5), out=tmp_path / "run"
+            )
     assert not (tmp_path / "run").exists()

@@ -250,7 +250,7 @@ def take_part(brief: dict[str, Any]) -> str:
 
     config = {
         "mode": "client",
-        "connect": {"endpoints": [brief["router"]], "timeout_ms": 20_000},
+        "connect": {"endpoints": [brief["router"]], "timeout_ms": -1},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {"auth": {"usrpwd": {"user": brief["user"], "password": brief["password"]}}},
     }

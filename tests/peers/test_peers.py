@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Self
+from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
 
-import evedrop.live.network.mailbox
-import evedrop.peers.following
-import evedrop.peers.sensor
 from evedrop.errors import EvedropError, Gap, MalformedMessage
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.reporting import is_due
@@ -24,8 +21,8 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import AnyBrief, Flow
 from evedrop.live.protocol.brief_parts import LegitimatePart, SensorPart
+from evedrop.live.protocol.commands import End, Start
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.whereabouts import Place
 from evedrop.model.digest import Blocks, Digests
 from evedrop.model.flag_bits import packed_flags
 from evedrop.peers.eavesdropper import eavesdrop
@@ -33,7 +30,9 @@ from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
 from evedrop.scenario import Scenario
 from tests.builders import part_of
+from tests.clock import T, TestClock
 from tests.conftest import LIMIT
+from tests.live.in_memory import Stage
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
 EXTENT = telemetry.Extent(SLOTS, 300, 2, 3)
@@ -67,110 +66,12 @@ def briefs(**changes: Any) -> dict[str, AnyBrief]:
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 
 
-@dataclass
-class Stage:
-    """What a peer's session would carry: the test fills the inboxes and reads what was put."""
-
-    inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
-    funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
-    put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
-    kept: dict[str, ReplayBuffer] = field(default_factory=dict)
-    commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
-    """Of the conductor, as `wire.control` makes them."""
-
-    def session(self, brief: AnyBrief) -> FakeSession:
-        """In the place of `Session`."""
-        return FakeSession(self, RunKeys(brief.run))
-
-    def fill(self, key: str, messages: list[bytes]) -> None:
-        """Put messages into an inbox."""
-        queue = self.inboxes.setdefault(key, SimpleQueue())
-        for message in messages:
-            queue.put(message)
-
-    def all(self, key: str) -> list[bytes]:
-        """All messages that were put on a key; the others are dropped."""
-        found = []
-        while not self.put.empty():
-            where, payload = self.put.get()
-            if where == key:
-                found.append(payload)
-        return found
-
-
-class FakeInbox:
-    """The part of an inbox that peers use."""
-
-    def __init__(self, queue: SimpleQueue[bytes]) -> None:
-        self._queue = queue
-
-    def recv(self) -> bytes:
-        """The next message."""
-        return self._queue.get(timeout=LIMIT)
-
-    def __iter__(self) -> Iterator[bytes]:
-        while not self._queue.empty():
-            yield self.recv()
-
-
-class FakeSession:
-    """The part of `Session` that peers use."""
-
-    def __init__(self, stage: Stage, keys: RunKeys) -> None:
-        self._stage = stage
-        self.keys = keys
-        self.place = Place()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stage.put.put(("closed", b""))
-
-    def inbox(self, key: str) -> Any:
-        """An inbox whose `recv` never waits for longer than a test may."""
-        queue = self._stage.inboxes.setdefault(key, SimpleQueue())
-
-        return FakeInbox(queue)
-
-    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
-        """As the real one, called by the test."""
-        self._stage.funnels[key] = receive
-
-    def outlet(self, key: str) -> Callable[[bytes], None]:
-        """Puts into the stage."""
-        return lambda payload: self._stage.put.put((key, payload))
-
-    def kept(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
-        """The same, kept to be sent again."""
-        self._stage.kept[key] = kept = ReplayBuffer(self.outlet(key), *how, **more)
-        return kept
-
-    def ready(self) -> None:
-        """Nobody to wait for."""
-
-    def wait_for(self, command: str) -> None:
-        """Until the test commands it."""
-        while self.command().text("do") != command:
-            pass
-
-    def command(self) -> wire.Reader:
-        """The next command, which the test gives."""
-        return wire.Reader("control", self._stage.commands.get(timeout=LIMIT))
-
-    def commanded(self) -> wire.Reader | None:
-        """The next command if the test has given one."""
-        return None if self._stage.commands.empty() else self.command()
-
-
 @pytest.fixture
-def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
+def stage() -> Iterator[Stage]:
     """A stage in the place of the network."""
     one = Stage()
-    monkeypatch.setattr(evedrop.peers.following, "Session", one.session)
-    monkeypatch.setattr(evedrop.peers.sensor, "Session", one.session)
     yield one
-    one.commands.put(wire.control("end"))
+    one.commands.put(End().pack())
 
 
 def deliveries(count: int = SLOTS) -> list[bytes]:
@@ -182,7 +83,7 @@ def deliveries(count: int = SLOTS) -> list[bytes]:
     return made
 
 
-RECEIVERS: dict[str, Callable[[Any], None]] = {
+RECEIVERS: dict[str, Callable[..., None]] = {
     "legitimate": estimate,
     "naive": eavesdrop,
     "smart": eavesdrop,
@@ -196,8 +97,8 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     brief = briefs()[name]
     keys = RunKeys(brief.run)
     stage.fill(keys.downlink(name), deliveries())
-    stage.commands.put(wire.control("end"))
-    RECEIVERS[name](brief)
+    stage.commands.put(End().pack())
+    RECEIVERS[name](brief, stage.session)
     put = []
     while not stage.put.empty():
         put.append(stage.put.get())
@@ -225,8 +126,8 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
     for flow in (Flow(1024, 7), Flow(1024, batch)):
         brief = replace(briefs(slots=600)[name], flow=flow, run="r")
         stage.fill(RunKeys("r").downlink(name), deliveries(600))
-        stage.commands.put(wire.control("end"))
-        RECEIVERS[name](brief)
+        stage.commands.put(End().pack())
+        RECEIVERS[name](brief, stage.session)
         end, x_hat, P = 0, [], []
         blocks: dict[int, bytes] = {}
         for payload in stage.all(RunKeys("r").telemetry(name)):
@@ -266,7 +167,7 @@ def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
     brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
     stage.fill(RunKeys(brief.run).downlink(name), messages)
     with pytest.raises(error, match=text) as caught:
-        RECEIVERS[name](brief)
+        RECEIVERS[name](brief, stage.session)
     assert caught.value.exit_status == 3
 
 
@@ -281,8 +182,8 @@ def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
         [*good[:20], *good[23:30], packets.barrier(25), *good[5:40], packets.barrier(7), good[0], *good[30:]],
     ):
         stage.fill(RunKeys("r").downlink(name), messages)
-        stage.commands.put(wire.control("end"))
-        RECEIVERS[name](brief)
+        stage.commands.put(End().pack())
+        RECEIVERS[name](brief, stage.session)
         found.append(stage.all(RunKeys("r").telemetry(name)))
     assert found[0] == found[1]
 
@@ -310,9 +211,9 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
     stage.fill(RunKeys("r").downlink("legitimate"), [delivered(k) for k in slots])
-    stage.commands.put(wire.control("end"))
+    stage.commands.put(End().pack())
     part_of(brief, LegitimatePart)
-    RECEIVERS["legitimate"](brief)
+    RECEIVERS["legitimate"](brief, stage.session)
     expected = [packets.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
     assert stage.all(RunKeys("r").acknowledged) == expected
 
@@ -322,8 +223,8 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
     """Reports that the observer may not have joined yet can be sent again, and no older ones; the last progress too."""
     brief = replace(briefs()[name], run="r")
     stage.fill(RunKeys("r").downlink(name), deliveries())
-    stage.commands.put(wire.control("end"))
-    RECEIVERS[name](brief)
+    stage.commands.put(End().pack())
+    RECEIVERS[name](brief, stage.session)
     stage.all("")
     stage.kept[RunKeys("r").telemetry(name)].again(1, 0)
     ends = []
@@ -341,7 +242,7 @@ class Sensing:
     def __init__(self, stage: Stage, brief: AnyBrief) -> None:
         self.stage = stage
         self.keys = RunKeys(brief.run)
-        self.thread = threading.Thread(target=sense, args=(brief,), daemon=True)
+        self.thread = threading.Thread(target=sense, args=(brief, stage.session), daemon=True)
         self.thread.start()
 
     def next(self) -> tuple[str, bytes]:
@@ -371,7 +272,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     brief = briefs()["sensor"]
     sensing = Sensing(stage, brief)
     assert stage.put.empty()
-    stage.commands.put(wire.control("start"))
+    stage.commands.put(Start().pack())
     sensing.packets(0, WINDOW)
     everybody = [*part_of(brief, SensorPart).receivers, "observer"]
     assert len(everybody) == 5
@@ -387,7 +288,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
             sensing.progress(name, sent)
         sensing.progress("observer", done)
         sensing.packets(sent, sent := min(SLOTS, done + WINDOW))
-    stage.commands.put(wire.control("end"))
+    stage.commands.put(End().pack())
     sensing.thread.join(LIMIT)
     assert stage.put.get(timeout=LIMIT) == ("closed", b"")
     assert stage.put.empty()
@@ -398,7 +299,7 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     brief = briefs()["sensor"]
     brief = replace(brief, part=replace(part_of(brief, SensorPart), history=3))
     sensing = Sensing(stage, brief)
-    stage.commands.put(wire.control("start"))
+    stage.commands.put(Start().pack())
     sensing.packets(0, WINDOW)
     for name in (*part_of(brief, SensorPart).receivers, "observer"):
         sensing.progress(name, 8)
@@ -419,25 +320,22 @@ class WouldWaitError(Exception):
     """The sensor would have to wait for news."""
 
 
-class News(SimpleQueue[tuple[str, bytes]]):
-    """A queue that says so instead of waiting."""
+class Impatient(TestClock):
+    """A clock that says so instead of waiting."""
 
-    def get(self, *_: Any, **__: Any) -> tuple[str, bytes]:
-        """The next news that is there."""
-        if self.empty():
+    def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
+        """The next item that is there."""
+        if queue.empty():
             raise WouldWaitError
-        return super().get()
+        return super().next(queue, timeout)
 
 
 @pytest.mark.parametrize("slowest", ["a", "b", "observer"])
-def test_sensor_is_never_a_window_ahead_of_the_slowest(
-    slowest: str, stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stage) -> None:
     """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
-    monkeypatch.setattr(evedrop.live.network.mailbox, "SimpleQueue", News)
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
-    window = Window(session, followers, 10, ReplayBuffer(print))  # type: ignore[arg-type]
+    window = Window(session, followers, 10, ReplayBuffer(print), Impatient())
 
     def reaches(limit: int) -> None:
         window.wait(limit - 1)
@@ -463,7 +361,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(
 def test_sensor_refuses_malformed_progress(k: float, stage: Stage) -> None:
     """Progress that is not as documented, or beyond what was sent, is an error that names its key and its sender."""
     session = stage.session(briefs()["sensor"])
-    window = Window(session, ("a",), 1, ReplayBuffer(print))  # type: ignore[arg-type]
+    window = Window(session, ("a",), 1, ReplayBuffer(print))
     stage.funnels[session.keys.progress("a")](msgpack.packb({"k": k}))
     with pytest.raises(MalformedMessage, match=rf"progress/a: k = {k}.*Check that a speaks") as found:
         window.wait(2)

@@ -42,8 +42,10 @@ def resume(options: argparse.Namespace) -> int:
 
 def step(options: argparse.Namespace) -> int:
     """Let the run go on for some slots."""
-    if not 1 <= options.slots <= 100_000_000:
-        raise UsageError(f"step {options.slots}: expected 1 or more slots, and 100000000 at most")
+    from evedrop.streams import MOST_SLOTS
+
+    if not 1 <= options.slots <= MOST_SLOTS:
+        raise UsageError(f"step {options.slots}: expected 1 or more slots, and {MOST_SLOTS} at most")
     return _ask(options.run, "step", f"step {options.slots}", _STEP_PATIENCE, slots=options.slots)
 
 

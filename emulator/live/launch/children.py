@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -19,9 +17,21 @@ from typing import final
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
+from evedrop.live.launch.starter import Process, Starter, start_process
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
-from evedrop.live.protocol.news import News, ProcessRequest, RunEnded
+from evedrop.live.protocol.news import (
+    Alive,
+    Back,
+    ConnectionOutage,
+    Finishing,
+    News,
+    ProcessRequest,
+    RunEnded,
+    RunOver,
+    Started,
+    read_news,
+)
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
@@ -37,6 +47,7 @@ _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
 _ROUTER_LOST = "has had no connection with the router"
+_NOT_THERE = re.compile(rf"evedrop: \S+: .*\b{OBSERVER}\b.* did not appear within")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
@@ -83,12 +94,14 @@ class Exit:
 class Children:
     """The processes of a run; all are ended on leaving the block."""
 
-    def __init__(self, folder: HeldFolder, private: Path, lock_step: bool = False) -> None:
+    def __init__(
+        self, folder: HeldFolder, private: Path, lock_step: bool = False, starter: Starter = start_process
+    ) -> None:
         """folder: of the results; private: of the briefs; lock_step: whether processes wait for each other every few slots."""
-        self._folder = folder
+        self._folder, self._starter = folder, starter
         self._lock_step = lock_step
         self._private = private
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes: dict[str, Process] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
         self._unread = 0
         """How many processes were started again and have not joined the run yet; they may not have read their briefs."""
@@ -130,7 +143,6 @@ class Children:
 
         Raises RunError if the system cannot start it.
         """
-        conducts = brief.role == "observer"
         self._briefs[brief.process] = brief
         self._unread += again
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:
@@ -149,15 +161,7 @@ class Children:
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "evedrop", brief.role, str(path)],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE if conducts else log,
-                    stderr=log,
-                    start_new_session=True,
-                    env=environment,
-                    umask=0o077,
-                )
+                process = self._starter(brief.role, path, log, environment)
         except OSError as error:
             raise RunError(
                 f"{brief.process} cannot be started ({error}); free system resources and run again"
@@ -168,15 +172,22 @@ class Children:
         self._processes[brief.process] = process
         threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
 
-    def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
+    def _follow(self, name: str, process: Process) -> None:
         if process.stdout is not None:
             with process.stdout as lines:
                 for line in lines:
-                    with contextlib.suppress(ValueError):
-                        self._news.put(json.loads(line))
+                    try:
+                        self._news.put(read_news(line))
+                    except ValueError as error:
+                        self._refuse(name, error)
         status = process.wait()
         if process.pid not in self._killed:
             self._news.put(Exit(name, status))
+
+    def _refuse(self, name: str, error: ValueError) -> None:
+        """Write into a process's log that the launcher cannot read its news."""
+        with contextlib.suppress(OSError), (self._folder.now / "logs" / f"{name}.log").open("a") as log:
+            log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
 
     def restart_router(self, ended: Exit) -> bool:
         """Restart a router if a signal ended it, a few times at most; returns whether it was restarted."""
@@ -222,17 +233,19 @@ class Children:
         if isinstance(news, Exit):
             return news
         self.silent_seconds = 0.0
-        if news["event"] in {"started", "back", "reconnected"}:
-            self._unread = max(0, self._unread - 1) if self.started else 0  # at the start, all have
-            self.started = True
-            if not self._unread:
-                self._forget_briefs()
-        if news["event"] == ProcessRequest.event:
-            self.act(ProcessRequest.of(news))
-            return None
-        self.over = self.over or news["event"] == "over"
-        self._finishing = self._finishing or news["event"] == "finishing"
-        return None if news["event"] in {"alive", "over", "finishing", "back"} else news
+        match news:
+            case Started() | Back() | ConnectionOutage():
+                self._unread = max(0, self._unread - 1) if self.started else 0  # at the start, all have
+                self.started = True
+                if not self._unread:
+                    self._forget_briefs()
+            case ProcessRequest():
+                self.act(news)
+            case RunOver():
+                self.over = True
+            case Finishing():
+                self._finishing = True
+        return None if isinstance(news, Alive | Back | ProcessRequest | RunOver | Finishing) else news
 
     def _forget_briefs(self) -> None:
         """Delete the briefs: every process has read its own by now, and the keys should not stay on disk."""
@@ -254,7 +267,7 @@ class Children:
                     break
             elif news is not None:
                 tell(news)
-                ending = RunEnded.of(news) if news["event"] == RunEnded.event else ending
+                ending = news if isinstance(news, RunEnded) else ending
         return ending
 
     def terminate(self, name: str, after: float = 0.0) -> None:
@@ -281,6 +294,10 @@ class Children:
         lost = None if first is None else self._lost_by_all(first.process, suspects)
         if lost is not None:
             first, suspects = None, [lost]  # the router is at fault, not the process that gave up first
+        if first is not None and self._missed_observer(first.process):
+            return "\n".join(
+                [f"{OBSERVER}: {why}" if why else f"{OBSERVER} did not appear", *self._log_lines(OBSERVER)]
+            )
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
         if accused and why:
@@ -309,13 +326,20 @@ class Children:
                 if name != OBSERVER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                if status and not ({ROUTER, RELAY} & set(suspects) and self._lost_router(name)):
+                for_others = self._missed_observer(name) or (
+                    {ROUTER, RELAY} & set(suspects) and self._lost_router(name)
+                )
+                if status and not for_others:
                     return Exit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return Exit(suspects[0], 0)
             if time.monotonic() > deadline:
                 return None
             time.sleep(0.01)
+
+    def _missed_observer(self, name: str) -> bool:
+        """Whether a process ended because the observer did not appear."""
+        return any(_NOT_THERE.match(line) for line in self._log(name))
 
     def _lost_router(self, name: str) -> bool:
         """Whether a process ended because it could no longer reach its router."""

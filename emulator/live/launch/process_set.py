@@ -21,13 +21,14 @@ from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
 from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.network.control_file import remove_control
-from evedrop.live.protocol.news import News, RunEnded
+from evedrop.live.protocol.news import FolderMoved, News, RunEnded, ViewOpened
 from evedrop.names import OBSERVER
 from evedrop.results.folder import make_private, new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
 from evedrop.view.viewer import Viewer
 
+_INTERRUPTED = "interrupted; the results so far are in the results folder"
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
 _AFTERTHOUGHT_SECONDS = (
@@ -72,9 +73,9 @@ def launch_one(
                 # The other processes start up at the same time as the viewer.
                 viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
-                    tell({"event": "view", "address": viewer.address, "warning": viewer.warning})
+                    tell(ViewOpened(viewer.address, viewer.warning))
                 children.start(observer)
-                status = _supervise(children, stop, tell)
+                status = follow_to_end(children, stop, tell)
                 if viewer is not None:
                     viewer.complete()
         except BaseException as error:
@@ -99,7 +100,7 @@ def _now(held: HeldFolder, tell: Callable[[News], None]) -> Path:
         return held.first
     remove_control(now)
     if now != held.first:
-        tell({"event": "moved", "folder": str(now)})
+        tell(FolderMoved(str(now)))
     return now
 
 
@@ -142,19 +143,20 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
     write_summary(folder, summary)
 
 
-def _supervise(children: Children, stop: threading.Event, tell: Callable[[News], None]) -> int:
+def follow_to_end(children: Children, stop: threading.Event, tell: Callable[[News], None]) -> int:
     """Follow the run to its end; returns the exit status that the observer gives it."""
     early: tuple[Exit, float] | None = None
+    ending: RunEnded | None
     while True:
         if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
             raise RunError(children.failure_report(early[0], children.conclude(tell)))
         if stop.is_set():
-            children.conclude(tell)
-            raise Interrupted("interrupted; the results so far are in the results folder")
+            ending = _stopped(children, tell)
+            break
         if children.silent_seconds > SILENCE_SECONDS:
             raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
         news = children.news(_LOOK_SECONDS)
-        ending: RunEnded | None = None
+        ending = None
         if isinstance(news, Exit):
             if _meant_us_too(news, stop) or (
                 news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
@@ -169,15 +171,23 @@ def _supervise(children: Children, stop: threading.Event, tell: Callable[[News],
                 raise RunError(children.failure_report(news, ending))
         elif news is not None:
             tell(news)
-            ending = RunEnded.of(news) if news["event"] == RunEnded.event else None
+            ending = news if isinstance(news, RunEnded) else None
         if ending is not None:
             break
     if ending.status == Interrupted.exit_status:
-        raise Interrupted("interrupted; the results so far are in the results folder")
+        raise Interrupted(_INTERRUPTED)
     if not ending.well:
         raise RunError(children.failure_report(None, ending))
     children.wait_all()
     return ending.status
+
+
+def _stopped(children: Children, tell: Callable[[News], None]) -> RunEnded:
+    """End the run; returns its end if it was complete before the signal came, else raises Interrupted."""
+    ending = children.conclude(tell)
+    if ending is None or not ending.well:
+        raise Interrupted(_INTERRUPTED)
+    return ending
 
 
 def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:

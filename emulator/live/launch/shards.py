@@ -20,7 +20,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.ports import RouterEndpoints, loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
-from evedrop.live.protocol.news import News, RunEnded, RunProgress
+from evedrop.live.protocol.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
@@ -51,20 +51,25 @@ class OneProgress:
         return tell
 
     def _take(self, number: int, news: News) -> None:
-        kind = news["event"]
-        if kind == "started":
-            self.started = time.monotonic() if self.started is None else self.started
-            self._waited_for.discard(number)
-            if not self._waited_for:
+        match news:
+            case Started():
+                self.started = time.monotonic() if self.started is None else self.started
+                self._waited_for.discard(number)
+                if not self._waited_for:
+                    self._tell(news)
+            case RunProgress():
+                self._latest[number] = news
+                if len(self._latest) == len(self._trials):
+                    self._tell(self._all())
+            case FolderMoved():
+                pass  # a shard's folder moves with the run's, which is reported separately
+            case ConnectionOutage():
+                self._tell(replace(news, shard=number))
+            case _:
+                if isinstance(news, RunEnded) and news.well and number in self._latest:
+                    # Its last slots were too few for a progress report.
+                    self._latest[number] = replace(self._latest[number], done=self._slots)
                 self._tell(news)
-        elif kind == RunProgress.event:
-            self._latest[number] = RunProgress.of(news)
-            if len(self._latest) == len(self._trials):
-                self._tell(self._all().news)
-        elif kind != "moved":  # a shard's folder moves with the run's, which is reported separately
-            if kind == RunEnded.event and number in self._latest:  # its last slots were too few for a progress report
-                self._latest[number] = replace(self._latest[number], done=self._slots)
-            self._tell({**news, "shard": number} if kind == "reconnected" else news)
 
     def _all(self) -> RunProgress:
         """The slowest shard's progress and rate, with the errors over all trials."""
@@ -131,7 +136,7 @@ def launch_shards(
     try:
         now = held.now
         if now != folder:
-            tell({"event": "moved", "folder": str(now)})
+            tell(FolderMoved(str(now)))
             shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
         return Ended(_made_one(scenario, now, shards, course, progress.started), course.viewer, now)
     except BaseException as error:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 
 
@@ -101,7 +101,7 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
     return table
 
 
-def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any]:
+def access_control(table: list[Grant], certified: bool = False) -> ZenohConfig:
     """The `access_control` section of the router's Zenoh configuration.
 
     certified: whether a user must have that user's certificate, too.
@@ -116,12 +116,12 @@ def access_control(table: list[Grant], certified: bool = False) -> dict[str, Any
     }
 
 
-def _subject(grant: Grant, certified: bool) -> dict[str, Any]:
+def _subject(grant: Grant, certified: bool) -> ZenohConfig:
     shown = {"usernames": [grant.process]} if grant.zid is None else {"zids": [grant.zid]}
     return {"id": grant.process, **shown, **({"cert_common_names": [grant.process]} if certified else {})}
 
 
-def _rules(grant: Grant) -> Iterator[dict[str, Any]]:
+def _rules(grant: Grant) -> Iterator[ZenohConfig]:
     """Both directions of every permission: a writer must also learn that it has a reader."""
     kinds: list[tuple[str, str, str, tuple[str, ...]]] = [
         ("write", "ingress", "put", grant.writes),

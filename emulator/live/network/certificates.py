@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import datetime
-from typing import Any
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
@@ -16,6 +15,7 @@ from cryptography.x509.oid import NameOID
 
 from evedrop.errors import BriefError
 from evedrop.live.protocol.brief_parts import Identity
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 
 _AGAIN = "write the briefs again with `evedrop brief`, all of them"
 
@@ -72,10 +72,10 @@ def _first_line(error: Exception) -> str:
     return str(error).partition("\n")[0].rstrip(".")
 
 
-def tls_section(identity: Identity, listens: bool = False) -> dict[str, Any]:
+def tls_section(identity: Identity, listens: bool = False) -> ZenohConfig:
     """The `tls` section of Zenoh's configuration: both ends show a certificate, and the router's must name its host."""
     encoded = {name: base64.b64encode(getattr(identity, name).encode()).decode() for name in ("certificate", "key")}
-    section: dict[str, Any] = {
+    section: ZenohConfig = {
         "root_ca_certificate_base64": base64.b64encode(identity.authority.encode()).decode(),
         "enable_mtls": True,
         "verify_name_on_connect": True,

@@ -12,16 +12,17 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Protocol, final
 
 import zenoh
 
 from evedrop.errors import BriefError, RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief_parts import Identity
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 
-WAITING_SECONDS = 3.0
-"""How often a process says that it still waits for its router."""
+_WAITING_SECONDS = 3.0  # how often a process says that it still waits for its router
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ATTEMPT_SECONDS = 3.0
 _UNKNOWN_HOST_SECONDS = 2.5  # the name of a host that is just starting may not be known yet
@@ -33,6 +34,30 @@ _AT_ONCE_SECONDS = 0.1
 _NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of OpenSSL's X509_V_ERR
 
 
+class Credentials(Protocol):
+    """The router's address, and a user with a password: a brief, or the operator's control file."""
+
+    @property
+    def run(self) -> str:
+        """Name of the run."""
+
+    @property
+    def router(self) -> str:
+        """Zenoh endpoint."""
+
+    @property
+    def user(self) -> str:
+        """Name of the user."""
+
+    @property
+    def password(self) -> str:
+        """Password of the user."""
+
+    @property
+    def identity(self) -> Identity | None:
+        """Certificate of the user, if the router takes certificates."""
+
+
 @dataclass(frozen=True)
 class RouterAddress:
     """A router's address, and the configuration and user to connect with."""
@@ -40,7 +65,7 @@ class RouterAddress:
     router: str
     """Zenoh endpoint."""
     run: str
-    config: dict[str, Any]
+    config: ZenohConfig
     """Zenoh's configuration for one attempt."""
     identity: Identity | None = None
     process: str = "operator"
@@ -51,19 +76,19 @@ class RouterAddress:
 class Waiting:
     """Reports every few seconds on standard error that a process waits for its router."""
 
-    def __init__(self, process: str, router: str) -> None:
-        self._process, self._router = process, router
+    def __init__(self, process: str, router: str, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._process, self._router, self._clock = process, router, clock
         self.begin()
 
     def begin(self, again: bool = False) -> None:
         """Start the clock. again: because a connection was lost."""
-        self._began = self._said = time.monotonic()
+        self._began = self._said = self._clock.monotonic()
         self._what = "lost the connection; waiting again" if again else "waiting"
 
     def look(self, why: object) -> None:
         """Report that the process still waits, if a report is due; why: the result of the last attempt."""
-        now = time.monotonic()
-        if now - self._said >= WAITING_SECONDS:
+        now = self._clock.monotonic()
+        if now - self._said >= _WAITING_SECONDS:
             self._said = now
             sys.stderr.write(
                 f"evedrop: {self._process}: {self._what} for the router at {self._router}: no answer yet "
@@ -84,23 +109,25 @@ def _reason(error: OSError | zenoh.ZError) -> object:
     return (error.strerror or error) if isinstance(error, OSError) else "it did not answer as one"
 
 
-def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None) -> zenoh.Session:
+def connected(
+    door: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None, clock: Clock = SYSTEM_CLOCK
+) -> zenoh.Session:
     """Open a session with the router; `meanwhile` is called before each attempt.
 
     Raises BriefError for an error that waiting cannot mend, RunError if no router has answered after `patience` seconds.
     """
     endpoint = endpoint_of(door.router, door.identity)
-    began = time.monotonic()
-    failures, waiting = Failures(), Waiting(door.process, door.router)
+    began = clock.monotonic()
+    failures, waiting = Failures(clock), Waiting(door.process, door.router, clock)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
-        tried = time.monotonic()
+        tried = clock.monotonic()
         try:
             _knock(endpoint, door)
             return zenoh.open(zenoh.Config.from_json5(json.dumps(door.config)))
         except (OSError, zenoh.ZError) as error:
-            failures.add(error, time.monotonic() - tried)
+            failures.add(error, clock.monotonic() - tried)
             why = _reason(error)
             if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS:
                 raise BriefError(
@@ -108,19 +135,19 @@ def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None
                     "briefs again with --connect and a name or address that this host knows"
                 ) from error
             if failures.refused and _cut_off(endpoint):
-                failures = Failures()
+                failures = Failures(clock)
             if failures.refused:
                 raise BriefError(
                     f"{door.router} does not let this brief in, which is of run {door.run}: the router there is of another run, "
                     "or another program listens there; start the router of this run, or give the brief of that one"
                 ) from error
-            if time.monotonic() - began > patience:
+            if clock.monotonic() - began > patience:
                 raise RunError(
                     f"no router answered at {door.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error
             waiting.look(why)
-        time.sleep(pause)
+        clock.sleep(pause)
         pause = min(longest, pause * 1.5)
 
 
@@ -128,14 +155,15 @@ def connected(door: RouterAddress, patience: float, meanwhile: Callable[[], None
 class Failures:
     """The results of the attempts so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self._unknown: float | None = None
         self._refused: float | None = None
         self._refusals = 0
 
     def add(self, error: Exception, seconds: float) -> None:
         """Add an attempt that failed after `seconds`."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         unknown = isinstance(error, socket.gaierror)
         self._unknown = (self._unknown or now) if unknown else None
         # A listener that hangs up refuses us; one that is slow, or not there, may still answer.
@@ -148,7 +176,7 @@ class Failures:
     @property
     def unknown_seconds(self) -> float:
         """For how long the host's name has been unknown."""
-        return 0.0 if self._unknown is None else time.monotonic() - self._unknown
+        return 0.0 if self._unknown is None else self._clock.monotonic() - self._unknown
 
     @property
     def refused(self) -> bool:
@@ -156,7 +184,7 @@ class Failures:
         return (
             self._refused is not None
             and self._refusals >= _REFUSALS
-            and time.monotonic() - self._refused > _REFUSED_SECONDS
+            and self._clock.monotonic() - self._refused > _REFUSED_SECONDS
         )
 
 

@@ -8,6 +8,7 @@ from queue import SimpleQueue
 from typing import final
 
 from evedrop.errors import MalformedMessage
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.keys import writer_of
 
 _OVERHEAD_BYTES = 200  # of a message in memory, besides its payload
@@ -23,9 +24,9 @@ def allowance(largest: int, window: int, batch: int) -> int:
 class Mailbox:
     """A queue of messages by sender; filled by threads of Zenoh's, read by one."""
 
-    def __init__(self, keys: Mapping[str, str], most: int) -> None:
+    def __init__(self, keys: Mapping[str, str], most: int, clock: Clock = SYSTEM_CLOCK) -> None:
         """keys: sender → the key on which it sends; most: how many bytes of one sender may wait."""
-        self._keys, self._most = keys, most
+        self._keys, self._most, self._clock = keys, most, clock
         self._queue: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
         self._waiting = dict.fromkeys(keys, 0)
         self._lock = threading.Lock()
@@ -54,7 +55,7 @@ class Mailbox:
                 last,
                 writer_of(key),
             )
-        sender, news = self._queue.get(timeout=timeout)
+        sender, news = self._clock.next(self._queue, timeout)
         if isinstance(news, bytes):
             with self._lock:
                 self._waiting[sender] -= len(news) + _OVERHEAD_BYTES

@@ -5,8 +5,6 @@ Source: docs/protocol.md, two routers.
 
 from __future__ import annotations
 
-from typing import Any
-
 from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.linked_routers import at_relay
@@ -14,6 +12,8 @@ from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import ATTEMPT, Session, client_config, door_of, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
+from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 
 
 def relay(brief: Brief[RelayPart]) -> None:
@@ -30,16 +30,16 @@ def relay(brief: Brief[RelayPart]) -> None:
         present = session.attendance(grant.process for grant in table if grant.token is not None and grant.zid is None)
         session.wait_for_link()
         session.ready()
-        session.wait_for("end")
+        session.wait_for(End)
         until_all_left(present)
 
 
-def _opened(brief: Brief[RelayPart], access: dict[str, Any]) -> Session:
+def _opened(brief: Brief[RelayPart], access: ZenohConfig) -> Session:
     with users_file(brief.part.users) as users:
         return Session(brief, _config(brief, str(users), access), brief.part.listen)
 
 
-def _config(brief: Brief[RelayPart], users: str, access: dict[str, Any]) -> dict[str, Any]:
+def _config(brief: Brief[RelayPart], users: str, access: ZenohConfig) -> ZenohConfig:
     """Configuration of a router that also connects to the first router as a client, and reconnects when the link is lost."""
     listening = router_config(brief, users, access, brief.part.listen)
     connecting = client_config(brief)

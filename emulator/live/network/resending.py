@@ -9,12 +9,12 @@ Source: docs/protocol.md, lost connections.
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import final
 
 from evedrop.errors import Gap
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.codec import Reader
 
 
@@ -71,9 +71,9 @@ class ReplayBuffer:
 class GapDetector:
     """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
 
-    def __init__(self, key: str, patience: float) -> None:
+    def __init__(self, key: str, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
         """patience: for how many seconds later slots may arrive while the due one does not."""
-        self._key, self._patience = key, patience
+        self._key, self._patience, self._clock = key, patience, clock
         self._slot, self._since = -1, 0.0
 
     def take(self, receive: Callable[[], Reader], due: int) -> Reader:
@@ -84,7 +84,7 @@ class GapDetector:
 
     def missed(self, due: int, found: int) -> None:
         """Slot `found` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if found < due:
             return
         if self._slot != due:

@@ -11,10 +11,10 @@ packets are sent again, the router routes them again, with the same fates, as a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from evedrop.errors import NotRegistered
 from evedrop.live.network.access import access_control, grants
 from evedrop.live.network.delayed_sender import DelayedSender
 from evedrop.live.network.linked_routers import at_router
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.router_commands import Commands, ReplayRequested
 from evedrop.live.network.router_users import until_all_left, users_file
@@ -29,7 +30,8 @@ from evedrop.live.network.session import Session, router_config
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.brief_parts import RouterPart
-from evedrop.live.protocol.codec import Reader, shown
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import Go, LinkChange
 from evedrop.live.protocol.packets import (
     PacketExtras,
     acknowledgement,
@@ -44,6 +46,7 @@ from evedrop.live.protocol.packets import (
     read_uplink,
 )
 from evedrop.live.protocol.telemetry import Journal
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.model.acknowledgements import AckChannel, WayBackSpec
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Floats
@@ -51,7 +54,7 @@ from evedrop.model.receiver import Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
 from evedrop.model.slot.link import Change, Fates, Link, LinkSchedule, streams_of
 from evedrop.model.slot.transit import Late, Transit
-from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE
+from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
 
 
 @final
@@ -183,7 +186,7 @@ class Burst:
 class WayBackLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
 
-    def __init__(self, brief: AnyBrief, session: Session, spec: WayBackSpec) -> None:
+    def __init__(self, brief: AnyBrief, session: ProcessSession, spec: WayBackSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
         self._way = AckChannel(spec.attack, spec.quality, key, brief.batch, spec.spans)
         self._jammer = spec.jammer
@@ -234,7 +237,7 @@ def route(brief: Brief[RouterPart]) -> None:
 class Routing:
     """The router's work on an open session."""
 
-    def __init__(self, brief: Brief[RouterPart], session: Session) -> None:
+    def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
         self._uplink = session.inbox(session.keys.uplink)
@@ -259,7 +262,9 @@ class Routing:
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
         waiting = [] if self._way_back is None else [self._way_back.sent]
-        self._commands = Commands(session, lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage)
+        self._commands = Commands(
+            session, tuple(self._courses), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
+        )
         self._stale = False
         """Whether to ignore packets until the resend begins."""
         self._begin(0, 0)
@@ -347,11 +352,11 @@ class Routing:
     def _resend(self, message: Reader) -> None:
         """Begin a resend, which the conductor and the sensor announce in either order; wait for the conductor if need be."""
         number, done, start = read_resend(message, self._brief.slots)
-        command = self._commands.resend_of(number)
-        if command is None:  # the conductor has asked again since
+        again = self._commands.resend_of(number)
+        if again is None:  # the conductor has asked again since
             self._stale = True
             return
-        for name, changes in read_links(command, self._courses, self._brief.slots).items():
+        for name, changes in (again.links or {}).items():
             self._courses[name] = replace(self._courses[name], changes=changes)
         self._begin(start, done)
 
@@ -369,43 +374,25 @@ class Routing:
         for downlink in self._downlinks.values():
             downlink.mark(k)
         self._flush()
-        while (command := self._commands.next()).text("do") != "go" or command.integer("k") != k:
-            if command.text("do") == "change":
-                self._amend(command, k)
+        while True:
+            match self._commands.next():
+                case Go(slot) if slot == k:
+                    return
+                case LinkChange() as change:
+                    self._amend(change, k)
 
-    def _amend(self, command: Reader, k: int) -> None:
+    def _amend(self, command: LinkChange, k: int) -> None:
         """Change a link from slot k on, as the conductor's command says."""
-        name = command.choice("link", self._courses)
-        changes = read_changes(command, "changes", self._brief.slots)
+        name, changes = command.link, command.changes
         try:
             self._downlinks[name].amend(k, changes)
         except (KeyError, TypeError, ValueError, NotRegistered) as error:
-            raise command.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
+            message = Reader(self._session.keys.control(ROUTER), command.pack())
+            raise message.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
         course = self._courses[name]
         self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
 
 
-def read_changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
-    """The changes of a link in a field of a command; slots: how many the run has."""
-    return tuple(
-        Change(
-            one.integer("at", 0, slots),
-            one.map("settings") if one.has("settings") else None,
-            one.flag("cut") if one.has("cut") else None,
-        )
-        for one in found.maps(name)
-    )
-
-
-def read_links(command: Reader, names: Collection[str], slots: int) -> dict[str, tuple[Change, ...]]:
-    """Receiver → all changes of its link, for the links that an `again` command names."""
-    links = command.nested("links")
-    for name in command.map("links"):
-        if name not in names:
-            raise command.malformed(f"the link {shown(name)}", f"one of {', '.join(names)}")
-    return {name: read_changes(links, name, slots) for name in command.map("links")}
-
-
-def _opened(brief: Brief[RouterPart], access: dict[str, Any]) -> Session:
+def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:
     with users_file(brief.part.users) as users:
         return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

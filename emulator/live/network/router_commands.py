@@ -6,13 +6,13 @@ Source: docs/protocol.md, control and lost connections.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from queue import SimpleQueue
 from typing import final
 
 from evedrop.errors import EvedropError
-from evedrop.live.network.session import Session
-from evedrop.live.protocol.codec import Reader
+from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.protocol.commands import Again, Command, End
 from evedrop.names import ROUTER
 
 
@@ -29,14 +29,22 @@ class Commands:
     """
 
     def __init__(
-        self, session: Session, knock: Callable[[], None], waiting: Iterable[SimpleQueue[bytes | None]], patience: float
+        self,
+        session: ProcessSession,
+        receivers: Collection[str],
+        knock: Callable[[], None],
+        waiting: Iterable[SimpleQueue[bytes | None]],
+        patience: float,
     ) -> None:
-        """patience: how many seconds to wait for the conductor's command for a round that the sensor has announced."""
-        self._session, self._knock, self._waiting = session, knock, tuple(waiting)
+        """receivers: those that a command may name.
+
+        patience: how many seconds to wait for the conductor's command for a round that the sensor has announced.
+        """
+        self._session, self._receivers, self._knock, self._waiting = session, receivers, knock, tuple(waiting)
         self._patience = patience
-        self._orders: SimpleQueue[tuple[int, Reader] | None] = SimpleQueue()
+        self._orders: SimpleQueue[tuple[int, Command] | None] = SimpleQueue()
         self._news = threading.Condition()
-        self._asked = ReplayRound()
+        self._asked = Again(0, 0)
         self._heeded = 0
         self._ended = False
         self._failure: EvedropError | None = None
@@ -45,7 +53,7 @@ class Commands:
     def _listen(self) -> None:
         try:
             while not self._ended:
-                self._sort(self._session.command())
+                self._sort(self._session.command(self._receivers))
         except EvedropError as error:  # the working thread raises it
             self._failure = error
         with self._news:
@@ -53,17 +61,17 @@ class Commands:
         self._wake()
         self._knock()
 
-    def _sort(self, command: Reader) -> None:
-        match command.text("do"):
-            case "again":
+    def _sort(self, command: Command) -> None:
+        match command:
+            case Again():
                 with self._news:
-                    self._asked = ReplayRound(command.integer("n"), command)
+                    self._asked = command
                     self._news.notify()
                 self._wake()
-            case "end":
+            case End():
                 self._ended = True
             case _:
-                self._orders.put((self._asked.number, command))
+                self._orders.put((self._asked.round, command))
 
     def _wake(self) -> None:
         self._orders.put(None)
@@ -78,10 +86,10 @@ class Commands:
 
     def check(self) -> None:
         """Raise ReplayRequested if the conductor has ended the run, or asked for packets since its last heeded request."""
-        if self.over() or self._asked.number != self._heeded:
+        if self.over() or self._asked.round != self._heeded:
             raise ReplayRequested
 
-    def next(self) -> Reader:
+    def next(self) -> Command:
         """The next command of the current round; those of earlier rounds are skipped. Raises ReplayRequested as `check` does."""
         while True:
             with self._session.place.waiting(self._session.keys.control(ROUTER)):
@@ -90,24 +98,16 @@ class Commands:
             if order is not None and order[0] == self._heeded:
                 return order[1]
 
-    def resend_of(self, number: int) -> Reader | None:
+    def resend_of(self, number: int) -> Again | None:
         """Wait for the conductor's command for this round; None if the conductor has asked for a later one.
 
         Also None if it has ended the run meanwhile, or if no such command arrives within the patience.
         """
         with self._news:
             # Sensor and router are told at the same time: if the command does not arrive, the round does not exist.
-            if not self._news.wait_for(lambda: self.over() or self._asked.number >= number, self._patience):
+            if not self._news.wait_for(lambda: self.over() or self._asked.round >= number, self._patience):
                 return None
-            if self._ended or self._asked.number > number:
+            if self._ended or self._asked.round > number:
                 return None
             self._heeded = number
-            return self._asked.command
-
-
-@final
-class ReplayRound:
-    """A round in which packets are sent again: its number, counted from 1 (0: none yet), and the conductor's command."""
-
-    def __init__(self, number: int = 0, command: Reader | None = None) -> None:
-        self.number, self.command = number, command
+            return self._asked

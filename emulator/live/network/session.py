@@ -14,16 +14,18 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
+from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Protocol, Self, final
+from typing import Self, final
 
 import zenoh
 
 from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
-from evedrop.live.network.connecting import RouterAddress, Waiting, connected, endpoint_of
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.network.connecting import Credentials, RouterAddress, Waiting, connected, endpoint_of
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.container_heartbeat import HeartbeatFile
 from evedrop.live.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
@@ -34,10 +36,12 @@ from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, over, refusal
+from evedrop.live.protocol.commands import Abandon, Again, Bounds, Command, End, Where, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, reader_of
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.whereabouts import Place
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.names import OBSERVER, ROUTER
 
 READY_SECONDS = 30.0
@@ -48,15 +52,15 @@ _SENT_BYTES = 1 << 20  # under way to one reader: a full buffer would keep Zenoh
 _NEVER_MS = 86_400_000
 _ANSWER_BYTES = 64 * 2**20  # for the operator
 _WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
-ATTEMPT: Mapping[str, Any] = {"open_timeout": int(_LEASE_SECONDS * 1000)}
+ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
 """Zenoh's limit of one attempt to connect again: one that a cut connection has swallowed holds up the next for so long."""
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
 
 
-def _transport(identity: Identity | None, largest: int, listens: bool = False) -> dict[str, Any]:
+def _transport(identity: Identity | None, largest: int, listens: bool = False) -> ZenohConfig:
     # A full queue waits a minute, not five seconds, before it drops a reader: the window bounds the messages under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
-    link: dict[str, Any] = {
+    link: ZenohConfig = {
         "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
         "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
@@ -70,31 +74,7 @@ def _transport(identity: Identity | None, largest: int, listens: bool = False) -
     return {"link": link, "shared_memory": {"enabled": False}}
 
 
-class Credentials(Protocol):
-    """The router's address, and a user with a password: a brief, or the operator's control file."""
-
-    @property
-    def run(self) -> str:
-        """Name of the run."""
-
-    @property
-    def router(self) -> str:
-        """Zenoh endpoint."""
-
-    @property
-    def user(self) -> str:
-        """Name of the user."""
-
-    @property
-    def password(self) -> str:
-        """Password of the user."""
-
-    @property
-    def identity(self) -> Identity | None:
-        """Certificate of the user, if the router takes certificates."""
-
-
-def client_config(entry: Credentials) -> dict[str, Any]:
+def client_config(entry: Credentials) -> ZenohConfig:
     """Zenoh configuration of every process but the router: one connection, to the router, and no scouting for others."""
     largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
@@ -124,7 +104,7 @@ def _once(door: RouterAddress) -> zenoh.Config:
     return zenoh.Config.from_json5(json.dumps(config))
 
 
-def router_config(brief: Brief[RoutingPart], users_file: str, access: dict[str, Any], listen: str) -> dict[str, Any]:
+def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
     """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
     transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
     return {
@@ -138,7 +118,7 @@ def router_config(brief: Brief[RoutingPart], users_file: str, access: dict[str, 
     }
 
 
-def _listening(listen: str, identity: Identity | None, config: dict[str, Any]) -> zenoh.Session:
+def _listening(listen: str, identity: Identity | None, config: ZenohConfig) -> zenoh.Session:
     """Open a router's session. Raises BriefError if it cannot listen at the address in its brief."""
     endpoint = endpoint_of(listen, identity)
     try:
@@ -168,9 +148,10 @@ class Session:
     def __init__(
         self,
         brief: AnyBrief,
-        config: dict[str, Any] | None = None,
+        config: ZenohConfig | None = None,
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
         zenoh.init_log_from_env_or(_LOGGED)
@@ -187,18 +168,19 @@ class Session:
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
-        self._waiting = Waiting(brief.process, brief.router)
+        self._waiting = Waiting(brief.process, brief.router, clock)
         if config is None or listen is None:
             door = door_of(brief)
             once = _once(door)
-            first = connected(door, self.patience, meanwhile)
+            first = connected(door, self.patience, meanwhile, clock)
             self._connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
         else:
             self._connection = Connection(_listening(listen, brief.identity, config), None)
         self._outlets: dict[str, Outlet] = {}
         self._kept: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
-        self._rounds: SimpleQueue[Reader] = SimpleQueue()
+        self._rounds: SimpleQueue[Again] = SimpleQueue()
+        self._slots = brief.slots
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
         # A router connects to no other process, so it is always on its network.
@@ -293,7 +275,7 @@ class Session:
         """Process → whether it is present, kept up to date by a thread of Zenoh's."""
         present = dict.fromkeys(processes, False)
         for name in present:
-            self.watch(name, lambda there, name=name: present.__setitem__(name, there))  # type: ignore[misc]
+            self.watch(name, partial(present.__setitem__, name))
         return present
 
     def linked(self) -> bool:
@@ -359,43 +341,45 @@ class Session:
     def _send_again(self) -> None:
         """Send messages again as asked; on a thread of its own, since the working thread may be waiting for the effect."""
         while True:
-            command = self._rounds.get()
+            asked = self._rounds.get()
             deadline = time.monotonic() + _HEARD_SECONDS
             while self._unread() and time.monotonic() < deadline:
                 time.sleep(_POLL_SECONDS)
             for kept in self._kept:
-                kept.again(command.integer("n"), command.integer("k"))
+                kept.again(asked.round, asked.slot)
 
     def _told(self, payload: bytes) -> None:
         """Sort the conductor's commands; a malformed one is left to the reader of the commands, which raises the error."""
         with suppress(MalformedMessage):
-            command = Reader(self._control, payload)
-            if self._by_hand and command.text("do") == "abandon":
-                # Its messages will not come, and there is no launcher to end it.
-                sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {command.text('why')}\n")
-                sys.stderr.flush()
-                os._exit(RunError.exit_status)
-            if command.text("do") == "where":
-                self.place.ask()
-                return
-            if self._kept and command.text("do") == "again":
-                command.integer("n"), command.integer("k")
-                self._rounds.put(command)
-                return
+            match self._read(payload):
+                case Abandon(why) if self._by_hand:
+                    # Its messages will not come, and there is no launcher to end it.
+                    sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {why}\n")
+                    sys.stderr.flush()
+                    os._exit(RunError.exit_status)
+                case Where():
+                    self.place.ask()
+                    return
+                case Again() as asked if self._kept:
+                    self._rounds.put(asked)
+                    return
         self._commands.put(payload)
 
-    def wait_for(self, command: str) -> None:
-        """Wait for one command of the conductor: `start` or `end`."""
+    def _read(self, payload: bytes, receivers: Collection[str] | None = None) -> Command:
+        return read_command(Reader(self._control, payload), Bounds(self._slots, receivers))
+
+    def wait_for(self, kind: type[Command]) -> None:
+        """Wait for one command of the conductor: `Start` or `End`."""
         with self.place.waiting(self._control):
-            while self.command().text("do") != command:
+            while not isinstance(self.command(), kind):
                 pass
-        if command == "end":
+        if kind is End:
             self.conclude()
 
-    def command(self) -> Reader:
-        """Wait for the next command of the conductor, named in its field `do`."""
-        return Reader(self._control, self._commands.get())
+    def command(self, receivers: Collection[str] | None = None) -> Command:
+        """Wait for the next command of the conductor; receivers: those that it may name, any by default."""
+        return self._read(self._commands.get(), receivers)
 
-    def commanded(self) -> Reader | None:
+    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
         """The next command of the conductor, or None without waiting."""
-        return None if self._commands.empty() else self.command()
+        return None if self._commands.empty() else self.command(receivers)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Collection
+from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Any, NoReturn, final
+from typing import NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.declared import Question
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.codec import Reader, control, is_over, progress, read_over
+from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
+from evedrop.live.protocol.commands import Abandon, Command, End, Start
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 
 _AFTERTHOUGHT_SECONDS = 0.5  # the user who ended a process may be about to end the observer: then the run did not fail
@@ -27,16 +29,16 @@ _ROUTERS_SECONDS = 5.0  # for a router to confirm
 class Stop:
     """Set by a signal: the run must end now."""
 
-    def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False, clock: Clock = SYSTEM_CLOCK) -> None:
         """orphaned: whether the launcher is gone, which ends the run, too."""
-        self._orphaned = orphaned
+        self._orphaned, self._clock = orphaned, clock
         self.wanted = False
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
-        deadline = time.monotonic() + patience
-        while not (asked := self.wanted or self._orphaned()) and time.monotonic() < deadline:
-            time.sleep(0.01)
+        deadline = self._clock.monotonic() + patience
+        while not (asked := self.wanted or self._orphaned()) and self._clock.monotonic() < deadline:
+            self._clock.sleep(0.01)
         if asked:
             raise Interrupted("interrupted; the results so far are in the results folder")
 
@@ -51,24 +53,25 @@ class Conductor:
         reporters: tuple[str, ...],
         stop: Stop,
         relayed: bool = False,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """reporters: the processes that report besides router and sensor: the receivers, and a controller."""
-        self._session = session
+        self._session, self._clock = session, clock
         self._stop = stop
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
         """Whether the observer is connected to a relay, and not to the router itself."""
         self._router: str | None = None
         self.lost: dict[str, float] = {}
-        """Process that has vanished from the network → when, on the clock of `time.monotonic`."""
+        """Process that has vanished from the network → when, on the clock."""
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
-        self._news = Mailbox(self.keys, session.allowance)
+        self._news = Mailbox(self.keys, session.allowance, clock)
         for source, key in self.keys.items():
-            session.funnel(key, lambda payload, source=source: self._news.put(source, payload))  # type: ignore[misc]
+            session.funnel(key, partial(self._news.put, source))
         for name in self._present:
-            session.watch(name, lambda there, name=name: self._news.put(name, there))  # type: ignore[misc]
+            session.watch(name, partial(self._news.put, name))
         self.misdelivered: dict[str, int] = {}
         """Process that has confirmed its end → how many messages it dropped because they name another key."""
         self.absent: set[str] = set()
@@ -100,10 +103,10 @@ class Conductor:
 
     def assemble(self) -> None:
         """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
-        deadline = time.monotonic() + self._session.patience
+        deadline = self._clock.monotonic() + self._session.patience
         while self.missing:
             self._stop.check()
-            if time.monotonic() > deadline:
+            if self._clock.monotonic() > deadline:
                 # Do not name processes that wait for another one themselves.
                 names = [name for name in self.missing if not self._reaches(name)]
                 names = names or self.missing
@@ -115,7 +118,7 @@ class Conductor:
 
     def start(self) -> None:
         """Let the sensor begin."""
-        self._commands[SENSOR](control("start"))
+        self.command(SENSOR, Start())
 
     def news(self) -> tuple[str, bytes] | None:
         """The next message with its sender, or None if there was none for a moment.
@@ -134,15 +137,15 @@ class Conductor:
         self._stop.check(_AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
-    def command(self, name: str, do: str, **fields: Any) -> None:
+    def command(self, name: str, command: Command) -> None:
         """Send a command to one process."""
-        self._commands[name](control(do, **fields))
+        self._commands[name](command.pack())
 
-    def ask(self, what: str) -> None:
+    def ask(self, command: Command) -> None:
         """Send a command to every process that is present and reports."""
         for name in self.keys:
             if self._present[name]:
-                self.command(name, what)
+                self.command(name, command)
 
     def report(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""
@@ -155,17 +158,17 @@ class Conductor:
         """
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
-        deadline = time.monotonic() + patience
+        deadline = self._clock.monotonic() + patience
         said = 0.0
-        while time.monotonic() < deadline:
+        while self._clock.monotonic() < deadline:
             left = [name for name in others if not self._has_ended(name, told)]
             if not left and self._present[ROUTER]:
                 break
-            if time.monotonic() - said > _END_SECONDS:
-                said = time.monotonic()
+            if self._clock.monotonic() - said > _END_SECONDS:
+                said = self._clock.monotonic()
                 for name in left:
                     if self._present[name]:
-                        self.command(name, "end")
+                        self.command(name, End())
                         told.add(name)
             self._hear_out(self._next())
         # The relay after the router: the router's messages pass through it.
@@ -177,19 +180,19 @@ class Conductor:
         """Whether a process has left for good: it confirmed its end, or it vanished when told to end and did not return."""
         if self._present[name]:
             return False
-        gone = time.monotonic() - self.lost.get(name, -math.inf)
+        gone = self._clock.monotonic() - self.lost.get(name, -math.inf)
         return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
 
     def _end_router(self, name: str) -> None:
         """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
-        deadline = time.monotonic() + _ROUTERS_SECONDS
+        deadline = self._clock.monotonic() + _ROUTERS_SECONDS
         said = 0.0
-        while time.monotonic() < deadline and name not in self.misdelivered:
+        while self._clock.monotonic() < deadline and name not in self.misdelivered:
             if name == RELAY and not self._present[name] and self._session.linked():
                 return
-            if time.monotonic() - said > _END_SECONDS:
-                said = time.monotonic()
-                self.command(name, "end")
+            if self._clock.monotonic() - said > _END_SECONDS:
+                said = self._clock.monotonic()
+                self.command(name, End())
             self._hear_out(self._next())
 
     def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
@@ -207,10 +210,10 @@ class Conductor:
         for names in (others, [ROUTER], [RELAY]):
             told = [name for name in names if name in self._commands]
             for name in told:
-                self.command(name, "abandon", why=why)
-            deadline = time.monotonic() + _ABANDON_SECONDS
-            while any(self._reaches(name) for name in told) and time.monotonic() < deadline:
-                time.sleep(0.01)
+                self.command(name, Abandon(why))
+            deadline = self._clock.monotonic() + _ABANDON_SECONDS
+            while any(self._reaches(name) for name in told) and self._clock.monotonic() < deadline:
+                self._clock.sleep(0.01)
 
     def _reaches(self, name: str) -> bool:
         """Whether a process has opened its session; it may still wait for others."""
@@ -230,4 +233,4 @@ class Conductor:
         if there:
             self.lost.pop(name, None)
         else:
-            self.lost.setdefault(name, time.monotonic())
+            self.lost.setdefault(name, self._clock.monotonic())

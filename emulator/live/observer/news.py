@@ -6,13 +6,14 @@ while the observer imports, computes or writes, however long that takes on a bus
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import threading
 from contextlib import suppress
 from types import TracebackType
-from typing import Any, Self, final
+from typing import Self, final
+
+from evedrop.live.protocol.news import Alive, News
 
 _BEAT_SECONDS = 1.0
 _LINE = threading.Lock()  # one line at a time
@@ -25,9 +26,9 @@ def set_news_apart() -> None:
     os.dup2(2, 1)
 
 
-def tell(event: str, **news: Any) -> None:
+def tell(news: News) -> None:
     """Write a line to standard output for the launcher; works also without a reader."""
-    left = memoryview(json.dumps({"event": event, **news}, ensure_ascii=False).encode() + b"\n")
+    left = memoryview(news.line)
     with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
         while left:
             left = left[os.write(sys.stdout.fileno(), left) :]
@@ -54,4 +55,4 @@ class Heartbeat:
 
     def _beat(self) -> None:
         while not self._over.wait(self._seconds):
-            tell("alive")
+            tell(Alive())

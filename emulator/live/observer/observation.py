@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
@@ -29,7 +29,8 @@ from evedrop.live.observer.verification import Verifier, extent_of
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
-from evedrop.live.protocol.news import RunEnded, RunProgress
+from evedrop.live.protocol.commands import Where
+from evedrop.live.protocol.news import RunEnded, RunOver, RunProgress, Started, ViewOpened
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
@@ -95,7 +96,7 @@ class ObservedRun:
         """Processes whose misbehaviour ended the run."""
         self._recovery: Recovery
         self._stall: Stall
-        self._outages: list[Mapping[str, Any]] = []
+        self._outages: Sequence[Mapping[str, object]] = ()
         self._misdelivered: dict[str, int] = {}
         self._due: dict[str, GapDetector] = {}
         self._recent: tuple[float, int] = (self._started, 0)
@@ -112,7 +113,7 @@ class ObservedRun:
     def show(self, stand: WebAddress) -> Viewer:
         """Start a viewer for browsers, and stream the run to it."""
         viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
-        tell("view", address=viewer.address)
+        tell(ViewOpened(viewer.address))
         return viewer
 
     def writer(self) -> ResultsWriter:
@@ -134,14 +135,14 @@ class ObservedRun:
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             batch = self._brief.flow.batch
             limit = patience_of(patience, self._scenario.pace, batch)
-            self._stall = Stall(limit, batch, lambda: conductor.ask("where"))
+            self._stall = Stall(limit, batch, lambda: conductor.ask(Where()))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
                 self._recent = (self._started, 0)
                 self._control.write(self.folder)
                 conductor.start()
-                tell("started")
+                tell(Started())
                 while not self._joiner.complete(self._scenario.slots):
                     news = conductor.news()
                     if news is not None:
@@ -161,7 +162,7 @@ class ObservedRun:
                 self._recovery.give_up(self._joiner.done)
                 self._outages = self._recovery.account()
                 self._ended = time.monotonic()
-            tell("over")
+            tell(RunOver())
             try:
                 conductor.end(patience)
             finally:
@@ -308,7 +309,7 @@ class ObservedRun:
         rate = (self._joiner.done - done) / (now - before)
         self._told, self._recent = now, (now, self._joiner.done)
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
-        tell(**RunProgress(self._joiner.done, rate, "slots/s", errors).news)
+        tell(RunProgress(self._joiner.done, rate, "slots/s", errors))
 
     @property
     def _at(self) -> str:
@@ -370,7 +371,7 @@ class ObservedRun:
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell(**RunEnded(status, how, self._suspects, self._accused, view).news)
+        tell(RunEnded(status, how, self._suspects, self._accused, view))
         if self._by_hand:
             with suppress(FileNotFoundError):
                 report(self.folder, status, how)

@@ -24,6 +24,7 @@ from evedrop.live.observer.news import set_news_apart, tell
 from evedrop.live.observer.observation import ObservedRun, Report
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
+from evedrop.live.protocol.news import Finishing
 from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.results.folder import new_folder
 from evedrop.results.resolved_scenario import write_resolved
@@ -68,7 +69,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
             except EvedropError as error:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
             finally:
-                tell("finishing")
+                tell(Finishing())
             observation.settle(how)
     except OSError as error:
         status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)

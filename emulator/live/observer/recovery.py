@@ -9,14 +9,16 @@ Source: docs/protocol.md, lost connections.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, final
+from collections.abc import Callable
+from typing import final
 
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.brief_entries import plain
+from evedrop.live.protocol.commands import Again
+from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.names import OBSERVER, RELAY, ROUTER
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
@@ -24,27 +26,20 @@ _IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before 
 _LONGEST_SECONDS = 30.0
 
 
-@dataclass(frozen=True)
-class ConnectionOutage:
-    """A process that was cut off."""
-
-    process: str
-    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
-    slot: int
-    """The first slot that was not joined when the loss was noticed."""
-    until: int | None
-    """The first slot that was not joined when the run went on; None if it did not."""
-    seconds: float
-    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
-
-
 @final
 class Recovery:
     """Notices lost connections and begins rounds of resending. say: sends news to the launcher."""
 
     def __init__(
-        self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: Callable[..., None]
+        self,
+        conductor: Conductor,
+        steering: Steering,
+        flow: Flow,
+        pace: float,
+        say: Callable[[News], None],
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
+        self._clock = clock
         self._conductor, self._steering, self._flow, self._say = conductor, steering, flow, say
         self._batch_seconds = pace * flow.batch
         self._missing: dict[str, tuple[int, float]] = {}
@@ -52,7 +47,7 @@ class Recovery:
         self._done = 0
         self._target = 0
         """Slots below this were under way when a connection was lost."""
-        self._moved = self._joined = time.monotonic()
+        self._moved = self._joined = self._clock.monotonic()
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
@@ -64,7 +59,7 @@ class Recovery:
 
         Raises RunError if a process has been missing for too long.
         """
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if done > self._done:
             self._go_on(done, now)
         if self._conductor.missing:
@@ -98,7 +93,7 @@ class Recovery:
         for name, (slot, since) in self._back.items():
             outage = ConnectionOutage(name, slot, done, now - since)
             self.outages.append(outage)
-            self._say("reconnected", **asdict(outage))
+            self._say(outage)
         self._back = {}
 
     def _miss(self, done: int, now: float) -> None:
@@ -138,8 +133,8 @@ class Recovery:
         self._number += 1
         for name, there in self._conductor.processes.items():
             if there:
-                links = {"links": self._steering.changes} if name == ROUTER else {}
-                self._conductor.command(name, "again", n=self._number, k=self._done, **links)
+                links = self._steering.changes if name == ROUTER else None
+                self._conductor.command(name, Again(self._number, self._done, links))
         if self._done == 0:
             self._conductor.start()
         self._steering.remind()
@@ -147,13 +142,13 @@ class Recovery:
 
     def give_up(self, done: int) -> None:
         """Record the outages that are open when the run ends with slot `done`."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
         self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
 
-    def account(self) -> list[Mapping[str, Any]]:
+    def account(self) -> list[dict[str, object]]:
         """The outages in the form of the summary."""
-        return [asdict(outage) for outage in self.outages]
+        return [plain(outage) for outage in self.outages]

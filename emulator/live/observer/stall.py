@@ -10,11 +10,11 @@ Source: docs/protocol.md, silence.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Mapping
 from typing import final
 
 from evedrop.errors import Silence
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.whereabouts import Whereabouts
 from evedrop.names import OBSERVER
@@ -35,10 +35,11 @@ def patience_of(longest_outage: float, pace: float, batch: int) -> float:
 class Stall:
     """Notices that a run stands still, and ends it when the process that it waits for has done nothing for too long."""
 
-    def __init__(self, patience: float, batch: int, ask: Callable[[], None]) -> None:
+    def __init__(self, patience: float, batch: int, ask: Callable[[], None], clock: Clock = SYSTEM_CLOCK) -> None:
         """patience: as in `patience_of`; batch: slots of a report; ask: asks every process where it is."""
         self._patience, self._batch, self._ask = patience, batch, ask
-        self._looked = time.monotonic()
+        self._clock = clock
+        self._looked = self._clock.monotonic()
         self._done = 0
         self._stalled = self._asked = 0.0
         """Seconds since slots were last joined, and the value of that count when the processes were last asked."""
@@ -65,7 +66,7 @@ class Stall:
         slots. held: the run is held, and no process has anything to do; missing: some process is not on the network, which
         is handled elsewhere.
         """
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if done > self._done or held:
             self._done, self._looked, self._stalled, self._asked = done, now, 0.0, 0.0
             self._answers, self._moved = {}, {}

@@ -17,7 +17,8 @@ from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
-from evedrop.live.protocol.news import ProcessRequest
+from evedrop.live.protocol.commands import Go, Hold, LinkChange
+from evedrop.live.protocol.news import Back, Held, News, ProcessRequest
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
@@ -39,7 +40,7 @@ class Steering:
         self,
         scenario: Scenario,
         conductor: Conductor,
-        tell: Callable[..., None],
+        tell: Callable[[News], None],
         keep: Callable[[Scenario], None],
     ) -> None:
         self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep
@@ -56,7 +57,7 @@ class Steering:
         self._step: OperatorStep | None = None
         self._last = -1
         self._changed: set[str] = set()
-        self._gone: dict[str, Any] | None = None
+        self._gone: Go | None = None
         """The last go, as the sensor was told it."""
         self.paused = False
         """Whether the run stays held until the operator resumes it."""
@@ -95,7 +96,7 @@ class Steering:
         self._orders.append(order)
         if self.at is None and not self._asked:
             self._asked = True
-            self._conductor.command(SENSOR, "hold")
+            self._conductor.command(SENSOR, Hold())
 
     def carry_on(self, reported: int) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
@@ -144,7 +145,7 @@ class Steering:
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
             if act.kind in ("restart", "resume"):
                 self._conductor.absent -= set(act.names)
-                self._tell("back")
+                self._tell(Back())
             self._waiting = None
             return True
         self._despair(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
@@ -167,7 +168,7 @@ class Steering:
             if act.kind in ("kill", "pause"):
                 self._conductor.absent |= set(act.names)
             self._waiting, self._confirmed, self._since = act, False, time.monotonic()
-            self._tell(**ProcessRequest(act.kind, act.names[0], k, len(self.events)).news)
+            self._tell(ProcessRequest(act.kind, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""
@@ -208,13 +209,13 @@ class Steering:
         self._keep(changed)
         for name in act.names:
             self._changed.add(name)
-            changes = [_plain(one) for one in changed.timeline.changes[name] if one.at >= k]
-            self._conductor.command(ROUTER, "change", link=name, changes=changes)
+            changes = tuple(one for one in changed.timeline.changes[name] if one.at >= k)
+            self._conductor.command(ROUTER, LinkChange(name, changes))
         order.done(k, f"from slot {k} on: {act.said}")
 
     def _pause(self, k: int, said: str | None = None) -> None:
         self.paused = True
-        self._tell("held", before=k)
+        self._tell(Held(k))
         if said is not None:
             self._note(k, said, "operator")
 
@@ -234,20 +235,20 @@ class Steering:
 
     def _release(self) -> None:
         self.at = None
-        until = {} if self._step is None else {"until": self._step.until}
-        self._gone = {"k": self._last, "absent": sorted(self._conductor.absent), **until}
+        until = None if self._step is None else self._step.until
+        self._gone = Go(self._last, tuple(sorted(self._conductor.absent)), until)
         self._go()
 
     def _go(self) -> None:
         if self._gone is not None:
-            self._conductor.command(ROUTER, "go", k=self._gone["k"])
-            self._conductor.command(SENSOR, "go", **self._gone)
+            self._conductor.command(ROUTER, Go(self._gone.slot))
+            self._conductor.command(SENSOR, self._gone)
 
     @property
-    def changes(self) -> dict[str, list[dict[str, Any]]]:
+    def changes(self) -> dict[str, tuple[Change, ...]]:
         """Link that the operator has changed → all its changes."""
         timeline = self._scenario.timeline.changes
-        return {name: [_plain(one) for one in timeline[name]] for name in sorted(self._changed)}
+        return {name: tuple(timeline[name]) for name in sorted(self._changed)}
 
     def remind(self) -> None:
         """Send the last commands again, which may have been lost with a connection; restart the time limit of the hold.
@@ -257,10 +258,4 @@ class Steering:
         self._since = time.monotonic()
         self._go()
         if self._asked:
-            self._conductor.command(SENSOR, "hold")
-
-
-def _plain(change: Change) -> dict[str, Any]:
-    """A change in the form of the command to the router."""
-    optional = {"settings": change.settings, "cut": change.cut}
-    return {"at": change.at, **{name: value for name, value in optional.items() if value is not None}}
+            self._conductor.command(SENSOR, Hold())

@@ -19,7 +19,6 @@ from evedrop.errors import BriefError
 from evedrop.files import Unreadable, opened, why_of
 from evedrop.live.protocol.brief_entries import (
     MATRIX,
-    MOST_SLOTS,
     anything,
     entry,
     expect,
@@ -37,7 +36,7 @@ from evedrop.live.protocol.brief_entries import (
 )
 from evedrop.live.protocol.brief_parts import PARTS, Identity, Part
 from evedrop.model.process import Process, mistakes_of
-from evedrop.streams import Batch
+from evedrop.streams import MOST_SLOTS, Batch
 
 _MOST_TRIALS, _LAST_TRIAL = 1_000_000, 2**48
 _MOST_BYTES = 2**30  # the observer's brief holds the complete scenario

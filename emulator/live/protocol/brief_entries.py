@@ -22,7 +22,6 @@ Check = Callable[[str, Any], Iterator[str]]
 
 _SHOWN = 40  # characters of a value that a message repeats
 _MOST_TOLD = 8
-MOST_SLOTS = 100_000_000
 
 T = TypeVar("T")
 

@@ -18,7 +18,6 @@ from evedrop.live.protocol.brief_closed_loop import (
     Wiring,
 )
 from evedrop.live.protocol.brief_entries import (
-    MOST_SLOTS,
     SLOT,
     Check,
     anything,
@@ -42,6 +41,7 @@ from evedrop.model.acknowledgements import WayBackSpec
 from evedrop.model.links.link import Fate
 from evedrop.model.numeric.detection import Chart
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
+from evedrop.streams import MOST_SLOTS
 
 _TEXTS = listed(text)
 _SCHEME = table({"scheme": text}, strict=False)

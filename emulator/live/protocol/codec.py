@@ -197,11 +197,6 @@ def read_progress(key: str, payload: bytes, sent: int) -> int:
     return Reader(key, payload).integer("k", 0, sent)
 
 
-def control(command: str, **fields: Any) -> bytes:
-    """Encode a command of the conductor, such as `start`, `end`, `hold`, `change`, `go` or `again`, with its fields."""
-    return pack({"do": command, **fields})
-
-
 def over(dropped: int) -> bytes:
     """Encode a process's last message: it ends on command. dropped: how many messages it dropped that named another key."""
     return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})

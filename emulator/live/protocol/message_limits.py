@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from evedrop.live.protocol.keys import KINDS
+from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.links.link import REASONS
 from evedrop.model.slot.account import COUNTED_BURSTS
@@ -66,10 +66,10 @@ class Sizes:
         return {kind: kinds[kind] + _FRAME_BYTES for kind in KINDS}
 
 
-def low_pass(run: str, kinds: Mapping[str, int]) -> list[dict[str, Any]]:
+def low_pass(run: str, kinds: Mapping[str, int]) -> list[ZenohConfig]:
     """The `low_pass_filter` section of a router's Zenoh configuration, which drops larger messages."""
 
-    def rule(name: str, keys: list[str], size: int, messages: list[str]) -> dict[str, Any]:
+    def rule(name: str, keys: list[str], size: int, messages: list[str]) -> ZenohConfig:
         return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": keys, "size_limit": size}
 
     under = {kind: [f"evedrop/{run}/{kind}", f"evedrop/{run}/{kind}/**"] for kind in kinds}

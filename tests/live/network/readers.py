@@ -8,15 +8,16 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from evedrop.live.network import operator, router
+from evedrop.live.network import operator
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets, telemetry, whereabouts
+from evedrop.live.protocol import commands, packets, telemetry, whereabouts
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.link import Change
 from evedrop.model.slot.transit import Late
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
@@ -32,13 +33,8 @@ def _on(path: str, read: Callable[[Reader], Any]) -> tuple[str, Callable[[bytes]
     return key, lambda payload: read(Reader(key, payload))
 
 
-def _go(command: Reader) -> tuple[Any, ...]:
-    until = command.integer("until") if command.has("until") else None
-    return command.text("do"), command.integer("k"), command.names("absent"), until
-
-
-def _changed(command: Reader) -> Any:
-    return command.choice("link", ("eve", "legitimate")), router.read_changes(command, "changes", SLOTS)
+def _commanded(process: str, receivers: tuple[str, ...] | None = None) -> tuple[str, Callable[[bytes], Any]]:
+    return _on(f"control/{process}", lambda m: commands.read_command(m, commands.Bounds(SLOTS, receivers)))
 
 
 READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
@@ -51,10 +47,10 @@ READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "state": _on("state", lambda m: loop_wire.read_known(m, "x", K, SHAPE)),
     "input": _on("input", lambda m: loop_wire.read_decided(m, K, (INPUTS, TRIALS))),
     "progress": ("evedrop/r1/progress/eve", lambda raw: wire.read_progress("evedrop/r1/progress/eve", raw, K)),
-    "control": _on("control/eve", lambda m: (m.text("do"), m.has("k") and m.integer("k"))),
-    "go": _on("control/sensor", _go),
-    "change": _on("control/router", _changed),
-    "again": _on("control/router", lambda m: router.read_links(m, ("eve", "legitimate"), SLOTS)),
+    "control": _commanded("eve"),
+    "go": _commanded("sensor", ("eve", "observer")),
+    "change": _commanded("router", ("eve", "legitimate")),
+    "again": _commanded("router", ("eve", "legitimate")),
     "request": ("evedrop/r1/control/observer", lambda raw: operator.read_request("evedrop/r1/control/observer", raw)),
     "answer": ("evedrop/r1/control/observer", lambda raw: operator.read_answer("evedrop/r1/control/observer", raw)),
     "truth": _on("telemetry/sensor", lambda m: telemetry.read_truth(m, K, EXTENT)),
@@ -94,10 +90,10 @@ EXAMPLES: Mapping[str, bytes] = {
     "state": loop_wire.known("x", K, _z),
     "input": loop_wire.decided(K, _z[:1], _flags),
     "progress": wire.progress(K),
-    "control": wire.control("end"),
-    "go": wire.control("go", k=K, absent=["eve"], until=9),
-    "change": wire.control("change", link="eve", changes=[{"at": 4, "cut": True}, {"at": 9, "settings": {"loss": {}}}]),
-    "again": wire.control("again", n=1, k=K, links={"eve": [{"at": 4, "cut": True}]}),
+    "control": commands.End().pack(),
+    "go": commands.Go(K, ("eve",), 9).pack(),
+    "change": commands.LinkChange("eve", (Change(4, cut=True), Change(9, {"loss": {}}))).pack(),
+    "again": commands.Again(1, K, {"eve": (Change(4, cut=True),)}).pack(),
     "request": operator.Request("step", slots=3).pack(),
     "answer": operator.Answer(3, "done").pack(),
     "truth": telemetry.Truth(K, np.ones((2, *SHAPE)), np.ones((2, 3), bool), None, None, np.ones((2, 1, 3)),

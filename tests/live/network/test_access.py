@@ -21,6 +21,7 @@ import zenoh
 from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.commands import End, Unknown
 from evedrop.live.protocol.envelope import enclosed
 from tests.live.network.bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
 
@@ -81,8 +82,8 @@ def talk(stage: Bench) -> None:
         if name != "sensor":
             stage.put(name, stage.keys.progress(name), wire.progress(1))
             assert stage.progress[name].hear()[1] == wire.progress(1)
-        stage.put("observer", stage.keys.control(name), wire.control("noted"))
-        assert stage.controls[name].hear()[1] == wire.control("noted")
+        stage.put("observer", stage.keys.control(name), Unknown().pack())
+        assert stage.controls[name].hear()[1] == Unknown().pack()
     stage.put("observer", stage.keys.progress("observer"), wire.progress(1))
     assert stage.progress["observer"].hear()[1] == wire.progress(1)
 
@@ -217,7 +218,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
     """What it puts on any other key, and any deletion, reaches nobody; the run goes on as if nothing had been."""
     keys = all_keys(stage)
     own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
-    payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), wire.control("end"), wire.progress(10**9), b"\xc1")
+    payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), End().pack(), wire.progress(10**9), b"\xc1")
     block = zenoh.CongestionControl.BLOCK
     with attacking(stage, mode) as attacker:
         for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:

@@ -14,12 +14,14 @@ from evedrop.live.network.mailbox import Mailbox, allowance
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.commands import Again
 from evedrop.live.protocol.envelope import head_of
 from evedrop.live.protocol.message_limits import Sizes
 from evedrop.live.protocol.whereabouts import Whereabouts
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.link import Change
 from evedrop.model.slot.transit import Late
 
 SIZES = st.builds(
@@ -83,7 +85,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
         "telemetry": max(reports, key=len),
         "journal": telemetry.Journal(k, c, dict.fromkeys(names, account)).pack(),
         "progress": wire.progress(k),
-        "control": wire.control("again", n=k, k=k, links={name: [{"at": k, "cut": True}] * 100 for name in names}),
+        "control": Again(k, k, {name: (Change(k, cut=True),) * 100 for name in names}).pack(),
     }
 
 

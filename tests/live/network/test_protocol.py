@@ -17,7 +17,7 @@ from evedrop.live.network import operator
 from evedrop.live.network.access import grants
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import envelope, packets, telemetry
+from evedrop.live.protocol import commands, envelope, packets, telemetry
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys
@@ -26,6 +26,7 @@ from evedrop.model.digest import BeliefLog, Blocks, RunDigest
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.link import Change
 from evedrop.model.slot.transit import Late
 from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
 
@@ -256,28 +257,34 @@ def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> di
     return {"k": message.slot(value["k"]), "held": message.flag("held")}
 
 
+def control_of(value: dict[str, Any]) -> commands.Command:
+    """A command with these fields."""
+
+    def changes(of: list[dict[str, Any]]) -> tuple[Change, ...]:
+        return tuple(Change(one["at"], one.get("settings"), one.get("cut")) for one in of)
+
+    match value:
+        case {"do": "start"}:
+            return commands.Start()
+        case {"do": "end"}:
+            return commands.End()
+        case {"do": "abandon", "why": why}:
+            return commands.Abandon(why)
+        case {"do": "go", "k": k, "absent": absent, "until": until}:
+            return commands.Go(k, tuple(absent), until)
+        case {"do": "again", "n": n, "k": k, "links": links}:
+            return commands.Again(n, k, {name: changes(of) for name, of in links.items()})
+        case {"do": "change", "link": link, "changes": of}:
+            return commands.LinkChange(link, changes(of))
+    raise AssertionError(value)
+
+
 def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As processes read it."""
-    message = wire.Reader(KEY, raw)
-    found: dict[str, Any] = {"do": message.text("do")}
-    for name in ("n", "k"):
-        if message.has(name):
-            found[name] = message.integer(name)
-    if message.has("links"):
-        found["links"] = dict(message.map("links"))
-    if message.has("why"):
-        found["why"] = message.text("why")
-    if message.has("absent"):
-        found["absent"] = list(message.names("absent"))
-    if message.has("until"):
-        found["until"] = message.integer("until")
-    if message.has("changes"):
-        found |= {"link": message.text("link"), "changes": value["changes"]}
-        for one, change in zip(message.maps("changes"), value["changes"], strict=True):
-            assert one.integer("at") == change["at"]
-            assert "cut" not in change or one.flag("cut") == change["cut"]
-            assert "settings" not in change or one.map("settings") == change["settings"]
-    return found
+    """As the process reads it to which it is sent."""
+    to = {"again": "router", "change": "router"}.get(value["do"], "sensor")
+    message = wire.Reader(f"{KEY}/control/{to}", raw)
+    assert commands.read_command(message, commands.Bounds(SLOTS)) == control_of(value)
+    return value
 
 
 def decode_packet(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -312,11 +319,6 @@ def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
     return {"k": answer.slot, "said": answer.said} if answer.status is None else {"status": answer.status}
 
 
-def rest_of(value: dict[str, Any]) -> dict[str, Any]:
-    """What goes with a command."""
-    return {name: inner for name, inner in value.items() if name != "do"}
-
-
 CODECS: dict[str, tuple[Encode, Decode]] = {
     "packet": (lambda _shape, value: packets.uplink(value["k"], np.array(value["z"])), decode_packet),
     "delivery": (encode_delivery, decode_delivery),
@@ -328,7 +330,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, value: wire.progress(value["k"]),
         lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw, SLOTS)},
     ),
-    "control": (lambda _shape, value: wire.control(value["do"], **rest_of(value)), decode_control),
+    "control": (lambda _shape, value: control_of(value).pack(), decode_control),
     "resend": (lambda _shape, value: packets.resend(value["n"], value["again"], value["k"]), decode_resend),
     "barrier": (lambda _shape, value: packets.barrier(value["k"]), decode_barrier),
     "held": (lambda _shape, value: telemetry.held(value["k"]), decode_held),

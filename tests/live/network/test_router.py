@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import re
 import struct
+import threading
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self, cast
 
 import msgpack
 import numpy as np
 import pytest
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
+from evedrop.errors import RunError
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.network.router import Routing
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from tests.live.network.bench import LIMIT_SECONDS, Bench
+from evedrop.live.protocol.brief import Brief, Flow
+from evedrop.live.protocol.brief_parts import RouterPart
+from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.keys import RunKeys
+from evedrop.model.process import Floats
+from tests.live.in_memory import Stage
+from tests.live.network.bench import LIMIT_SECONDS, Bench, scenario_of
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
@@ -27,7 +41,63 @@ def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
     return np.array([[(word >> 11) / 2**53 for word in row] for row in drawn])
 
 
-def run_through(bench: Bench) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+@dataclass
+class Ear:
+    """What a router puts on one key, in order."""
+
+    bench: MemoryBench
+    key: str
+
+    def hear(self) -> tuple[str, bytes]:
+        """The next message."""
+        kept = self.bench.heard[self.key]
+        while not kept:
+            key, payload = self.bench.stage.put.get(timeout=LIMIT_SECONDS)
+            self.bench.heard[key].append(payload)
+        return self.key, kept.popleft()
+
+
+class MemoryBench:
+    """The work of a router in a thread of its own, on a session in memory, with everybody else played by the test."""
+
+    def __init__(self, **changes: Any) -> None:
+        self.scenario = scenario_of(**changes)
+        self.briefs = briefs_of(self.scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+        brief = self.briefs["router"]
+        assert isinstance(brief.part, RouterPart)
+        self.brief = cast(Brief[RouterPart], replace(brief, flow=Flow(32, 8, self.scenario.longest_outage)))
+        self.keys, self.stage = RunKeys(brief.run), Stage()
+        self.heard: defaultdict[str, deque[bytes]] = defaultdict(deque)
+        self.downlinks = {name: Ear(self, self.keys.downlink(name)) for name in self.scenario.receivers}
+        self.journal = Ear(self, self.keys.journal)
+
+    def __enter__(self) -> Self:
+        self._routing = Routing(self.brief, self.stage.session(self.brief))
+        self._thread = threading.Thread(target=self._routing.carry_on, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def put(self, process: str, key: str, payload: bytes) -> None:
+        """The sensor sends a packet."""
+        assert (process, key) == ("sensor", self.keys.uplink)
+        self.stage.fill(key, [payload])
+
+    def end(self) -> None:
+        """The run is over: the router returns."""
+        self.stage.commands.put(End().pack())
+        self._thread.join(LIMIT_SECONDS)
+        assert not self._thread.is_alive()
+
+    def packet(self, k: int) -> Floats:
+        """The payloads of slot k: any numbers that tell slots, states and trials apart."""
+        n, trials = 2, self.scenario.trials
+        return np.arange(n * trials, dtype=float).reshape(n, trials) + 100.0 * (k + 1)
+
+
+def run_through(bench: Bench | MemoryBench) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Send every slot; what each receiver got of it, (slots, R), and how many were lost by the journal, (slots,)."""
     scenario, keys = bench.scenario, bench.keys
     shape = (2, scenario.trials)
@@ -62,16 +132,16 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         key = stage.briefs["router"].stream_keys[f"link/{name}"]
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
-    stage.put("observer", stage.keys.control("router"), wire.control("end"))
+    stage.put("observer", stage.keys.control("router"), End().pack())
     assert stage.router.wait(LIMIT_SECONDS) == 0
     assert stage.log.read_text() == ""
 
 
-def test_perfect_and_dead_links(bench: Callable[..., Bench]) -> None:
+def test_perfect_and_dead_links() -> None:
     """A link of quality 1 delivers everything, one of quality 0 nothing, and both have a delivery in every slot."""
     eavesdroppers = {"eve": {"strategy": "naive", "link": {"quality": 0.0}}}
-    stage = bench(slots=20, trials=9, legitimate={"link": {"quality": 1.0}}, eavesdroppers=eavesdroppers)
-    gammas, lost = run_through(stage)
+    with MemoryBench(slots=20, trials=9, legitimate={"link": {"quality": 1.0}}, eavesdroppers=eavesdroppers) as bench:
+        gammas, lost = run_through(bench)
     assert gammas["legitimate"].all()
     assert not gammas["eve"].any()
     assert lost["eve"].tolist() == [9] * 20
@@ -98,9 +168,21 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_packet_ends_the_router(name: str, bench: Callable[..., Bench]) -> None:
-    """A gap that is not closed, or a malformed packet, ends the router with status 3 and a line that says which."""
+def test_bad_packet_is_refused(name: str) -> None:
+    """A gap that is not closed, or a malformed packet, ends the router's work with an error that says which."""
     messages, line = BAD[name]
+    bench = MemoryBench(longest_outage=0.0)
+    routing = Routing(bench.brief, bench.stage.session(bench.brief))
+    bench.stage.fill(bench.keys.uplink, messages)
+    with pytest.raises(RunError, match=line) as found:
+        routing.carry_on()
+    bench.stage.commands.put(End().pack())  # ends the thread that reads commands
+    assert found.value.exit_status == 3
+
+
+def test_bad_packet_ends_the_router(bench: Callable[..., Bench]) -> None:
+    """A malformed packet ends the process with status 3, a line that says which, and no traceback."""
+    messages, line = BAD["too short"]
     stage = bench(longest_outage=0.0)
     for message in messages:
         stage.put("sensor", stage.keys.uplink, message)
@@ -111,16 +193,16 @@ def test_bad_packet_ends_the_router(name: str, bench: Callable[..., Bench]) -> N
     assert stage.tokens.hear() == (f"deleted {stage.keys.alive('router')}", b"")
 
 
-def test_a_doubled_packet_is_delivered_once(bench: Callable[..., Bench]) -> None:
+def test_a_doubled_packet_is_delivered_once() -> None:
     """A slot that comes twice, and one that comes too early, are ignored."""
-    stage = bench()
-    for k in (0, 0, 2, 1):
-        stage.put("sensor", stage.keys.uplink, packets.uplink(k, np.zeros((2, 5))))
-    for ear in stage.downlinks.values():
-        assert [wire.Reader(*ear.hear()).integer("k") for _ in range(2)] == [0, 1]
-    stage.put("sensor", stage.keys.uplink, packets.uplink(2, np.zeros((2, 5))))
-    for ear in stage.downlinks.values():
-        assert wire.Reader(*ear.hear()).integer("k") == 2
+    with MemoryBench() as bench:
+        for k in (0, 0, 2, 1):
+            bench.put("sensor", bench.keys.uplink, packets.uplink(k, np.zeros((2, 5))))
+        for ear in bench.downlinks.values():
+            assert [wire.Reader(*ear.hear()).integer("k") for _ in range(2)] == [0, 1]
+        bench.put("sensor", bench.keys.uplink, packets.uplink(2, np.zeros((2, 5))))
+        for ear in bench.downlinks.values():
+            assert wire.Reader(*ear.hear()).integer("k") == 2
 
 
 def test_a_part_of_a_slot_is_waited_for_in_real_time(bench: Callable[..., Bench]) -> None:

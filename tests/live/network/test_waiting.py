@@ -18,22 +18,20 @@ from evedrop.live.network import connecting
 from evedrop.live.network.connecting import RouterAddress
 from evedrop.live.network.session import Session
 from evedrop.ports import free_port
+from tests.clock import TestClock
 from tests.live.network.bench import scenario_of
 
 
-def test_a_process_says_that_it_waits_for_its_router(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_process_says_that_it_waits_for_its_router(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Every few seconds, on standard error: who waits, for which router, for how long, and what came of the last attempt."""
-    monkeypatch.setattr(connecting, "WAITING_SECONDS", 0.3)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     brief = briefs_of(scenario_of(), endpoint, ObserverTask(tmp_path, False), ends_with_stdin=False)["eve"]
     with pytest.raises(RunError, match="no router answered"):
-        Session(replace(brief, patience=1))
+        Session(replace(brief, patience=10), clock=TestClock())
     said = capfd.readouterr().err.splitlines()
-    line = rf"evedrop: eve: waiting for the router at {endpoint}: no answer yet \((0|1) s; Connection refused\)"
+    line = rf"evedrop: eve: waiting for the router at {endpoint}: no answer yet \((3|6|9) s; Connection refused\)"
     assert [bool(re.fullmatch(line, one)) for one in said] == [True] * len(said)
-    assert 2 <= len(said) <= 4
+    assert len(said) == 3
 
 
 @contextlib.contextmanager

@@ -1,0 +1,208 @@
+"""The observer's commands to the other processes, a class for each.
+
+Source: docs/protocol.md, control.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+from evedrop.live.protocol.codec import Reader, pack, shown
+from evedrop.live.protocol.keys import reader_of
+from evedrop.model.slot.link import Change
+from evedrop.names import ROUTER, SENSOR
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The limits of what a command may name."""
+
+    slots: int
+    """Of the run."""
+    receivers: Collection[str] | None = None
+    """The receivers that it may name, and the observer, to the sensor; None: any."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command without fields; the others add theirs."""
+
+    do: ClassVar[str]
+
+    def pack(self) -> bytes:
+        """Encode it as a message."""
+        return pack({"do": self.do})
+
+    @classmethod
+    def read(cls, message: Reader, bounds: Bounds) -> Self:  # noqa: ARG003 - for kinds with fields
+        """Decode a command of this kind. Raises MalformedMessage."""
+        return cls()
+
+
+@dataclass(frozen=True)
+class Start(Command):
+    """To the sensor: all processes are there; begin."""
+
+    do = "start"
+
+
+@dataclass(frozen=True)
+class End(Command):
+    """To all: the run is over; confirm it and leave."""
+
+    do = "end"
+
+
+@dataclass(frozen=True)
+class Where(Command):
+    """To all: report where you are."""
+
+    do = "where"
+
+
+@dataclass(frozen=True)
+class Hold(Command):
+    """To the sensor: stop before the next slot."""
+
+    do = "hold"
+
+
+@dataclass(frozen=True)
+class Unknown(Command):
+    """A command that this version does not know, and ignores."""
+
+    do = "unknown"
+
+
+@dataclass(frozen=True)
+class Abandon(Command):
+    """To all: the run was given up."""
+
+    do = "abandon"
+    why: str
+
+    def pack(self) -> bytes:
+        """Encode it as a message."""
+        return pack({"do": self.do, "why": self.why})
+
+    @classmethod
+    def read(cls, message: Reader, bounds: Bounds) -> Self:  # noqa: ARG003 - for kinds that name receivers or slots
+        """Decode it."""
+        return cls(message.text("why"))
+
+
+@dataclass(frozen=True)
+class Go(Command):
+    """To router and sensor: go on after a hold."""
+
+    do = "go"
+    slot: int
+    """The slot before which the run is held."""
+    absent: tuple[str, ...] | None = None
+    """To the sensor: the receivers that it does not wait for from now on. None to the router."""
+    until: int | None = None
+    """To the sensor: the slot before which it holds again, if any."""
+
+    def pack(self) -> bytes:
+        """Encode it as a message."""
+        absent = {} if self.absent is None else {"absent": list(self.absent)}
+        until = {} if self.until is None else {"until": self.until}
+        return pack({"do": self.do, "k": self.slot, **absent, **until})
+
+    @classmethod
+    def read(cls, message: Reader, bounds: Bounds) -> Self:
+        """Decode it."""
+        slot = message.integer("k")
+        if reader_of(message.key) != SENSOR:
+            return cls(slot)
+        absent = message.names("absent")
+        if bounds.receivers is not None and not set(absent) <= set(bounds.receivers):
+            raise message.malformed(f"absent = {shown(absent)}", f"some of {', '.join(bounds.receivers)}")
+        return cls(slot, absent, message.integer("until") if message.has("until") else None)
+
+
+@dataclass(frozen=True)
+class LinkChange(Command):
+    """To the router: change a link."""
+
+    do = "change"
+    link: str
+    """The receiver of the link."""
+    changes: tuple[Change, ...]
+    """All changes from the slot of the hold on."""
+
+    def pack(self) -> bytes:
+        """Encode it as a message."""
+        return pack({"do": self.do, "link": self.link, "changes": _packed(self.changes)})
+
+    @classmethod
+    def read(cls, message: Reader, bounds: Bounds) -> Self:
+        """Decode it."""
+        link = message.text("link") if bounds.receivers is None else message.choice("link", bounds.receivers)
+        return cls(link, _changes(message, "changes", bounds.slots))
+
+
+@dataclass(frozen=True)
+class Again(Command):
+    """To all: send the messages again that may have been lost with a connection."""
+
+    do = "again"
+    round: int
+    """Counted from 1."""
+    slot: int
+    """The first slot that is not joined."""
+    links: Mapping[str, tuple[Change, ...]] | None = None
+    """To the router: receiver → all changes of its link, for the links that the operator has changed. None to others."""
+
+    def pack(self) -> bytes:
+        """Encode it as a message."""
+        links = {} if self.links is None else {"links": {name: _packed(one) for name, one in self.links.items()}}
+        return pack({"do": self.do, "n": self.round, "k": self.slot, **links})
+
+    @classmethod
+    def read(cls, message: Reader, bounds: Bounds) -> Self:
+        """Decode it."""
+        number, slot = message.integer("n"), message.integer("k")
+        if reader_of(message.key) != ROUTER:
+            return cls(number, slot)
+        names, links = message.map("links"), message.nested("links")
+        for name in names:
+            if bounds.receivers is not None and name not in bounds.receivers:
+                raise message.malformed(f"the link {shown(name)}", f"one of {', '.join(bounds.receivers)}")
+        return cls(number, slot, {name: _changes(links, name, bounds.slots) for name in names})
+
+
+def _packed(changes: Sequence[Change]) -> list[dict[str, Any]]:
+    """Changes of a link as in a message."""
+    return [
+        {
+            "at": one.at,
+            **({} if one.settings is None else {"settings": one.settings}),
+            **({} if one.cut is None else {"cut": one.cut}),
+        }
+        for one in changes
+    ]
+
+
+def _changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
+    """The changes of a link in a field of a message; slots: of the run."""
+    return tuple(
+        Change(
+            one.integer("at", 0, slots),
+            one.map("settings") if one.has("settings") else None,
+            one.flag("cut") if one.has("cut") else None,
+        )
+        for one in found.maps(name)
+    )
+
+
+_KINDS: Mapping[str, type[Command]] = {
+    kind.do: kind for kind in (Start, End, Where, Hold, Abandon, Go, LinkChange, Again)
+}
+
+
+def read_command(message: Reader, bounds: Bounds) -> Command:
+    """Decode a command. Raises MalformedMessage."""
+    return _KINDS.get(message.text("do"), Unknown).read(message, bounds)

@@ -1,0 +1,8 @@
+"""The type of a part of Zenoh's own configuration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+ZenohConfig = dict[str, Any]
+"""A JSON object, whose entries only Zenoh knows."""

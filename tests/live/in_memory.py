@@ -1,0 +1,117 @@
+"""A session in memory: the test puts what a process receives, and reads what it sends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+from typing import Any, Self
+
+from evedrop.live.network.resending import ReplayBuffer
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import Bounds, Command, read_command
+from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.whereabouts import Place
+from tests.conftest import LIMIT
+
+
+@dataclass
+class Stage:
+    """What a peer's session would carry: the test fills the inboxes and reads what was put."""
+
+    inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
+    funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
+    put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
+    kept: dict[str, ReplayBuffer] = field(default_factory=dict)
+    commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
+    """Of the conductor, as its classes pack them."""
+
+    def session(self, brief: AnyBrief) -> FakeSession:
+        """In the place of `Session`."""
+        return FakeSession(self, RunKeys(brief.run), brief)
+
+    def fill(self, key: str, messages: list[bytes]) -> None:
+        """Put messages into an inbox."""
+        queue = self.inboxes.setdefault(key, SimpleQueue())
+        for message in messages:
+            queue.put(message)
+
+    def all(self, key: str) -> list[bytes]:
+        """All messages that were put on a key; the others are dropped."""
+        found = []
+        while not self.put.empty():
+            where, payload = self.put.get()
+            if where == key:
+                found.append(payload)
+        return found
+
+
+class FakeInbox:
+    """The part of an inbox that peers use."""
+
+    def __init__(self, queue: SimpleQueue[bytes]) -> None:
+        self._queue = queue
+
+    def recv(self) -> bytes:
+        """The next message."""
+        return self._queue.get(timeout=LIMIT)
+
+    def __iter__(self) -> Iterator[bytes]:
+        while not self._queue.empty():
+            yield self.recv()
+
+
+class FakeSession:
+    """The part of `Session` that peers use."""
+
+    def __init__(self, stage: Stage, keys: RunKeys, brief: AnyBrief) -> None:
+        self._stage, self._process, self._slots = stage, brief.process, brief.slots
+        self.keys = keys
+        self.place = Place()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stage.put.put(("closed", b""))
+
+    def inbox(self, key: str) -> FakeInbox:
+        """An inbox whose `recv` never waits for longer than a test may."""
+        queue = self._stage.inboxes.setdefault(key, SimpleQueue())
+
+        return FakeInbox(queue)
+
+    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+        """As the real one, called by the test."""
+        self._stage.funnels[key] = receive
+
+    def outlet(self, key: str) -> Callable[[bytes], None]:
+        """Puts into the stage; what the process puts for itself comes back to it."""
+        if key in self._stage.inboxes:
+            return self._stage.inboxes[key].put
+        return lambda payload: self._stage.put.put((key, payload))
+
+    def kept(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
+        """The same, kept to be sent again."""
+        self._stage.kept[key] = kept = ReplayBuffer(self.outlet(key), *how, **more)
+        return kept
+
+    def ready(self) -> None:
+        """Nobody to wait for."""
+
+    appear = ready
+
+    def wait_for(self, kind: type[Command]) -> None:
+        """Until the test commands it."""
+        while not isinstance(self.command(), kind):
+            pass
+
+    def command(self, receivers: Collection[str] | None = None) -> Command:
+        """The next command, which the test gives."""
+        message = Reader(self.keys.control(self._process), self._stage.commands.get(timeout=LIMIT))
+        return read_command(message, Bounds(self._slots, receivers))
+
+    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
+        """The next command if the test has given one."""
+        return None if self._stage.commands.empty() else self.command(receivers)

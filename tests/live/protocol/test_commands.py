@@ -1,0 +1,93 @@
+"""The observer's commands: each is read as it was packed, and a malformed one is refused with what was expected."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.protocol.codec import Reader, pack
+from evedrop.live.protocol.commands import (
+    Abandon,
+    Again,
+    Bounds,
+    Command,
+    End,
+    Go,
+    Hold,
+    LinkChange,
+    Start,
+    Unknown,
+    Where,
+    read_command,
+)
+from evedrop.model.slot.link import Change
+
+BOUNDS = Bounds(100, ("eve", "legitimate"))
+CHANGES = (Change(4, cut=True), Change(100, {"loss": {"model": "bernoulli", "quality": 0.5}}))
+
+
+def read(process: str, payload: bytes) -> Command:
+    """A command as this process reads it."""
+    return read_command(Reader(f"evedrop/r/control/{process}", payload), BOUNDS)
+
+
+@pytest.mark.parametrize(
+    ("process", "command"),
+    [
+        ("sensor", Start()),
+        ("eve", End()),
+        ("eve", Where()),
+        ("sensor", Hold()),
+        ("relay", Abandon("interrupted")),
+        ("sensor", Go(7, (), 9)),
+        ("sensor", Go(7, ("eve",))),
+        ("router", Go(7)),
+        ("router", LinkChange("eve", CHANGES)),
+        ("eve", Again(1, 7)),
+        ("router", Again(1, 7, {"eve": CHANGES, "legitimate": ()})),
+    ],
+)
+def test_a_command_is_read_as_it_was_packed(process: str, command: Command) -> None:
+    """By the process to which it is sent."""
+    assert read(process, command.pack()) == command
+
+
+def test_an_unknown_command_is_no_error() -> None:
+    """A later version may have more; those are ignored."""
+    assert read("eve", pack({"do": "dance", "k": "x"})) == Unknown()
+
+
+@pytest.mark.parametrize(
+    ("process", "fields", "said"),
+    [
+        ("eve", {}, "do = None; expected a string do"),
+        ("eve", {"do": 3}, "do = 3; expected a string do"),
+        ("eve", {"do": "abandon"}, "why = None; expected a string why"),
+        ("router", {"do": "go"}, "k = None; expected an integer k of at least 0"),
+        ("sensor", {"do": "go", "k": 1}, "absent = None; expected a list absent of strings"),
+        ("sensor", {"do": "go", "k": 1, "absent": ["x"]}, "absent = ('x',); expected some of eve, legitimate"),
+        ("sensor", {"do": "go", "k": 1, "absent": [], "until": True}, "until = True; expected an integer until"),
+        ("router", {"do": "change", "link": "x", "changes": []}, "link = 'x'; expected one of eve, legitimate"),
+        ("router", {"do": "change", "link": "eve"}, "changes = None; expected a list changes of maps"),
+        ("router", {"do": "change", "link": "eve", "changes": [{"at": 101}]}, "at = 101; expected an integer at from"),
+        (
+            "router",
+            {"do": "change", "link": "eve", "changes": [{"at": 1, "cut": 1}]},
+            "cut = 1; expected a boolean cut",
+        ),
+        ("eve", {"do": "again", "k": 1}, "n = None; expected an integer n"),
+        ("router", {"do": "again", "n": 1, "k": 1}, "links = None; expected a map links"),
+        (
+            "router",
+            {"do": "again", "n": 1, "k": 1, "links": {"x": []}},
+            "the link 'x'; expected one of eve, legitimate",
+        ),
+    ],
+)
+def test_a_malformed_command_is_refused(process: str, fields: dict[str, Any], said: str) -> None:
+    """The error names the key, what was found and what was expected."""
+    with pytest.raises(MalformedMessage, match=re.escape(f"malformed message on evedrop/r/control/{process}: {said}")):
+        read(process, pack(fields))

@@ -1,0 +1,181 @@
+"""The launcher's view of its children: their briefs on disk, the observer's news, and how a run ended; no process is started."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from evedrop.errors import Interrupted
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.children import Children, Exit
+from evedrop.live.launch.process_set import follow_to_end
+from evedrop.live.protocol.news import ConnectionOutage, News, RunEnded, RunProgress, Started, read_news
+from evedrop.results.folder import new_folder
+from evedrop.results.held_folder import HeldFolder
+from tests.conftest import wait_until
+from tests.live.network.bench import scenario_of
+
+
+@dataclass
+class Ended:
+    """A process that has written its output and ended."""
+
+    pid: int
+    stdout: IO[bytes] | None
+    stdin: IO[bytes] | None = None
+    status: int = 0
+
+    def poll(self) -> int:
+        """It has ended."""
+        return self.status
+
+    def wait(self, timeout: float | None = None) -> int:
+        """It has ended."""
+        del timeout
+        return self.status
+
+    def send_signal(self, sig: int) -> None:
+        """Nobody is there to take it."""
+
+    def terminate(self) -> None:
+        """It has ended."""
+
+    kill = terminate
+
+
+@dataclass
+class Starting:
+    """Starts processes that end at once; an observer writes these lines first."""
+
+    lines: bytes = b""
+    status: int = 0
+    pids: Iterator[int] = field(default_factory=lambda: itertools.count(1))
+
+    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Ended:  # noqa: ARG002 - nothing is run
+        """Start one."""
+        return Ended(next(self.pids), BytesIO(self.lines) if role == "observer" else None, None, self.status)
+
+
+class Bench:
+    """Children in a test's hands."""
+
+    def __init__(self, folder: Path) -> None:
+        self.private, self.results = folder / "private", new_folder(folder / "run")
+        self.private.mkdir()
+        (self.results / "logs").mkdir(exist_ok=True)
+        self.briefs = briefs_of(scenario_of(), "tcp/127.0.0.1:1", ObserverTask(self.results, False))
+        self.starter = Starting()
+        self.held = HeldFolder(self.results)
+        self.children = Children(self.held, self.private, starter=self.starter)
+
+    def tells(self, *lines: bytes) -> list[News]:
+        """The observer writes these lines and ends: what the launcher shows of them."""
+        self.starter.lines = b"".join(lines)
+        self.children.start(self.briefs["observer"])
+        found: list[News] = []
+
+        def ended() -> bool:
+            match self.children.news(0.1):
+                case Exit("observer"):
+                    return True
+                case News() as news:
+                    found.append(news)
+            return False
+
+        wait_until(ended, "the observer's end")
+        return found
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Children of a run that is not there."""
+    one = Bench(tmp_path)
+    with closing(one.held), one.children:
+        yield one
+
+
+def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Bench) -> None:
+    """The observer, told to end, says that it was complete: so its summary does, and the exit status follows."""
+    stop = threading.Event()
+    stop.set()
+    bench.starter.lines = RunEnded(1, "complete").line
+    bench.children.start(bench.briefs["observer"])
+    assert follow_to_end(bench.children, stop, lambda _: None) == 1
+    bench.starter.lines = RunEnded(130, "interrupted").line
+    bench.children.start(bench.briefs["observer"])
+    with pytest.raises(Interrupted):
+        follow_to_end(bench.children, stop, lambda _: None)
+
+
+MISSED = "evedrop: eve: legitimate, observer did not appear within 30 s, and nobody reads evedrop/r/telemetry/eve; start them\n"
+
+
+@pytest.mark.parametrize("first", [Exit("eve", 3), Exit("observer", 3)])
+def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: Exit) -> None:
+    """Cut off from the router, the observer and all others give up after the same time; it is named, and why."""
+    for name in ("eve", "observer"):
+        bench.starter.status = 3
+        bench.children.start(bench.briefs[name])
+    (bench.results / "logs" / "eve.log").write_text(MISSED)
+    report = bench.children.failure_report(first, RunEnded(3, "no router answered at tcp/127.0.0.1:1 within 30 s"))
+    assert report.startswith("observer"), report
+    assert "logs/observer.log" in report
+    assert "logs/eve.log" not in report
+
+
+PROGRESS = RunProgress(3, 2.5, "slots/s", {"eve": float("inf")})
+OUTAGE = ConnectionOutage("router", 3, 5, 0.5)
+
+
+def test_a_brief_stays_until_the_process_that_was_started_again_has_joined(bench: Bench) -> None:
+    """News of an earlier restart may still be under way when the router is started again, which must find its brief."""
+    router = bench.private / "router.json"
+    bench.children.start(bench.briefs["router"])
+    bench.tells(Started().line)
+    assert not router.exists()
+    bench.children.start(bench.briefs["router"], again=True)
+    bench.children.start(bench.briefs["router"], again=True)
+    bench.tells(OUTAGE.line)
+    assert router.exists()
+    bench.tells(OUTAGE.line)
+    assert not router.exists()
+
+
+@pytest.mark.parametrize("news", [PROGRESS, OUTAGE, RunEnded(3, "é", ["eve"], ["eve"], "why"), RunEnded(0, "complete")])
+def test_news_are_read_as_they_were_written(news: News) -> None:
+    """Whatever their entries."""
+    found = read_news(news.line)
+    assert (type(found), found.line) == (type(news), news.line)
+
+
+MALFORMED = {
+    b"{": "Expecting",
+    b"[1]": "no object with an event",
+    b'{"event": 3}': "no object with an event",
+    b'{"event": "dance"}': "no object with an event",
+    b"[" * 100_000: "nested too deeply",
+    b'{"event": "ended", "status": 0}': "how is missing",
+    b'{"event": "ended", "status": "0", "how": ""}': "status is '0', expected a whole number",
+    b'{"event": "started", "k": 1}': "k is an unknown entry",
+    b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}': "do is 'dance', expected one of kill",
+    b'{"event": "progress", "done": 1, "rate": true, "rate_unit": "", "squared_errors": {}}': "rate is True, expected",
+    b'{"event": "progress", "done": -1, "rate": 1, "rate_unit": "", "squared_errors": {}}': "done is -1, expected",
+}
+"""A line → what is wrong with it."""
+
+
+@pytest.mark.parametrize("line", MALFORMED)
+def test_malformed_news_are_refused(line: bytes, bench: Bench) -> None:
+    """The launcher goes on with the next line, and the observer's log says what was wrong."""
+    assert bench.tells(line + b"\n", PROGRESS.line) == [PROGRESS]
+    log = (bench.results / "logs" / "observer.log").read_text()
+    assert log.startswith("evedrop: the launcher refused malformed news: ")
+    assert MALFORMED[line] in log
