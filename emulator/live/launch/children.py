@@ -173,7 +173,9 @@ class Children:
             with process.stdout as lines:
                 for line in lines:
                     with contextlib.suppress(ValueError):
-                        self._news.put(json.loads(line))
+                        news = json.loads(line)
+                        if isinstance(news, dict):  # a class of a package may print numbers
+                            self._news.put(news)
         status = process.wait()
         if process.pid not in self._killed:
             self._news.put(Exit(name, status))
