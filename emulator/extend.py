@@ -1,4 +1,4 @@
-"""The names that authors of schemes, eavesdroppers, loss models, delay models, controllers and applications import.
+"""The names that authors of schemes, eavesdroppers, loss models, delay models, controllers, applications and panels import.
 
 A plug-in needs nothing else of Evedrop. Whatever is here keeps its name and its meaning within a major version.
 
@@ -38,6 +38,11 @@ if TYPE_CHECKING:
         PanelFeed,
     )
     from evedrop.scenario.table import Table
+    from evedrop.view.column import Column, scalars
+    from evedrop.view.palette import colour
+    from evedrop.view.panels.curves import curves_view, line_style, recent_slots, whole_run
+    from evedrop.view.panels.panel import PlacedView, ViewPanel
+    from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
 
 __all__ = [
     "Action",
@@ -49,6 +54,7 @@ __all__ = [
     "BlockReader",
     "Chain",
     "Codes",
+    "Column",
     "ConstantDelay",
     "ControlledPlant",
     "Controller",
@@ -71,31 +77,56 @@ __all__ = [
     "Panel",
     "PanelCurve",
     "PanelFeed",
+    "PeerSlots",
+    "PlacedView",
     "Plain",
     "PlainEncoder",
     "PlainEstimator",
     "Process",
     "Receiver",
     "Reception",
+    "Scene",
+    "SceneSlots",
     "Scheme",
     "Shared",
+    "Shown",
     "Table",
+    "ViewPanel",
+    "colour",
+    "curves_view",
     "elementary",
     "fates_of",
+    "line_style",
     "prior",
     "probability_mistakes",
+    "recent_slots",
+    "scalars",
     "trace_of",
     "update",
+    "whole_run",
 ]
 
-_LATER = dict.fromkeys(
-    ("Application", "ApplicationTally", "ControlledPlant", "Panel", "PanelCurve", "PanelFeed"),
-    "evedrop.scenario.application",
-) | {"Table": "evedrop.scenario.table"}
-"""Imported when used: pydantic, which checks tables, would slow down a receiver that uses a class of its own."""
+_LATER = {
+    "evedrop.scenario.application": (
+        "Application",
+        "ApplicationTally",
+        "ControlledPlant",
+        "Panel",
+        "PanelCurve",
+        "PanelFeed",
+    ),
+    "evedrop.scenario.table": ("Table",),
+    "evedrop.view.column": ("Column", "scalars"),
+    "evedrop.view.palette": ("colour",),
+    "evedrop.view.panels.curves": ("curves_view", "line_style", "recent_slots", "whole_run"),
+    "evedrop.view.panels.panel": ("PlacedView", "ViewPanel"),
+    "evedrop.view.scene": ("PeerSlots", "Scene", "SceneSlots", "Shown"),
+}
+_MODULES = {name: module for module, names in _LATER.items() for name in names}
+"""Imported when used: pydantic, which checks tables, and Rerun would slow down a receiver that uses a class of its own."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_LATER[name]), name)
+    return getattr(import_module(_MODULES[name]), name)

@@ -20,6 +20,11 @@ def say(text: str) -> None:
         sys.stderr.write(f"evedrop: {text}\n")
 
 
+def warn(text: str) -> None:
+    """Write a warning to standard error, as `say` does."""
+    say(f"warning: {text}")
+
+
 @contextlib.contextmanager
 def named_output() -> Iterator[None]:
     """Mark errors of standard output with its name, so that other errors are not taken for them."""

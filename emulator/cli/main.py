@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from evedrop.cli.commands import GROUP, MODULES, ROLES
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.files import shown
-from evedrop.output import OUTPUT, finish, named_output, say, silence
+from evedrop.output import OUTPUT, finish, named_output, say, silence, warn
 
 if TYPE_CHECKING:
     from evedrop.cli.command import Command
@@ -121,13 +121,11 @@ def _commands_of_packages() -> Iterator[Command]:
         try:
             found: Sequence[Command] = import_module(point.value).COMMANDS
         except Exception as error:  # of the package's author
-            say(f"warning: the commands of {point.value} cannot be loaded ({type(error).__name__}: {error})")
+            warn(f"the commands of {point.value} cannot be loaded ({type(error).__name__}: {error})")
             continue
         for command in found:
             if command.name in taken or command.group is not None:
-                say(
-                    f"warning: the command {command.name} of {point.value} is left out: expected a new name, and no group"
-                )
+                warn(f"the command {command.name} of {point.value} is left out: expected a new name, and no group")
             else:
                 taken.add(command.name)
                 yield command

@@ -9,7 +9,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
-from evedrop.view import paths
+
+TIMELINE = "slot_number"
+"""Rerun makes the events' first column as wide as this name, and "slot" is too narrow for a number."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +23,11 @@ class Column:
     values: rr.ComponentColumnList
 
     def send(self, to: rr.RecordingStream) -> None:
-        """Add it to a recording."""
-        to.send_columns(self.path, indexes=[rr.TimeColumn(paths.TIMELINE, sequence=self.slots)], columns=self.values)
+        """Add it to a recording. Raises an error of Rerun's if slots and values do not have the same length."""
+        slots = rr.TimeColumn(TIMELINE, sequence=self.slots)
+        to.send_columns(self.path, indexes=[slots], columns=self.values, strict=True)
 
 
 def scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
-    """A number in each slot."""
+    """A number in each slot: slots k (c,), and values (c,)."""
     return Column(path, k, rr.Scalars.columns(scalars=values))

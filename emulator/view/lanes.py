@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.receiver import Action, Codes
 from evedrop.view.palette import Colour
+from evedrop.view.scene import SceneSlots, Shown
 
 BLUE: Colour = (84, 150, 250)
 GREEN: Colour = (30, 128, 96)
@@ -39,17 +40,25 @@ MISLED = 5
 """Code of the only outcome that an eavesdropper does not know itself."""
 
 
-def sent(nu: Flags, any_packet: Flags | None) -> Codes:
-    """Codes of the sensor's lane, (c,), from ν (c,) and whether there was a packet, (c,); None: always."""
-    types = nu.astype(np.uint8)
-    return types if any_packet is None else np.where(any_packet, types, np.uint8(SENT.words.index("silent")))
+def lane_of(shown: Shown) -> Lane:
+    """The lane of a receiver."""
+    return LEGITIMATE if shown.role == "legitimate" else EAVESDROPPER
 
 
-def received(action: Codes, nu: Flags, any_packet: Flags | None) -> Codes:
-    """Codes of a receiver's lane, (c,), from its actions (c,), ν (c,) and whether there was a packet, (c,); None: always.
+def sent(slots: SceneSlots) -> Codes:
+    """Codes of the sensor's lane, (c,): the packets' types, or silence."""
+    types = slots.nu.astype(np.uint8)
+    return types if slots.sent is None else np.where(slots.sent, types, np.uint8(SENT.words.index("silent")))
 
-    They are the actions, except for silence, and for an innovation taken for the state, which misled.
+
+def received(shown: Shown, slots: SceneSlots) -> Codes:
+    """Codes of a receiver's lane, (c,).
+
+    They are its actions, except for silence, and for an innovation that an eavesdropper took for the state, which misled. The
+    legitimate estimator knows every type, and is never misled.
     """
-    misled = nu & (action == Action.STATE)
-    codes: Codes = np.where(misled, np.uint8(MISLED), action)
-    return codes if any_packet is None else np.where(any_packet, codes, np.uint8(SILENT))
+    action = slots.peers[shown.name].action
+    codes: Codes = action
+    if shown.role != "legitimate":
+        codes = np.where(slots.nu & (action == Action.STATE), np.uint8(MISLED), action)
+    return codes if slots.sent is None else np.where(slots.sent, codes, np.uint8(SILENT))

@@ -20,7 +20,7 @@ from rerun.experimental import ViewerClient
 from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
-from evedrop.view.paths import TIMELINE
+from evedrop.view.column import TIMELINE
 from evedrop.view.viewer_process import end, guarded, spawn
 
 _LOAD_SECONDS = 60.0

@@ -7,20 +7,17 @@ and writes the file. Viewers read the file as it grows; the run does not know of
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import final
 
-import numpy as np
 import rerun as rr
 
-from evedrop.model.receiver import Flags
+from evedrop.output import warn
 from evedrop.results.folder import private_file
-from evedrop.view.blueprint import layout
-from evedrop.view.column import Column
-from evedrop.view.columns import Columns, lines, log_styles
 from evedrop.view.events import Event, introduction
-from evedrop.view.paths import NOTES
-from evedrop.view.scene import Moved, PeerSlots, Scene, SceneSlots, Shown
+from evedrop.view.panel_set import PanelSet
+from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
 
 __all__ = ["PeerSlots", "Scene", "SceneSlots", "Shown", "ViewRecording"]
 
@@ -33,22 +30,22 @@ _FILE_TIMEOUT = 5.0  # seconds that the run waits for the file before it continu
 
 @final
 class ViewRecording:
-    """Writes the recording of one run to `path`. The disk cannot make any method raise: see `failure`."""
+    """Writes the recording of one run to `path`. Neither disk nor panels can make any method raise: see `failure`."""
 
-    def __init__(self, path: Path, scene: Scene) -> None:
+    def __init__(self, path: Path, scene: Scene, warn: Callable[[str], None] = warn) -> None:
+        """warn: tells the user about a panel that is left out; called from any thread."""
         self.failure: str | None = None
         """Why there is no recording on disk, or an incomplete one."""
-        self._scene = scene
-        self._columns = Columns(scene)
         self._waiting: list[SceneSlots] = []
         self._waiting_slots = 0
         self._notes = introduction(scene)
         self._closing = False
         self._changed = threading.Condition()
-        self._file = _stream(scene)
+        self._file = rr.RecordingStream(_APPLICATION, recording_id=scene.run)
         try:
-            self._file.save(private_file(path), default_blueprint=layout(scene))
-            log_styles(self._file, scene)
+            self._panels = PanelSet(scene, warn)
+            self._file.save(private_file(path), default_blueprint=self._panels.layout())
+            self._panels.send_styles(self._file)
         except Exception as error:
             self._give_up(str(error))
         self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
@@ -108,60 +105,14 @@ class ViewRecording:
             self._file.disconnect()
 
     def _put(self, chunks: list[SceneSlots], notes: list[Event]) -> None:
-        columns = [lines(NOTES, notes)] if notes else []
+        if self.failure is not None or not (chunks or notes):
+            return
         if chunks:
-            columns = [*self._columns.of(_joined(chunks)), *columns]
-        if columns and self.failure is None:
-            self._save(columns)
-
-    def _save(self, columns: list[Column]) -> None:
-        for column in columns:
-            column.send(self._file)
+            self._panels.send(SceneSlots.joined(chunks), self._file)
+        if notes:
+            self._panels.send_notes(notes, self._file)
         try:
             # When Rerun cannot write a file any more, the only sign is that it never finishes.
             self._file.flush(timeout_sec=_FILE_TIMEOUT)
         except RuntimeError:
             self._give_up("the file could not be written")
-
-
-def _stream(scene: Scene) -> rr.RecordingStream:
-    return rr.RecordingStream(_APPLICATION, recording_id=scene.run)
-
-
-def _joined(chunks: list[SceneSlots]) -> SceneSlots:
-    if len(chunks) == 1:
-        return chunks[0]
-    peers = {
-        name: PeerSlots(
-            x_hat=np.concatenate([chunk.peers[name].x_hat for chunk in chunks]),
-            P=np.concatenate([chunk.peers[name].P for chunk in chunks]),
-            action=np.concatenate([chunk.peers[name].action for chunk in chunks]),
-            squared_error=np.concatenate([chunk.peers[name].squared_error for chunk in chunks]),
-            trace=np.concatenate([chunk.peers[name].trace for chunk in chunks]),
-            expected_trace=np.concatenate([chunk.peers[name].expected_trace for chunk in chunks]),
-        )
-        for name in chunks[0].peers
-    }
-    return SceneSlots(
-        chunks[0].first,
-        np.concatenate([chunk.x for chunk in chunks]),
-        np.concatenate([chunk.nu for chunk in chunks]),
-        peers,
-        _joined_moves([chunk.moved for chunk in chunks if chunk.moved is not None]),
-        _joined_packets(chunks),
-    )
-
-
-def _joined_packets(chunks: list[SceneSlots]) -> Flags | None:
-    if all(chunk.sent is None for chunk in chunks):
-        return None
-    return np.concatenate([np.ones(chunk.count, np.bool_) if chunk.sent is None else chunk.sent for chunk in chunks])
-
-
-def _joined_moves(moves: list[Moved]) -> Moved | None:
-    if not moves:
-        return None
-    return Moved(
-        np.concatenate([one.values for one in moves]),
-        {path: np.concatenate([one.curves[path] for one in moves], axis=1) for path in moves[0].curves},
-    )

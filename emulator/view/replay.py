@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
         rows = slice(first, min(first + _CHUNK, len(x)))
         deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
         moved = None if showing is None else showing.take(inputs[rows], deviations)
-        shown = {name: _cut(peer, rows) for name, peer in peers.items()}
+        shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
         recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
     for event in results.summary.get("events", ()):
         recording.note(event["slot"], "INFO", event_line(event))
@@ -114,17 +115,6 @@ def _peer(results: Results, name: str) -> PeerSlots:
         squared_error=means["mean_squared_error"].to_numpy(),
         trace=means["mean_trace_covariance"].to_numpy(),
         expected_trace=means["expected_trace_covariance"].to_numpy(),
-    )
-
-
-def _cut(peer: PeerSlots, rows: slice) -> PeerSlots:
-    return PeerSlots(
-        peer.x_hat[rows],
-        peer.P[rows],
-        peer.action[rows],
-        peer.squared_error[rows],
-        peer.trace[rows],
-        peer.expected_trace[rows],
     )
 
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.scenario.application import Panel
+
+TRUTH = "truth"
+"""The name of the true state where receivers' names are those of their estimates."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,10 @@ class PeerSlots:
     expected_trace: Floats
     """Trace of the actual error covariance by theory, (c,); NaN where there is none."""
 
+    def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> PeerSlots:
+        """The same with every array changed, such as cut."""
+        return PeerSlots(*(change(getattr(self, one.name)) for one in fields(self)))
+
 
 @dataclass(frozen=True)
 class Moved:
@@ -75,6 +86,12 @@ class Moved:
     """The values of `Scene.moving`, (c, q + m)."""
     curves: Mapping[str, Floats] = field(default_factory=dict)
     """PATH/CURVE of the applications' panels → slots and values, (2, g)."""
+
+    @classmethod
+    def joined(cls, moves: Sequence[Moved]) -> Moved:
+        """Those of consecutive slots in one."""
+        curves = {path: _joined([one.curves[path] for one in moves], axis=1) for path in moves[0].curves}
+        return cls(_joined([one.values for one in moves]), curves)
 
 
 @dataclass(frozen=True)
@@ -98,3 +115,37 @@ class SceneSlots:
     def count(self) -> int:
         """C."""
         return len(self.nu)
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """Numbers of the slots, (c,)."""
+        return np.arange(self.first, self.first + self.count)
+
+    @classmethod
+    def joined(cls, chunks: Sequence[SceneSlots]) -> SceneSlots:
+        """Consecutive slots in one, whose arrays cannot be written to."""
+        first = chunks[0]
+        peers = {
+            name: PeerSlots(
+                *(_joined([getattr(chunk.peers[name], one.name) for chunk in chunks]) for one in fields(peer))
+            )
+            for name, peer in first.peers.items()
+        }
+        moves = [chunk.moved for chunk in chunks if chunk.moved is not None]
+        sent = None
+        if any(chunk.sent is not None for chunk in chunks):
+            sent = _joined([np.ones(chunk.count, np.bool_) if chunk.sent is None else chunk.sent for chunk in chunks])
+        return cls(
+            first.first,
+            _joined([chunk.x for chunk in chunks]),
+            _joined([chunk.nu for chunk in chunks]),
+            peers,
+            Moved.joined(moves) if moves else None,
+            sent,
+        )
+
+
+def _joined(parts: Sequence[NDArray[Any]], axis: int = 0) -> NDArray[Any]:
+    whole = parts[0].view() if len(parts) == 1 else np.concatenate(parts, axis=axis)
+    whole.flags.writeable = False
+    return whole

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evedrop.names import LEGITIMATE
+from evedrop.output import warn
 from evedrop.scenario import Scenario
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
@@ -25,8 +26,8 @@ def showing_of(scenario: Scenario) -> Showing | None:
     return Showing.of(scenario)
 
 
-def open_recording(scenario: Scenario, run: str, path: Path) -> ViewRecording:
-    """The run's recording, on disk."""
+def open_recording(scenario: Scenario, run: str, path: Path, warn: Callable[[str], None] = warn) -> ViewRecording:
+    """The run's recording, on disk; warn: as in ViewRecording."""
     from evedrop.view.plant_slots import driven_scene  # noqa: PLC0415 - only with a view
     from evedrop.view.recording import ViewRecording  # noqa: PLC0415 - saves 0.3 s and 100 MB in a run without a view
     from evedrop.view.scene import Scene, Shown  # noqa: PLC0415 - the same
@@ -53,7 +54,7 @@ def open_recording(scenario: Scenario, run: str, path: Path) -> ViewRecording:
         noise=float(np.trace(scenario.process.process.Q)),
         **driven_scene(scenario),
     )
-    return ViewRecording(path, scene)
+    return ViewRecording(path, scene, warn)
 
 
 def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:

@@ -43,7 +43,7 @@ from evedrop.results.writer import ResultsWriter
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from tests.fuzz.mutation import Mutator, words_of
-from tests.live.network import test_protocol
+from tests.live.network import golden
 
 Change = Callable[[Mutator, bytes], bytes]
 _EXAMPLES = Path(__file__).with_name("examples")
@@ -325,16 +325,16 @@ def _controls() -> list[bytes]:
 
 
 def _messages(name: str) -> Callable[[], list[bytes]]:
-    return lambda: [test_protocol.parts_of(test_protocol.GOLDEN[name])[2]]
+    return lambda: [golden.parts_of(golden.GOLDEN[name])[2]]
 
 
 def _message(name: str) -> Callable[[bytes, Path], None]:
-    shape, value, _ = test_protocol.parts_of(test_protocol.GOLDEN[name])
-    decode = test_protocol.CODECS[name.split(",", maxsplit=1)[0]][1]
+    shape, value, _ = golden.parts_of(golden.GOLDEN[name])
+    decode = golden.CODECS[name.split(",", maxsplit=1)[0]][1]
     return lambda data, _: _decoded(decode, shape, value, data)
 
 
-def _decoded(decode: test_protocol.Decode, shape: dict[str, Any], value: dict[str, Any], data: bytes) -> None:
+def _decoded(decode: golden.Decode, shape: dict[str, Any], value: dict[str, Any], data: bytes) -> None:
     try:
         decode(shape, value, data)
     except EvedropError:
@@ -342,12 +342,12 @@ def _decoded(decode: test_protocol.Decode, shape: dict[str, Any], value: dict[st
     except Exception as error:
         # The test of the golden bytes makes values of what was read, of messages that say what it expects.
         last = traceback.extract_tb(error.__traceback__)[-1]
-        if last.filename != test_protocol.__file__:
+        if last.filename != golden.__file__:
             raise
 
 
 def _every_message() -> Iterator[tuple[str, Reader]]:
-    for name in test_protocol.MESSAGES:
+    for name in golden.MESSAGES:
         title = "message-" + "-".join(name.replace(",", " ").replace("/", " ").split())
         yield title, Reader(_messages(name), _message(name), (raw, _as_msgpack, _as_msgpack), status=3)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
-from evedrop.view import paths
+from evedrop.view.column import TIMELINE
 
 
 def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
@@ -13,7 +13,7 @@ def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
     found: dict[int, Any] = {}
     for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
         columns = chunk.to_record_batch().to_pydict()
-        found |= dict(zip(columns[paths.TIMELINE], columns[component], strict=True))
+        found |= dict(zip(columns[TIMELINE], columns[component], strict=True))
     return found
 
 

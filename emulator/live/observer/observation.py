@@ -128,7 +128,9 @@ class ObservedRun:
             if self._brief.part.recording:
                 self._showing = showing_of(self._scenario)
                 path = self.folder / "recording.rrd"
-                self._recording = open_recording(self._scenario, self._brief.run, path)
+                self._recording = open_recording(
+                    self._scenario, self._brief.run, path, lambda text: tell("view", address=None, warning=text)
+                )
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             patience = self._brief.flow.longest_outage
             self._due = {source: GapDetector(key, patience) for source, key in conductor.keys.items()}

@@ -1,0 +1,33 @@
+"""The panels of the view, one file for each. An installed package adds panels by entry points of the group `evedrop.panels`."""
+
+from __future__ import annotations
+
+from evedrop.model.registry import Registry
+from evedrop.view.panels.applications import ApplicationPanels
+from evedrop.view.panels.error import SquaredError
+from evedrop.view.panels.events import Events
+from evedrop.view.panels.levels import Levels
+from evedrop.view.panels.packets import Packets
+from evedrop.view.panels.panel import ViewPanel
+from evedrop.view.panels.plant import WhatMovesThePlant
+from evedrop.view.panels.state import StateOverTime
+from evedrop.view.panels.state_plane import StatePlane
+from evedrop.view.panels.trace import TraceOfP
+
+PANELS: Registry[ViewPanel] = Registry(
+    "panel",
+    ViewPanel,  # type: ignore[type-abstract]
+    "evedrop.panels",
+    {
+        "plant": WhatMovesThePlant,
+        "levels": Levels,
+        "applications": ApplicationPanels,
+        "error": SquaredError,
+        "trace": TraceOfP,
+        "packets": Packets,
+        "plane": StatePlane,
+        "state": StateOverTime,
+        "events": Events,
+    },
+)
+"""In the order in which they are placed, from the top of each side; those of packages follow."""

@@ -1,0 +1,83 @@
+"""What panels with curves have in common: axes, views, styles, logarithms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.view.column import Column, scalars
+from evedrop.view.palette import Colour
+from evedrop.view.scene import Scene
+
+_WINDOW = 105  # slots; with a slot below four pixels, Rerun merges it with its neighbours to grey
+_ROOM = 25  # slots to the right of the present, kept free for the legend
+_MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
+
+# Where slots share a pixel: the mean of logarithms would be far below the logarithm of the mean.
+LARGEST = rr.components.AggregationPolicy.Max
+
+
+def recent_slots(scene: Scene) -> rrb.TimeAxis:
+    """An axis that follows the newest slot."""
+    recent = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.cursor_relative(seq=-min(_WINDOW, scene.slots)),
+        end=rrb.TimeRangeBoundary.cursor_relative(seq=_ROOM),
+    )
+    return rrb.TimeAxis(view_range=recent, zoom_lock=True)
+
+
+def whole_run(scene: Scene) -> rrb.TimeAxis:
+    """An axis from slot 0 to the last."""
+    whole = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.absolute(seq=0), end=rrb.TimeRangeBoundary.absolute(seq=scene.slots)
+    )
+    return rrb.TimeAxis(view_range=whole, zoom_lock=True)
+
+
+def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis, *, legend: bool) -> rrb.TimeSeriesView:
+    """The curves below some paths, with or without the legend of receivers.
+
+    One legend serves all panels: a receiver has the same colour in each.
+    """
+    return rrb.TimeSeriesView(
+        name=title,
+        origin="/",
+        contents=[f"/{kind}/**" for kind in kinds],
+        axis_x=axis,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
+    )
+
+
+def curves_view(title: str, path: str, axis: rrb.TimeAxis, values: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+    """The curves below a path, with a legend; values: the vertical axis."""
+    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=legend)
+
+
+def line_style(label: str, bright: Colour, width: float, *, steps: bool = False) -> rr.SeriesLines:
+    """The style of a curve; steps: each value holds until the next."""
+    mode = rr.components.InterpolationMode.StepAfter if steps else rr.components.InterpolationMode.Linear
+    return rr.SeriesLines(names=label, colors=bright, widths=width, interpolation_mode=mode)
+
+
+def thinned(scene: Scene, slots: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Offsets of the slots that a curve over the whole run is drawn at."""
+    return np.flatnonzero(slots % math.ceil(scene.slots / _MOST_POINTS) == 0)
+
+
+def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats) -> Iterator[Column]:
+    """log10 of squared errors or traces (c,) where there are any.
+
+    Everything below a floor is raised to it, because a state that was received is known exactly. The floor is a decade below one
+    step's noise, or two for a mean over trials with and without errors.
+    """
+    known = ~np.isnan(values)  # there is no theory for some links
+    if known.any():
+        floor = 10.0 ** (np.floor(np.log10(scene.noise)) - (1 if scene.trials == 1 else 2))
+        yield scalars(path, slots[known], np.log10(np.maximum(values[known], floor)))

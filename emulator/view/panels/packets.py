@@ -1,0 +1,60 @@
+"""What happened to each packet: a lane for the sensor, and one for each receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from evedrop.view import lanes
+from evedrop.view.column import Column
+from evedrop.view.panels.curves import recent_slots
+from evedrop.view.panels.panel import PlacedView, ViewPanel
+from evedrop.view.scene import Scene, SceneSlots
+
+_PATH = "packets"
+_LANES_OF_A_SCREEN = 23.0  # lanes that would fill the usual window from top to bottom
+
+
+@final
+class Packets(ViewPanel):
+    """Lanes, which record only changes."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        # Lanes are sorted by path, hence the number.
+        digits = len(str(len(scene.receivers)))
+        names = ["sent", *(shown.name for shown in scene.receivers)]
+        self._paths = [f"{_PATH}/{i:0{digits}d}_{name}" for i, name in enumerate(names)]
+        self._lanes = [lanes.SENT, *(lanes.lane_of(shown) for shown in scene.receivers)]
+        self._last = [-1] * len(names)
+
+    def views(self) -> Iterator[PlacedView]:
+        """As high as the lanes need; on the left, where two curves stand above it, at most half of the window."""
+        view = rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=_PATH, time_view=recent_slots(self.scene))
+        receivers = len(self.scene.receivers)
+        if self.scene.moving:
+            yield PlacedView(view, "right", 0.4 + 0.22 * receivers)
+        else:
+            height = min(0.5, (3.0 + receivers) / _LANES_OF_A_SCREEN)
+            yield PlacedView(view, "left", 2.0 * height / (1.0 - height))
+
+    def styles(self) -> dict[str, rr.StateConfiguration]:
+        """Blank labels: a slot is too narrow for a word, and the title says what the colours mean."""
+        return {
+            path: rr.StateConfiguration(values=lane.words, labels=[" "] * len(lane.words), colors=lane.colours)
+            for path, lane in zip(self._paths, self._lanes, strict=True)
+        }
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """The lanes' changes."""
+        found = [lanes.sent(slots), *(lanes.received(shown, slots) for shown in self.scene.receivers)]
+        for i, (path, lane, codes) in enumerate(zip(self._paths, self._lanes, found, strict=True)):
+            at = np.flatnonzero(np.diff(codes.astype(np.int64), prepend=self._last[i]))
+            self._last[i] = int(codes[-1])
+            if len(at):
+                words = [lane.words[code] for code in codes[at].tolist()]
+                yield Column(path, slots.numbers[at], rr.StateChange.columns(state=words))

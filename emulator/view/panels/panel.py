@@ -1,0 +1,61 @@
+"""What a panel of the view says of itself. The recording and the layout ask each panel; neither knows a panel's paths.
+
+Source: docs/your-own.md, a panel.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from evedrop.view.column import Column
+from evedrop.view.events import Event
+from evedrop.view.scene import Scene, SceneSlots
+
+
+@dataclass(frozen=True)
+class PlacedView:
+    """A view of Rerun's and its place. On each side, views are one above the other."""
+
+    view: rrb.View
+    side: Literal["left", "right"]
+    share: float = 1.0
+    """Its height, compared with the other views of this side; most have 1."""
+
+
+class ViewPanel(ABC):
+    """A panel of the view. A class is registered; each recording makes an instance before the first slot.
+
+    Paths in the recording begin with a word that no other panel uses. Views show entity names, so these are short.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Whether the recording of this run has the panel; by default every recording has."""
+        del scene
+        return True
+
+    @abstractmethod
+    def views(self) -> Iterable[PlacedView]:
+        """Its views; none if it is recorded, and not shown."""
+
+    def styles(self) -> Mapping[str, rr.AsComponents]:
+        """Path → name, colour and the like, recorded once; by default none, so that Rerun chooses."""
+        return {}
+
+    @abstractmethod
+    def columns(self, slots: SceneSlots) -> Iterable[Column]:
+        """Its values in the next slots. Calls are in order of slot; the arrays cannot be written to."""
+
+    def notes(self, notes: Sequence[Event]) -> Iterable[Column]:
+        """What it shows of lines about the run, such as "cut smart"; by default nothing."""
+        del notes
+        return ()

@@ -1,0 +1,58 @@
+"""What moves the plant of a closed loop: its disturbances and inputs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import final
+
+import rerun as rr
+
+from evedrop.view.column import Column, scalars
+from evedrop.view.palette import Colour
+from evedrop.view.panels.curves import curves_view, line_style, thinned, whole_run
+from evedrop.view.panels.panel import PlacedView, ViewPanel
+from evedrop.view.scene import Scene, SceneSlots
+
+_PATH = "moving"
+_COLOURS: tuple[Colour, ...] = (
+    (226, 178, 40),
+    (222, 92, 82),
+    (80, 150, 235),
+    (60, 180, 120),
+    (170, 120, 230),
+    (140, 140, 140),
+)
+
+
+@final
+class WhatMovesThePlant(ViewPanel):
+    """Disturbances and inputs within their limits, over the whole run."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """For a closed loop."""
+        return bool(scene.moving)
+
+    def views(self) -> Iterator[PlacedView]:
+        """At the top of the left."""
+        title = "What moves the plant: " + ", ".join(self.scene.moving)
+        yield PlacedView(curves_view(title, _PATH, whole_run(self.scene)), "left", 1.3)
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Steps, because a value holds for its slot."""
+        return {
+            _curve(label): line_style(label, _COLOURS[i % len(_COLOURS)], 1.4, steps=True)
+            for i, label in enumerate(self.scene.moving)
+        }
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """A curve for each."""
+        at = thinned(self.scene, slots.numbers)
+        if slots.moved is not None and len(at):
+            for label, values in zip(self.scene.moving, slots.moved.values.T, strict=True):
+                yield scalars(_curve(label), slots.numbers[at], values[at])
+
+
+def _curve(label: str) -> str:
+    return f"{_PATH}/{re.sub(r'[^A-Za-z0-9_-]+', '_', label)}"

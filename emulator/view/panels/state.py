@@ -1,0 +1,51 @@
+"""The state and its estimates over time, for a process with one state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import final
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from evedrop.view.column import Column, scalars
+from evedrop.view.palette import TRUTH_CURVE, colour
+from evedrop.view.panels.curves import recent_slots
+from evedrop.view.panels.panel import PlacedView, ViewPanel
+from evedrop.view.scene import TRUTH, Scene, SceneSlots
+
+_PATH = "plane"
+
+
+@final
+class StateOverTime(ViewPanel):
+    """In place of the state plane. A closed loop has no view of it."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """For one state."""
+        return scene.n == 1
+
+    def views(self) -> Iterator[PlacedView]:
+        """At the top of the right."""
+        if not self.scene.moving:
+            view = rrb.TimeSeriesView(
+                name="State and estimates",
+                origin=_PATH,
+                axis_x=recent_slots(self.scene),
+                plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+            )
+            yield PlacedView(view, "right", 1.75)
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """A receiver's colour; the truth is grey and broad."""
+        found = {f"{_PATH}/{TRUTH}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
+        for i, shown in enumerate(self.scene.receivers):
+            found[f"{_PATH}/{shown.name}"] = rr.SeriesLines(names=shown.name, colors=colour(i), widths=1.5)
+        return found
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """The truth, and every estimate."""
+        yield scalars(f"{_PATH}/{TRUTH}", slots.numbers, slots.x[:, 0])
+        for shown in self.scene.receivers:
+            yield scalars(f"{_PATH}/{shown.name}", slots.numbers, slots.peers[shown.name].x_hat[:, 0])

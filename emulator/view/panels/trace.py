@@ -1,0 +1,49 @@
+"""The trace of the covariance that each receiver believes, and that theory expects of its error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import final
+
+import rerun as rr
+
+from evedrop.view.column import Column
+from evedrop.view.palette import colour, dim
+from evedrop.view.panels.curves import LARGEST, logarithms, receivers_view, recent_slots
+from evedrop.view.panels.panel import PlacedView, ViewPanel
+from evedrop.view.scene import SceneSlots
+
+_BELIEVED, _THEORY = "trace", "theory"
+
+
+@final
+class TraceOfP(ViewPanel):
+    """tr P, logarithmic. A closed loop has no view of it."""
+
+    def views(self) -> Iterator[PlacedView]:
+        """Below the squared error, whose legend serves."""
+        if not self.scene.moving:
+            title = "tr P   log10, bright: believed · dim: theory · bottom: 0"
+            yield PlacedView(
+                receivers_view(title, [_BELIEVED, _THEORY], recent_slots(self.scene), legend=False), "left"
+            )
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """A receiver's colour, bright and dim."""
+        found = {}
+        for i, shown in enumerate(self.scene.receivers):
+            bright, label = colour(i), shown.name
+            found[f"{_BELIEVED}/{label}"] = rr.SeriesLines(
+                names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=LARGEST
+            )
+            found[f"{_THEORY}/{label}"] = rr.SeriesLines(
+                names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0, aggregation_policy=LARGEST
+            )
+        return found
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """Two curves for each receiver; one if there is no theory."""
+        for shown in self.scene.receivers:
+            peer = slots.peers[shown.name]
+            yield from logarithms(self.scene, f"{_BELIEVED}/{shown.name}", slots.numbers, peer.trace)
+            yield from logarithms(self.scene, f"{_THEORY}/{shown.name}", slots.numbers, peer.expected_trace)
