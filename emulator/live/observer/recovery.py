@@ -10,32 +10,18 @@ Source: docs/protocol.md, lost connections.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, final
+from collections.abc import Callable
+from typing import final
 
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
 from evedrop.names import OBSERVER, RELAY, ROUTER
+from evedrop.score.summary import Outage
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
 _IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before a round is tried
 _LONGEST_SECONDS = 30.0
-
-
-@dataclass(frozen=True)
-class ConnectionOutage:
-    """A process that was cut off."""
-
-    process: str
-    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
-    slot: int
-    """The first slot that was not joined when the loss was noticed."""
-    until: int | None
-    """The first slot that was not joined when the run went on; None if it did not."""
-    seconds: float
-    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
 
 
 @final
@@ -56,7 +42,7 @@ class Recovery:
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
-        self.outages: list[ConnectionOutage] = []
+        self.outages: list[Outage] = []
         """All outages so far."""
 
     def look(self, done: int) -> None:
@@ -96,9 +82,9 @@ class Recovery:
     def _close(self, done: int, now: float) -> None:
         """Record the outages that ended, now that the run goes on."""
         for name, (slot, since) in self._back.items():
-            outage = ConnectionOutage(name, slot, done, now - since)
+            outage = Outage(name, slot, done, now - since)
             self.outages.append(outage)
-            self._say("reconnected", **asdict(outage))
+            self._say("reconnected", **outage.as_dict())
         self._back = {}
 
     def _miss(self, done: int, now: float) -> None:
@@ -151,9 +137,5 @@ class Recovery:
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
-        self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
+        self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
-
-    def account(self) -> list[Mapping[str, Any]]:
-        """The outages in the form of the summary."""
-        return [asdict(outage) for outage in self.outages]
