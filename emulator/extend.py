@@ -1,4 +1,4 @@
-"""The names that authors of schemes, eavesdroppers, loss models, delay models, controllers, applications and panels import.
+"""The names that authors of schemes, eavesdroppers, links, controllers, figures, panels and applications import.
 
 A plug-in needs nothing else of Evedrop. Whatever is here keeps its name and its meaning within a major version.
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from evedrop.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ScoredSlots
 from evedrop.kernels import elementary
 from evedrop.model import update
 from evedrop.model.controllers.controller import Controller
@@ -62,11 +63,15 @@ __all__ = [
     "Eavesdropper",
     "Encoder",
     "Fate",
+    "Figure",
+    "FigureColumn",
+    "FigureTally",
     "Flags",
     "Floats",
     "Innovation",
     "Knowledge",
     "LossModel",
+    "MeanFigure",
     "Naive",
     "NoInnovations",
     "Outcomes",
@@ -88,6 +93,7 @@ __all__ = [
     "Scene",
     "SceneSlots",
     "Scheme",
+    "ScoredSlots",
     "Shared",
     "Shown",
     "Table",

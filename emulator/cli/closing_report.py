@@ -19,16 +19,12 @@ def print_results(folder: Path, as_json: bool = False) -> None:
 
     Raises UsageError if it is not a results folder.
     """
-    summary = load_results(folder).summary
+    results = load_results(folder)
     if as_json:
-        sys.stdout.write(json.dumps(summary, ensure_ascii=False) + "\n")
+        sys.stdout.write(json.dumps(results.summary, ensure_ascii=False) + "\n")
         return
-    try:
-        print_summary(summary, str(folder), None if summary["mode"] == "live" else replay_command(folder))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UsageError(
-            f"{folder / 'summary.json'} is not a run summary of this version ({error!r}); run the scenario again"
-        ) from error
+    summary = results.typed_summary
+    print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder))
 
 
 def print_ending(folder: Path, status: int, how: str) -> None:

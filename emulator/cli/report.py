@@ -24,8 +24,9 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from evedrop.figures import columns, shown_figure, unloadable_figures
 from evedrop.scenario.application import applications_in
-from evedrop.score.expectations_held import format_expectation
+from evedrop.score.summary import ControllerSummary, LinkSummary, Summary
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -134,118 +135,115 @@ def outage_line(outage: News) -> str:
     return f"{outage['process']}{where} cut off at slot {outage['slot']}; {went}"
 
 
-def closing_table(summary: News, width: int) -> Table:
-    """The table of the receivers: their received packets, actual and believed errors, and, if there is room, digests."""
-    trials = f"{summary['trials']:,} trials" if summary["trials"] > 1 else "1 trial"
-    rate = f"{summary['slots_per_second']:,.0f} slots/s"
-    if summary["mode"] != "live":
-        rate = f"{summary['slots_per_second'] * summary['trials']:,.0f} trial-slots/s in memory"
-    title = f"{summary['scenario']} · {summary['slots']:,} slots · {trials} · {rate}"
-    failed = [one["held"] for one in summary["expectations"]].count(False)
-    if failed:
-        title += f" · {failed} of {len(summary['expectations'])} expectations FAILED"
+def closing_table(summary: Summary, width: int) -> Table:
+    """The table of the receivers: their figures, and, if there is room, digests."""
+    trials = f"{summary.trials:,} trials" if summary.trials > 1 else "1 trial"
+    rate = f"{summary.slots_per_second:,.0f} slots/s"
+    if summary.mode != "live":
+        rate = f"{summary.slots_per_second * summary.trials:,.0f} trial-slots/s in memory"
+    title = f"{summary.scenario} · {summary.slots:,} slots · {trials} · {rate}"
+    if summary.failed_expectations:
+        title += f" · {summary.failed_expectations} of {len(summary.expectations)} expectations FAILED"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     table.add_column("receiver", no_wrap=True)
-    covariances = summary["mode"] == "covariance-only"
-    error = "actual tr P" if covariances else "mean |x−x̂|²"
-    for head in ("received", "used", error, "believed tr P", "expected tr P"):
-        table.add_column(head, justify="right", no_wrap=True)
+    shown = columns("column", summary.mode)
+    for column in shown:
+        table.add_column(column.heading, justify="right", no_wrap=True)
     wide = width >= _DIGEST_WIDTH
     if wide:
         table.add_column("digest", no_wrap=True)
-    for name, peer in summary["peers"].items():
-        error_figure = "mean_actual_trace_covariance" if covariances else "mean_squared_error"
+    for name, peer in summary.peers.items():
         table.add_row(
             name,
-            _figure(peer["received_fraction"], ".4f"),
-            _figure(peer["used_fraction"], ".4f"),
-            _figure(peer[error_figure]),
-            _figure(peer["mean_trace_covariance"]),
-            _figure(peer["expected_trace_covariance"]),
-            *([(peer["digest"] or "–")[:12]] if wide else []),
+            *(_figure(shown_figure(peer.all_figures, names), column.format) for column, names in shown.items()),
+            *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
 
 
-def print_summary(summary: News, folder: str, replay: str | None = None) -> None:
+def print_summary(summary: Summary, folder: str, replay: str | None = None) -> None:
     """Print the closing report on standard output; replay: the beginning of the command that shows one trial live."""
     console = terminal()
-    if summary["ended"] != "complete":
-        console.print(f"{summary['ended'].splitlines()[0]}; the results so far:")
+    if summary.ended != "complete":
+        console.print(f"{summary.ended.splitlines()[0]}; the results so far:")
     console.print(closing_table(summary, console.width))
-    for line in _link_lines(summary["links"]):
+    for name, why in unloadable_figures().items():
+        console.print(f"the figure {name} is left out{why}")
+    for line in _link_lines(summary.links):
         console.print(line)
-    if summary["controller"] is not None:
-        console.print(_loop_line(summary["controller"]))
-    for verdict in summary["secrecy"].values():
-        console.print(verdict["sentence"])
-    for name, peer in summary["peers"].items():
-        if peer["infinite_variance"] and peer["error_quantiles"] and summary["trials"] > 1:
-            low, middle, high = (f"{float(value):.3g}" for value in peer["error_quantiles"].values())
+    if summary.controller is not None:
+        console.print(_loop_line(summary.controller))
+    for verdict in summary.secrecy.values():
+        console.print(verdict.sentence)
+    for name, peer in summary.peers.items():
+        if peer.infinite_variance and peer.error_quantiles and summary.trials > 1:
+            low, middle, high = (f"{value:.3g}" for value in peer.error_quantiles.values())
             console.print(
                 f"{name}: its error has infinite variance, so the mean over trials says nothing; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
-    for name, application in applications_in(summary).items():
-        for line in application.lines(summary[name]):
-            console.print(line)
-    for expectation in summary["expectations"]:
-        console.print(format_expectation(expectation))
-        if "replay" in expectation:
-            console.print(f"    see it again: {expectation['replay']}")
-    surprising = summary["surprising"]
+    for line in (*_application_lines(summary), *_expectation_lines(summary)):
+        console.print(line)
+    surprising = summary.surprising
     if surprising is not None:
         console.print(
-            f"most surprising: trial {surprising['trial']}, {surprising['receiver']}, mean error "
-            f"{surprising['mean_error']:.3g} against {surprising['median']:.3g} in the median trial"
+            f"most surprising: trial {surprising.trial}, {surprising.receiver}, mean error "
+            f"{surprising.mean_error:.3g} against {surprising.median:.3g} in the median trial"
         )
         if replay is not None:
-            console.print(f"    watch it live: {replay} --first-trial {surprising['trial']} --trials 1")
+            console.print(f"    watch it live: {replay} --first-trial {surprising.trial} --trials 1")
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
 
 
-def _link_lines(links: Mapping[str, Any]) -> Iterator[str]:
+def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:
     """A line for each link whose delivered fraction differs from its model's."""
     for name, link in links.items():
-        if link.get("within_interval") is False:
-            low, high = link["interval"]
+        if link.within_interval is False and link.interval is not None:
+            low, high = link.interval
             yield (
-                f"the link of {name} let {link['rate']:.5g} of its packets through; its model predicts "
-                f"{link['expected_rate']:.5g}, and for this run an interval of {low:.5g} to {high:.5g}"
+                f"the link of {name} let {link.rate:.5g} of its packets through; its model predicts "
+                f"{link.expected_rate:.5g}, and for this run an interval of {low:.5g} to {high:.5g}"
             )
 
 
-def _loop_line(controller: News) -> str:
+def _application_lines(summary: Summary) -> Iterator[str]:
+    """The lines of the applications that the scenario uses."""
+    for name, application in applications_in(summary.applications).items():
+        yield from application.lines(summary.applications[name])
+
+
+def _expectation_lines(summary: Summary) -> Iterator[str]:
+    """A line for each expectation, and the command that reproduces a failure."""
+    for expectation in summary.expectations:
+        yield expectation.sentence
+        if expectation.replay is not None:
+            yield f"    see it again: {expectation.replay}"
+
+
+def _loop_line(controller: ControllerSummary) -> str:
     """The line about a closed loop."""
     errors = ", ".join(
-        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller["mean_squared_errors"].items()
+        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller.mean_squared_errors.items()
     )
-    line = (
-        f"controller {controller['strategy']}, {controller['decisions']:,} decisions; the estimator's error is {errors}"
-    )
-    failed, clipped = controller["failed_fraction"], controller["clipped_fraction"]
-    if failed:
-        line += f"; {failed:.2%} of inputs were held because a decision failed"
-    if clipped:
-        line += f"; {clipped:.2%} were clipped by the plant"
+    line = f"controller {controller.strategy}, {controller.decisions:,} decisions; the estimator's error is {errors}"
+    if controller.failed_fraction:
+        line += f"; {controller.failed_fraction:.2%} of inputs were held because a decision failed"
+    if controller.clipped_fraction:
+        line += f"; {controller.clipped_fraction:.2%} were clipped by the plant"
     return line
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     """Print the table of a sweep: one row for each point and peer."""
     shown = Table(box=SIMPLE_HEAD)
-    columns = [*keys, "peer", "mean error", "expected tr P", "believed tr P", "relative secrecy"]
-    for column in columns:
-        shown.add_column(column, justify="left" if column in {"peer", "relative secrecy"} else "right", no_wrap=True)
+    figures = columns("sweep_column")
+    for heading in (*keys, "peer", *(column.heading for column in figures), "relative secrecy"):
+        shown.add_column(heading, justify="left" if heading in {"peer", "relative secrecy"} else "right", no_wrap=True)
     for row in table.to_pylist():
-        error = row["mean_squared_error"]
-        error = row["mean_actual_trace_covariance"] if error is None else error
         shown.add_row(
             *(f"{row[key]}" for key in keys),
             row["peer"],
-            f"{error:.4g}",
-            _figure(row["expected_trace_covariance"]),
-            f"{row['mean_trace_covariance']:.4g}",
+            *(_figure(shown_figure(row, names), column.format) for column, names in figures.items()),
             row["relative_secrecy"] or "–",
         )
     console = terminal()
@@ -307,9 +305,9 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
     return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
 
 
-def _figure(value: float | str | None, how: str = ".4g") -> str:
-    """A figure of the summary as text; in the summary infinity is a string, and null means that there is no figure."""
-    return "–" if value is None else format(float(value), how)
+def _figure(value: float | None, how: str = ".4g") -> str:
+    """A figure of the summary as text; None means that there is none."""
+    return "–" if value is None else format(value, how)
 
 
 def _number(value: float) -> str:

@@ -51,7 +51,7 @@ class Check:
     """A description of the machine, and the digests that it computed."""
 
     machine: Mapping[str, str]
-    digests: Mapping[str, str]
+    digests: Mapping[str, str | None]
 
     @property
     def passed(self) -> bool:
@@ -63,7 +63,7 @@ def selftest() -> Check:
     """Compute the golden digests on this machine."""
     with tempfile.TemporaryDirectory(prefix="evedrop-") as folder:
         simulate(Scenario.model_validate(SCENARIO), Path(folder) / "run", lambda _: None)
-        peers = load_results(Path(folder) / "run").summary["peers"]
+        peers = load_results(Path(folder) / "run").typed_summary.peers
     packages = ("evedrop", "numpy", "cryptography", "eclipse-zenoh", "rerun-sdk", "msgpack", "pyarrow", "scipy")
     machine = {
         "python": platform.python_version(),
@@ -71,7 +71,7 @@ def selftest() -> Check:
         "processor": _processor(),
         **{name: importlib.metadata.version(name) for name in packages},
     }
-    return Check(machine, {name: peer["digest"] for name, peer in peers.items()})
+    return Check(machine, {name: peer.digest for name, peer in peers.items()})
 
 
 def _processor() -> str:

@@ -34,6 +34,7 @@ from evedrop.score.expectations_held import replay_of
 from evedrop.score.histogram import SlotHistograms
 from evedrop.score.scorekeeper import Ending, events_of, summary_of
 from evedrop.score.slots import concatenated
+from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums, squared_errors
 from evedrop.score.totals import Totals
 from evedrop.signals import stop_on_signals
@@ -110,7 +111,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
         raise failure
     if not merger.complete:
         raise Interrupted("interrupted; the results so far are in the results folder")
-    return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0
+    return 1 if summary.failed_expectations else 0
 
 
 @contextlib.contextmanager
@@ -289,7 +290,7 @@ class Merger:
         return Totals.merged(self._totals)
 
     @np.errstate(over="ignore", invalid="ignore")
-    def summary(self, ending: Ending) -> dict[str, Any]:
+    def summary(self, ending: Ending) -> Summary:
         """The summary of all added batches; fills in mode and events."""
         totals = self.totals
         whole = self._whole and self.complete

@@ -69,6 +69,8 @@ class ReceiverChunk:
     """Fates of the packets sent in these slots, (c, R)."""
     late: NDArray[np.uint16] | None = None
     """Counts of late packets that arrived, and that were used, (2, c, R); None if the receiver cannot use late packets."""
+    x_hat: Floats | None = None
+    """Estimates in exact mode, (c, n, R)."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ class Chunk:
     """Where the sensor raised an alarm that its acknowledgements are attacked, (c, R); None if it does not watch them."""
     acted: Acted | None = None
     """The closed loop's actions, in exact mode."""
+    x: Floats | None = None
+    """True states in exact mode, (c, n, R)."""
     true_errors: Mapping[str, Floats] | None = None
     """If the sensor filters: squared errors against the true state, of `sensor` and of receivers, (c, R)."""
 
@@ -209,6 +213,7 @@ class Simulation:
                     one.action,
                     fates[name],
                     late[name],
+                    one.x_hat,
                 )
                 for name, one in rows.items()
             }
@@ -217,7 +222,7 @@ class Simulation:
             estimates = {name: one.x_hat for name, one in rows.items()}
             acted = None if inputs is None else Acted(inputs, x, estimates, user.action, true)
             if not self._recorded:
-                return Chunk(chunk.start, measured, None, alarms, acted, beside)
+                return Chunk(chunk.start, measured, None, alarms, acted, x, beside)
             some = slice(0, self._recorded)
             receivers = {
                 name: ReceiverSlots(
@@ -238,7 +243,7 @@ class Simulation:
                 None if sent is None else sent[:, some],
                 inputs=None if acted is None else acted.part(some).inputs,
             )
-            return Chunk(chunk.start, measured, shown, alarms, acted, beside)
+            return Chunk(chunk.start, measured, shown, alarms, acted, x, beside)
 
         return play
 

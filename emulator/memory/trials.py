@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.expected.expectations import expected_traces_of
+from evedrop.figures.figure import ScoredSlots
 from evedrop.memory.simulation import Chunk, Mode, ReceiverChunk, Simulation
 from evedrop.model.digest import Digests
 from evedrop.model.process import Floats
@@ -132,7 +133,11 @@ def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None
                 sums = slot_sums(part.error, part.action, trace)
             block.sums[name].add(chunk.first, sums)
             tally = block.totals.tallies[name]
-            tally.watched.add(chunk.first, part.error, part.action, sums.trace, part.late)
+            rows = slice(block.start - result.start, block.start - result.start + block.trials)
+            x = None if chunk.x is None else chunk.x[..., rows]
+            tally.watched.add(
+                ScoredSlots(chunk.first, part.error, part.action, sums.trace, expected[name], part.late, x, part.x_hat)
+            )
             tally.add(chunk.first, part.error, sums, expected[name])
             account = block.accountants[name].account(range(chunk.first, chunk.first + len(part.error)), part.fates)
             tally.account(account.delivered, part.action, account.lost, account.unsent)
@@ -168,6 +173,7 @@ def _parts(blocks: list[TrialBlock], start: int, measured: ReceiverChunk) -> Ite
                 measured.action[:, rows],
                 measured.fates.part(trials=rows),
                 None if measured.late is None else measured.late[..., rows],
+                None if measured.x_hat is None else measured.x_hat[..., rows],
             ),
         )
 

@@ -130,7 +130,7 @@ class Cell:
             "legitimate": asdict(self.legitimate),
             "ratio": self.ratio,
             "verdict": verdict.value,
-            "secrecy": self.secrecy.as_dict(),
+            "secrecy": asdict(self.secrecy.summary),
         }
 
 

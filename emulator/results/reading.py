@@ -20,6 +20,7 @@ from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is
 from evedrop.results.input_table import inputs_schema_in
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, trials_schema
+from evedrop.score.summary import RunEvent, Summary
 from evedrop.streams import MOST_SLOTS
 
 _MOST_BYTES = 2**28
@@ -27,16 +28,34 @@ _MOST_BYTES = 2**28
 
 @dataclass(frozen=True)
 class Results:
-    """A results folder that was read: `summary` as in docs/results.md, the tables as Arrow."""
+    """A results folder that was read: `summary` as in docs/results.md, the tables as Arrow.
+
+    `typed_summary` is the same summary with types, and raises UsageError if this version does not write such a summary.
+    """
 
     folder: Path
     summary: Mapping[str, Any]
+
+    @property
+    def typed_summary(self) -> Summary:
+        """The summary with types. Raises UsageError if it is not one of this version."""
+        try:
+            return Summary.read(self.summary)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            path = self.folder / "summary.json"
+            why = _one_line(error) if isinstance(error, ValueError) else repr(error)
+            raise UsageError(f"{path} is not a run summary of this version ({why}); run the scenario again") from error
 
     @property
     def remark(self) -> str | None:
         """A remark on a run that did not complete; None for a complete run."""
         ended = str(self.summary.get("ended", "complete"))
         return None if ended == "complete" else f"{self.folder}: {ended.splitlines()[0]}"
+
+    @property
+    def events(self) -> list[RunEvent]:
+        """The events of the run; also of a run of an older version."""
+        return [RunEvent(one["slot"], one["event"], one["by"]) for one in self.summary.get("events", ())]
 
     def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
         path = self.folder / f"{name}.parquet"
@@ -173,7 +192,7 @@ def _no_figures(folder: Path) -> dict[str, Any]:
 
     scenario = load(folder, beyond_horizon=True)
     nothing = Totals.nothing(scenario, scenario.trials)
-    summary: dict[str, Any] = plain(
-        summary_of(scenario, nothing, dict.fromkeys(scenario.digested), Ending(0.0, "slot 0"))
+    found: dict[str, Any] = plain(
+        summary_of(scenario, nothing, dict.fromkeys(scenario.digested), Ending(0.0, "slot 0")).as_dict()
     )
-    return summary
+    return found

@@ -16,9 +16,10 @@ import numpy as np
 
 from evedrop.results.folder import write_private
 from evedrop.results.growing_tables import forget
+from evedrop.score.summary import Summary
 
 
-def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
+def write_summary(folder: Path, summary: Summary) -> None:
     """Write summary.json, which completes a results folder; infinite and undefined numbers as strings, which JSON lacks."""
     unfinished = folder / "summary.json.new"
     try:
@@ -31,9 +32,9 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     forget(folder)
 
 
-def summary_text(summary: Mapping[str, Any]) -> str:
+def summary_text(summary: Summary) -> str:
     """The text of a summary's file."""
-    return json.dumps(plain(summary), indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(plain(summary.as_dict()), indent=1, ensure_ascii=False) + "\n"
 
 
 def plain(value: Any) -> Any:

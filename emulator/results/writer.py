@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, final
@@ -33,6 +34,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.disturbances import disturbances_of
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
+from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
 
 _ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
@@ -127,9 +129,7 @@ class ResultsWriter:
         if failure is not None and error is None:
             raise failure
 
-    def checkpoint(
-        self, at: str, figures: Callable[[], Mapping[str, Any]], before: Callable[[], None] = lambda: None
-    ) -> None:
+    def checkpoint(self, at: str, figures: Callable[[], Summary], before: Callable[[], None] = lambda: None) -> None:
         """Write rows to disk if some seconds have passed since the last round, or if many are held back.
 
         at: how far the run came, in words; figures: returns the summary so far, called more rarely if it takes long;
@@ -152,15 +152,15 @@ class ResultsWriter:
             self._figures_before = True
             self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
 
-    def settle(self, at: str, figures: Mapping[str, Any]) -> None:
+    def settle(self, at: str, figures: Summary) -> None:
         """Write everything to disk, with the last figures; no rows may follow. Raises OSError as `checkpoint` does."""
         self._at = at
         self._round()
         self.write_figures(figures)
 
-    def write_figures(self, figures: Mapping[str, Any]) -> None:
+    def write_figures(self, figures: Summary) -> None:
         """Write the summary so far, of a run that has not ended."""
-        write_figures(self._held.now, summary_text({**figures, "ended": self._at}))
+        write_figures(self._held.now, summary_text(replace(figures, ended=self._at)))
 
     def restart_slots(self) -> None:
         """Discard the rows of all slots; other rows will replace them."""

@@ -3,11 +3,10 @@
 Source: docs/scenario.md.
 """
 
-from evedrop.scenario.expect import FIGURES, ExpectTable, link_figure
+from evedrop.scenario.expect import ExpectTable, link_figure
 from evedrop.scenario.tables import SECRET_BYTES, Scenario
 
 __all__ = [
-    "FIGURES",
     "SECRET_BYTES",
     "ExpectTable",
     "Scenario",

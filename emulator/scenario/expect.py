@@ -14,21 +14,12 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
+from evedrop.figures import expectable_figures, figures_of, unloadable_figures
+from evedrop.figures.links import LINK_FIGURES
 from evedrop.scenario.application import APPLICATIONS, Application
 from evedrop.scenario.table import Found, Number, Table, expected, one_of
 from evedrop.scenario.words import as_toml, listed
 
-FIGURES = (
-    "mean_squared_error",
-    "mean_trace_covariance",
-    "expected_trace_covariance",
-    "received_fraction",
-    "used_fraction",
-)
-"""The figures of a receiver."""
-TRIAL_FIGURES = ("mean_squared_error", "received_fraction", "used_fraction")
-"""The figures that a run knows for every trial, and that therefore have quantiles."""
-LINK_FIGURES = ("offered", "delivered", "late", "lost", "unexplained", "rate")
 SECRECY = ("relative", "perfect")
 
 LINKS = "links"
@@ -192,12 +183,12 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
         if link is not None and table.get(name) is not None:
             instead = f"expected none, or the figure {link[0]}.received_fraction"
             found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
-    if (
-        link is None
-        and table.get("quantile") is not None
-        and figure.rpartition(".")[2] in set(FIGURES) - set(TRIAL_FIGURES)
-    ):
-        instead = f"expected a figure that every trial has: {listed(TRIAL_FIGURES)}"
+    known = expectable_figures()
+    of_receiver = known.get(figure.rpartition(".")[2])
+    if link is None and table.get("quantile") is not None and of_receiver is not None and not of_receiver.by_trial:
+        instead = (
+            f"expected a figure that every trial has: {listed([name for name, one in known.items() if one.by_trial])}"
+        )
         found.append(("quantile", f"is set, but {figure} is not known trial by trial; {instead}"))
     return found
 
@@ -260,18 +251,22 @@ class Around:
         link = link_figure(figure)
         if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
             return []
-        own = [f"{receiver}.{name}" for receiver in self.receivers for name in FIGURES]
+        known = expectable_figures()
+        own = [f"{receiver}.{name}" for receiver in self.receivers for name in figures_of(receiver) if name in known]
         links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
         first = figure.partition(".")[0]
         if first not in self.receivers and first in APPLICATIONS:
             return self._application_mistakes(figure, first, APPLICATIONS[first])
+        name = figure.rpartition(".")[2]
         if figure not in [*own, *links]:
-            names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(FIGURES)})"
+            broken = unloadable_figures().get(name)
+            if broken is not None:
+                return [("figure", f"is {as_toml(figure)}{broken}")]
+            names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(known)})"
             of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
             hint = _near(figure, [*own, *links])
             return [("figure", f"is {as_toml(figure)}; expected {names} or {of_links}{hint}")]
-        name = figure.rpartition(".")[2]
-        why = self.no_theory(first) if name == "expected_trace_covariance" else None
+        why = self.no_theory(first) if link is None and known[name].needs_theory else None
         if why is not None:
             return [("figure", f"is {as_toml(figure)}, but {why}; expected another figure")]
         return []

@@ -6,7 +6,7 @@ Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
+from evedrop.score.summary import DetectionSummary
 from evedrop.streams import Batch
 
 _ATTACK_LOOKED_FOR = "all"  # by the sensor of a scenario without an attack
@@ -101,7 +102,7 @@ class Detection:
         raised = alarms.any(axis=0)
         self.first = np.where(raised & (self.first < 0), first + np.argmax(alarms, axis=0), self.first)
 
-    def summary(self, scenario: Scenario) -> dict[str, Any] | None:
+    def summary(self, scenario: Scenario) -> DetectionSummary | None:
         """The sensor's detection for the summary; None if the sensor does not watch for attacks."""
         chart, spec = chart_of(scenario), way_back_of(scenario)
         if chart is None or spec is None:
@@ -109,10 +110,10 @@ class Detection:
         start = None if spec.attack == "none" else 0 if spec.spans is None else min(s for s, _ in spec.spans)
         raised = self.first >= 0
         true = raised & (self.first >= start) if start is not None else np.zeros_like(raised)
-        return {
-            "attack_from": start,
-            "alarms": int(np.count_nonzero(raised)),
-            "false_alarms": int(np.count_nonzero(raised & ~true)),
-            "mean_delay": float((self.first[true] - start + 1).mean()) if true.any() and start is not None else None,
-            "first_alarm": int(self.first[raised].min()) if raised.any() else None,
-        }
+        return DetectionSummary(
+            attack_from=start,
+            alarms=int(np.count_nonzero(raised)),
+            false_alarms=int(np.count_nonzero(raised & ~true)),
+            mean_delay=float((self.first[true] - start + 1).mean()) if true.any() and start is not None else None,
+            first_alarm=int(self.first[raised].min()) if raised.any() else None,
+        )

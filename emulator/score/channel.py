@@ -5,45 +5,42 @@ Source: docs/results.md, links; docs/mathematics.md, links.
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from evedrop.figures.links import LinkAccount
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain, LossModel
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import stretches
 from evedrop.scenario import Scenario
+from evedrop.score.summary import LinkSummary
 from evedrop.score.sums import Tally
 
 CONFIDENCE = 0.999
 QUANTILES = (0.5, 0.9, 0.99)
 
 
-def channel_of(scenario: Scenario, receiver: str, tally: Tally) -> dict[str, Any]:
-    """The link's figures in the summary, besides its account.
-
-    `rate`: the fraction of packets that the loss model let through; `expected_rate`: the same by the model;
-    `interval`: for the model's rate given the packets observed, at 99.9 % confidence; `within_interval`: whether the model's
-    rate lies in it; `lost_by`; `bursts`, `mean_burst` and `expected_mean_burst` of consecutive losses; `delays`, observed and
-    by the model. None where nothing was measured, or nothing is known.
-    """
+def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSummary:
+    """A link's account, and how its losses and delays compare with those of its models."""
     course = scenario.course(receiver)
     pieces = _pieces(course, tally.done)
     met = sum(len(slots) for slots, _ in pieces) * tally.trials - tally.lost.get("overflow", 0)
-    found = {
-        "lost_by": {reason: count for reason, count in sorted(tally.lost.items()) if count},
-        "rate": None,
-        "expected_rate": None,
-        "interval": None,
-        "within_interval": None,
-        "bursts": np.trim_zeros(tally.bursts, "b").tolist(),
-        "mean_burst": _mean_burst(tally),
-        "expected_mean_burst": None if tally.lost.get("overflow") else _expected_burst(pieces),
-        **_delays(course, tally),
-    }
+    found = _with_delays(
+        LinkSummary(
+            **asdict(LinkAccount.of(tally)),
+            lost_by={reason: count for reason, count in sorted(tally.lost.items()) if count},
+            bursts=np.trim_zeros(tally.bursts, "b").tolist(),
+            mean_burst=_mean_burst(tally),
+            expected_mean_burst=None if tally.lost.get("overflow") else _expected_burst(pieces),
+        ),
+        course,
+        tally,
+    )
     if tally.offered != tally.done * tally.trials:
         return found  # trials were cut short at different slots, in which different models may have applied
     if tally.unsent:
@@ -60,8 +57,7 @@ def channel_of(scenario: Scenario, receiver: str, tally: Tally) -> dict[str, Any
     variance *= slots * tally.trials / met if tally.unsent else 1.0
     low, high = interval(rate, expected, variance)
     within = low - _ROUNDING <= expected <= high + _ROUNDING
-    found |= {"rate": rate, "expected_rate": expected, "interval": [low, high], "within_interval": bool(within)}
-    return found
+    return replace(found, rate=rate, expected_rate=expected, interval=(low, high), within_interval=bool(within))
 
 
 def _independent(loss: LossModel) -> bool:
@@ -118,17 +114,18 @@ def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
     return float(chain.law @ lost) / begins if begins > 0.0 else None
 
 
-def _delays(course: LinkSchedule, tally: Tally) -> dict[str, Any]:
-    """Fractions of the delivered packets by delay in slots, the last for delays beyond the window; and quantiles."""
+def _with_delays(link: LinkSummary, course: LinkSchedule, tally: Tally) -> LinkSummary:
+    """The link with fractions of its delivered packets by delay, and their quantiles."""
     total = int(tally.delays.sum())
     if course.settings.get("delay") is None or not total:
-        return {"delays": None, "expected_delays": None, "delay_quantiles": None}
+        return link
     fractions = tally.delays / total
-    return {
-        "delays": fractions.tolist(),
-        "expected_delays": _expected_delays(course),
-        "delay_quantiles": {f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
-    }
+    return replace(
+        link,
+        delays=fractions.tolist(),
+        expected_delays=_expected_delays(course),
+        delay_quantiles={f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
+    )
 
 
 def _expected_delays(course: LinkSchedule) -> list[float] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS, ApplicationTally
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.score.slots import InputSlots
+from evedrop.score.summary import ControllerSummary, PeerSummary
 
 ESTIMATORS = ("ignoring_input", "knowing_input")
 
@@ -141,23 +142,26 @@ class LoopTally:
         return whole
 
     def summary(
-        self, scenario: Scenario, peer: dict[str, Any], times: SolveTimes, digest: str | None
-    ) -> dict[str, Any]:
-        """The summary's entry on the controller; peer: its entry on the legitimate estimator."""
+        self, scenario: Scenario, user: PeerSummary, times: SolveTimes, digest: str | None
+    ) -> ControllerSummary:
+        """The summary's entry on the controller; user: that on the legitimate estimator."""
         assert scenario.controller is not None  # noqa: S101 - else there is no tally
         knows = scenario.legitimate.knows_input
-        errors = [peer["mean_squared_error"], self.other_error / self.slots if self._offset and self.slots else None]
-        return {
-            "strategy": scenario.controller.strategy,
-            "period": scenario.controller.period,
-            "acts_on": scenario.controller.acts_on,
-            "knows_input": knows,
-            "decisions": times.decisions,
-            "mean_solve_seconds": times.mean,
-            "longest_solve_seconds": times.longest,
-            "failed_fraction": self.failed / self.slots if self.slots else None,
-            "clipped_fraction": self.clipped / self.slots if self.slots else None,
-            "mean_squared_errors": dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
-            "mean_trace_covariance": peer["mean_trace_covariance"],
-            "digest": digest,
-        }
+        errors = [
+            user.figure("mean_squared_error"),
+            self.other_error / self.slots if self._offset and self.slots else None,
+        ]
+        return ControllerSummary(
+            strategy=scenario.controller.strategy,
+            period=scenario.controller.period,
+            acts_on=scenario.controller.acts_on,
+            knows_input=knows,
+            decisions=times.decisions,
+            mean_solve_seconds=times.mean,
+            longest_solve_seconds=times.longest,
+            failed_fraction=self.failed / self.slots if self.slots else None,
+            clipped_fraction=self.clipped / self.slots if self.slots else None,
+            mean_squared_errors=dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
+            mean_trace_covariance=user.figure("mean_trace_covariance"),
+            digest=digest,
+        )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from evedrop.model.local_filter import LocalFilter, Steps
 from evedrop.model.process import Floats
 from evedrop.names import SENSOR
 from evedrop.scenario import Scenario
+from evedrop.score.summary import FilterSummary
 from evedrop.score.sums import squared_errors
 from evedrop.streams import Batch
 
@@ -69,7 +70,7 @@ class FilterTally:
                 whole.sums[name] = whole.sums.get(name, 0.0) + value
         return whole
 
-    def summary(self, scenario: Scenario) -> dict[str, Any]:
+    def summary(self, scenario: Scenario) -> FilterSummary:
         """The summary's entry on the filter."""
         driven = scenario.driven
         assert driven is not None  # noqa: S101 - else there is no tally
@@ -81,8 +82,5 @@ class FilterTally:
             traces.append(last)
         mean = (sum(traces) + (self.slots - len(traces)) * last) / max(1, self.slots)
         errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
-        return {
-            "mean_trace_covariance": mean if self.slots else None,
-            "mean_squared_error": errors.pop(SENSOR, None),
-            "mean_true_squared_errors": errors,
-        }
+        own = errors.pop(SENSOR, None)
+        return FilterSummary(mean if self.slots else None, own, errors)

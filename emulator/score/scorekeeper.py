@@ -5,24 +5,26 @@ The summary is described in docs/results.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from evedrop.expected.expectations import expectations_of
+from evedrop.figures import figures_of
+from evedrop.figures.figure import ScoredSlots
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario import Scenario
-from evedrop.score.channel import channel_of
+from evedrop.score.channel import link_summary_of
 from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
+from evedrop.score.summary import Outage, PeerSummary, RunEvent, Summary, Surprising
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
@@ -67,7 +69,11 @@ class Scorekeeper:
             if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
                 late = (receiver.late, receiver.late_used)
                 tally.account_late(receiver.late_delivered, *late)
-            tally.watched.add(slots.first, errors, receiver.action, one.sums.trace, late)
+            tally.watched.add(
+                ScoredSlots(
+                    slots.first, errors, receiver.action, one.sums.trace, one.expected, late, slots.x, receiver.x_hat
+                )
+            )
             scored[name] = one
         return scored
 
@@ -95,10 +101,8 @@ class Ending:
     """The command that runs it again, shown when an expectation fails."""
     mode: str = "live"
     """`live`, or the mode of a run in memory."""
-    events: Sequence[Mapping[str, Any]] = ()
-    """As in the summary."""
-    outages: Sequence[Mapping[str, Any]] = ()
-    """As in the summary."""
+    events: Sequence[RunEvent] = ()
+    outages: Sequence[Outage] = ()
     accused: tuple[str, ...] = ()
     """The processes whose behaviour made the run end."""
     misdelivered: Mapping[str, int] = field(default_factory=dict)
@@ -112,7 +116,7 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
     return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
 
 
-def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> dict[str, Any]:
+def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> Summary:
     """The summary of docs/results.md; a digest is None if there is none, or if the run was cut short.
 
     An accused process has no digest either: what it reported is contradicted.
@@ -120,54 +124,52 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
     expected = expectations_of(scenario)
-    peers: dict[str, dict[str, Any]] = {
-        name: {
-            **(_figures(tally) if tally.offered else dict.fromkeys(tally.figures)),
-            "error_quantiles": _quantiles(tally),
-            "infinite_variance": expected[name].infinite_variance,
-            "digest": digests[name],
-        }
+    peers = {
+        name: _peer(name, tally, expected[name].infinite_variance, digests[name], ending.mode)
         for name, tally in tallies.items()
     }
-    if ending.mode == "covariance-only":
-        for peer in peers.values():
-            peer["mean_actual_trace_covariance"], peer["mean_squared_error"] = peer["mean_squared_error"], None
     applications = {} if loop is None else {name: one.summary() for name, one in loop.applications.items()}
     user = tallies[LEGITIMATE]
-    links = {name: {**tally.link, **channel_of(scenario, name, tally)} for name, tally in tallies.items()}
+    links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
-    evidence = Evidence(scenario, peers, links, tallies, expected, secret, applications)
-    return {
-        "scenario": scenario.title,
-        "mode": ending.mode,
-        "seed": scenario.seed,
-        "slots": user.done,
-        "trials": user.trials,
-        "first_trial": scenario.first_trial,
-        "wall_seconds": ending.wall_seconds,
-        "slots_per_second": user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
-        "ended": ending.how,
-        "peers": peers,
-        "links": links,
-        "events": list(ending.events),
-        "outages": list(ending.outages),
-        "verification": verification_of(scenario, ending.accused) if ending.mode == "live" else None,
-        "misdelivered": dict(ending.misdelivered),
-        "secrecy": {name: one.as_dict() for name, one in secret.items()},
-        "detection": None if detection is None else detection.summary(scenario),
-        "controller": None
+    return Summary(
+        scenario=scenario.title,
+        mode=ending.mode,
+        seed=scenario.seed,
+        slots=user.done,
+        trials=user.trials,
+        first_trial=scenario.first_trial,
+        wall_seconds=ending.wall_seconds,
+        slots_per_second=user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
+        ended=ending.how,
+        peers=peers,
+        links=links,
+        events=ending.events,
+        outages=ending.outages,
+        verification=verification_of(scenario, ending.accused) if ending.mode == "live" else None,
+        misdelivered=ending.misdelivered,
+        secrecy={name: one.summary for name, one in secret.items()},
+        detection=None if detection is None else detection.summary(scenario),
+        controller=None
         if loop is None
         else loop.summary(scenario, peers[LEGITIMATE], totals.solve_times, digests[CONTROLLER]),
-        "filter": None if totals.filter is None else totals.filter.summary(scenario),
-        **applications,
-        "surprising": _surprising(scenario, tallies),
-        "expectations": evidence.judged(ending.replay),
-    }
+        filter=None if totals.filter is None else totals.filter.summary(scenario),
+        applications=applications,
+        surprising=_surprising(scenario, tallies),
+        expectations=Evidence(scenario, peers, links, tallies, secret, applications).judged(ending.replay),
+    )
 
 
-def _figures(tally: Tally) -> dict[str, float | None]:
-    """A receiver's figures; None where there is no theory."""
-    return {name: None if math.isnan(value) else value for name, value in tally.figures.items()}
+def _peer(name: str, tally: Tally, infinite_variance: bool, digest: str | None, mode: str) -> PeerSummary:
+    """A receiver's entry of the summary."""
+    figures: dict[str, float | None] = {}
+    of_mode: dict[str, float | None] = {}
+    for figure, one in figures_of(name).items():
+        if one.only_in_mode is None:
+            figures[figure] = None if one.not_in_mode == mode else tally.figure(figure)
+        elif one.only_in_mode == mode:
+            of_mode[figure] = tally.figure(figure)
+    return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode)
 
 
 def _quantiles(tally: Tally) -> dict[str, float] | None:
@@ -177,9 +179,9 @@ def _quantiles(tally: Tally) -> dict[str, float] | None:
     return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
 
 
-def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, Any] | None:
+def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising | None:
     """The trial whose mean error, for any receiver, lies furthest from the median, in logarithms and median deviations."""
-    found: dict[str, Any] | None = None
+    found: Surprising | None = None
     furthest = 0.0
     for name, tally in tallies.items():
         means = trial_means(tally)
@@ -192,12 +194,7 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> dict[str, A
         worst = int(np.argmax(deviation))
         if spread > 0.0 and deviation[worst] / spread > furthest:
             furthest = float(deviation[worst] / spread)
-            found = {
-                "trial": scenario.first_trial + worst,
-                "receiver": name,
-                "mean_error": float(means[worst]),
-                "median": float(np.exp(median)),
-            }
+            found = Surprising(scenario.first_trial + worst, name, float(means[worst]), float(np.exp(median)))
     return found
 
 
@@ -210,11 +207,6 @@ def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) 
     return digest.hexadecimal
 
 
-def events_of(scenario: Scenario, done: int) -> list[dict[str, Any]]:
-    """The scenario's events before slot `done`, as the summary lists them."""
-    return [{"slot": act.at, "event": act.said, "by": "scenario"} for act in scenario.timeline.acts if act.at < done]
-
-
-def event_line(event: Mapping[str, Any]) -> str:
-    """An event of the summary as a line of the view."""
-    return event["event"] if event["by"] == "scenario" else f"{event['event']} (by the {event['by']})"
+def events_of(scenario: Scenario, done: int) -> list[RunEvent]:
+    """The scenario's events before slot `done`."""
+    return [RunEvent(act.at, act.said, "scenario") for act in scenario.timeline.acts if act.at < done]

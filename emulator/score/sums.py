@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import final
@@ -9,10 +10,12 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.figures import figure
+from evedrop.figures.figure import ReceiverTotals
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.score.watched import Watched
+from evedrop.score.watched import Watched, WatchedSlots
 
 WINDOWS = 8
 """The number of windows into which slots k ≥ 1 are divided for verdicts, of equal length up to one slot."""
@@ -85,32 +88,16 @@ def window_of(k: NDArray[np.intp], slots: int) -> NDArray[np.intp]:
 
 @final
 @dataclass
-class Tally:
+class Tally(ReceiverTotals):
     """One receiver's totals over a run."""
 
     slots: int
     """The number of slots of the whole run."""
     trials: int
     watched: Watched = field(default_factory=lambda: Watched((), 0))
-    """The sums that expectations need of the receiver."""
+    """What its figures and expectations need besides."""
     done: int = 0
     """Slots that all trials have reached."""
-    offered: int = 0
-    """Slots times trials, which is the number of packets, except those that were not sent."""
-    unsent: int = 0
-    error: float = 0.0
-    trace: float = 0.0
-    expected_trace: float = 0.0
-    received: int = 0
-    used: int = 0
-    unexplained: int = 0
-    """Packets for which journal and receiver disagree."""
-    late: int = 0
-    """Packets that arrived after their own slot, within the window; `late_used`: those of them that were used."""
-    late_used: int = 0
-    late_sent: int = 0
-    """Packets that the router let through, but for a later slot."""
-    lost: dict[str, int] = field(default_factory=dict)
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
     bursts: NDArray[np.int64] = field(init=False)
@@ -175,33 +162,13 @@ class Tally:
             self.delays = np.zeros(account.delays.size, np.int64)
         self.delays += account.delays
 
-    @property
-    def figures(self) -> dict[str, float]:
-        """The receiver's figures: means over slots and trials."""
-        offered = max(1, self.offered)
-        return {
-            "mean_squared_error": self.error / offered,
-            "mean_trace_covariance": self.trace / offered,
-            "expected_trace_covariance": self.expected_trace / offered,
-            "received_fraction": (self.received + self.late) / offered,
-            "used_fraction": (self.used + self.late_used) / offered,
-        }
-
-    @property
-    def link(self) -> dict[str, int]:
-        """The link's account: every packet offered is delivered or lost for a reason."""
-        # In a run cut short some packets are still under way; for a whole run the router has reported which.
-        lost = sum(self.lost.values()) + max(0, self.late_sent - self.late)
-        delivered = self.received + self.late
-        offered = self.offered - self.unsent
-        missing = abs(offered - delivered - lost)
-        return {
-            "offered": offered,
-            "delivered": delivered,
-            "late": self.late,
-            "lost": lost,
-            "unexplained": max(missing, self.unexplained),
-        }
+    def figure(self, name: str) -> float | None:
+        """A figure of the run by its name; None where there is none."""
+        found = figure(name)
+        if not found.from_totals:
+            return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
+        value = found.of_totals(self) if self.offered else math.nan
+        return None if math.isnan(value) else value
 
 
 def window_means(tally: Tally) -> Floats:
@@ -218,25 +185,16 @@ def trial_means(tally: Tally) -> Floats:
     return means
 
 
+_COUNTED = [one.name for one in fields(ReceiverTotals) if one.name != "lost"]
+
+
 def merged(parts: Sequence[Tally]) -> Tally:
     """One tally of several disjoint sets of trials, in their order."""
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
     total.watched = Watched.of([part.watched for part in parts])
     total.done = min(part.done for part in parts)
     for part in parts:
-        for name in (
-            "offered",
-            "unsent",
-            "error",
-            "trace",
-            "expected_trace",
-            "received",
-            "used",
-            "unexplained",
-            "late",
-            "late_used",
-            "late_sent",
-        ):
+        for name in _COUNTED:
             setattr(total, name, getattr(total, name) + getattr(part, name))
         for reason, count in part.lost.items():
             total.lost[reason] = total.lost.get(reason, 0) + count

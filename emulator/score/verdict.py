@@ -14,6 +14,7 @@ import numpy as np
 
 from evedrop.expected.expectations import Expectation
 from evedrop.model.process import Floats
+from evedrop.score.summary import SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 
 CONFIDENCE = 0.99
@@ -51,17 +52,18 @@ class Secrecy:
     unknown: str = "there is no theory for these links"
     """The sentence's ending where theory makes no claim."""
 
-    def as_dict(self) -> dict[str, str | bool | int | None]:
-        """The entries of the summary."""
-        return {
-            "relative": self.relative.value,
-            "perfect": self.perfect.value,
-            "relative_by_theory": self.relative_by_theory,
-            "relative_from": self.relative_from,
-            "perfect_by_theory": self.perfect_by_theory,
-            "judged_by": self.judged_by,
-            "sentence": self.sentence,
-        }
+    @property
+    def summary(self) -> SecrecySummary:
+        """The entry of the summary."""
+        return SecrecySummary(
+            relative=self.relative.value,
+            perfect=self.perfect.value,
+            relative_by_theory=self.relative_by_theory,
+            relative_from=self.relative_from,
+            perfect_by_theory=self.perfect_by_theory,
+            judged_by=self.judged_by,
+            sentence=self.sentence,
+        )
 
     @property
     def sentence(self) -> str:

@@ -7,28 +7,32 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import pairwise
-from typing import Any
 
+from evedrop.figures import figures_of
 from evedrop.scenario import Scenario
+from evedrop.score.summary import Verification
 
 
-def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Any]:
+def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Verification]:
     """The entry `verification` of a live run's summary: receiver → the verified figures, and those that it only reported.
 
     accused: processes whose reports made the run end.
     """
     recorded = _recorded_of(scenario)
-    checked, of_recorded = ["mean_squared_error", "received_fraction"], ["mean_trace_covariance", "digest"]
     found = {}
     for name in scenario.receivers:
-        figures = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
-        own_word = [one for one in (*checked, "used_fraction", *of_recorded) if one not in figures]
-        found[name] = {
-            "recomputed_trials": 0 if name in accused else recorded,
-            "verified": figures,
-            "own_word": own_word,
-        }
+        figures = {who: _resting_on(who, name) for who in ("observer", "receiver", "recorded trials")}
+        checked, of_recorded = figures["observer"], [*figures["recorded trials"], "digest"]
+        verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
+        own_word = [one for one in (*checked, *figures["receiver"], *of_recorded) if one not in verified]
+        found[name] = Verification(0 if name in accused else recorded, verified, own_word)
     return found
+
+
+def _resting_on(who: str, receiver: str) -> list[str]:
+    """The figures of a receiver of a live run that rest on the observer, on recorded trials, or on the receiver alone."""
+    figures = figures_of(receiver).items()
+    return [name for name, one in figures if one.rests_on == who and one.only_in_mode is None]
 
 
 def _recorded_of(scenario: Scenario) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.expected.expectations import Expectation, expectations_of
+from evedrop.figures.errors import MeanSquaredError
 from evedrop.memory.montecarlo import Merger, News, Plan, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
@@ -146,7 +147,7 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
     heavy = expected.infinite_variance
     spread = None if heavy or len(means) < 2 else float(np.std(means, ddof=1)) / math.sqrt(len(means))
     return SimulatedError(
-        tally.figures["mean_squared_error"],
+        MeanSquaredError.of_totals(tally),
         spread,
         {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
         heavy,

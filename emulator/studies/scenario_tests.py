@@ -20,7 +20,7 @@ from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.results.folder import claimed, default_folder
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
-from evedrop.score.expectations_held import format_expectation
+from evedrop.score.summary import Judged
 
 
 class Outcome(Enum):
@@ -114,7 +114,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
         return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
     except RunError as error:
         return ended(Outcome.BROKEN, str(error).splitlines(), seed=made.seed, folder=folder)
-    reasons = list(_reasons(load_results(folder).summary))
+    reasons = list(_reasons(load_results(folder).typed_summary.expectations))
     return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, seed=made.seed, folder=folder)
 
 
@@ -130,9 +130,8 @@ def _silent(news: Mapping[str, Any]) -> None:
     del news
 
 
-def _reasons(summary: Mapping[str, Any]) -> Iterator[str]:
+def _reasons(expectations: Sequence[Judged]) -> Iterator[str]:
     """A line for each expectation that did not hold or could not be decided: a test fails if it cannot decide."""
-    for expectation in summary["expectations"]:
-        if expectation["held"] is not True:
-            replay = expectation.get("replay")
-            yield format_expectation(expectation) + (f"; see it again: {replay}" if replay is not None else "")
+    for one in expectations:
+        if one.held is not True:
+            yield one.sentence + (f"; see it again: {one.replay}" if one.replay is not None else "")

@@ -19,14 +19,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
+from evedrop.figures import all_figures
 from evedrop.loading import load, value_of
 from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
-from evedrop.scenario import FIGURES, Scenario
+from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.score.scorekeeper import Ending
+from evedrop.score.summary import Summary
 from evedrop.signals import stop_on_signals
 
 Grid = Mapping[str, Sequence[Any]]
@@ -150,7 +152,7 @@ def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]
         APPLICATIONS[name].draw_sweep(private_pictures(folder / name), table, next(iter(grid)))
 
 
-def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> dict[str, Any] | None:
+def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> Summary | None:
     """The summary of a point; None if it was interrupted."""
     started = time.monotonic()
     merger = Merger(scenario, plan.mode)
@@ -177,25 +179,24 @@ def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: P
     return found
 
 
-def _rows(point: Point, scenario: Scenario, summary: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
     """A row for each peer: the point, the figures, the verdict."""
-    for name, peer in summary["peers"].items():
-        verdict = summary["secrecy"].get(name, {})
+    for name, peer in summary.peers.items():
+        verdict = summary.secrecy.get(name)
         yield {
             **{key: json.dumps(value) if isinstance(value, (list, dict)) else value for key, value in point.items()},
             "peer": name,
             "slots": scenario.slots,
-            "trials": summary["trials"],
-            **{figure: peer[figure] for figure in FIGURES},
-            "mean_actual_trace_covariance": peer.get("mean_actual_trace_covariance"),
-            **{f"error_quantile_{level}": value for level, value in (peer["error_quantiles"] or {}).items()},
-            "infinite_variance": peer["infinite_variance"],
+            "trials": summary.trials,
+            **{figure: peer.figure(figure) for figure in all_figures()},
+            **{f"error_quantile_{level}": value for level, value in (peer.error_quantiles or {}).items()},
+            "infinite_variance": peer.infinite_variance,
             **{
                 column: value
-                for application in scenario.applications
-                for column, value in APPLICATIONS[application].sweep_columns(summary[application], name).items()
+                for application, entry in summary.applications.items()
+                for column, value in APPLICATIONS[application].sweep_columns(entry, name).items()
             },
-            "relative_secrecy": verdict.get("relative"),
-            "perfect_secrecy": verdict.get("perfect"),
-            "digest": peer["digest"],
+            "relative_secrecy": None if verdict is None else verdict.relative,
+            "perfect_secrecy": None if verdict is None else verdict.perfect,
+            "digest": peer.digest,
         }

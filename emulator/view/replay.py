@@ -15,7 +15,6 @@ from evedrop.loading import load
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Flags
 from evedrop.results.writer import Results, load_results
-from evedrop.score.scorekeeper import event_line
 from evedrop.view.scene import PeerSlots, SceneSlots
 from evedrop.view.scored_slots import open_recording, showing_of
 
@@ -53,8 +52,8 @@ def replay(folder: Path, path: Path | None = None) -> Path:
         moved = None if showing is None else showing.take(inputs[rows], deviations)
         shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
         recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
-    for event in results.summary.get("events", ()):
-        recording.note(event["slot"], "INFO", event_line(event))
+    for event in results.events:
+        recording.note(event.slot, "INFO", event.line)
     recording.close()
     if recording.failure is not None:
         path.unlink(missing_ok=True)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
+from evedrop.figures import all_figures, shown_figure
 from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _COLOURS = (BLUE, RED, ORANGE, GREEN, GREY, "#7b3294", "#00a6d6", "#8c564b")
@@ -18,6 +20,9 @@ _MOST_PANELS = 6
 def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
     """Draw `path`.png and `path`.pdf: simulated errors as marks, theory as lines."""
     rows = table.to_pylist()
+    marks, lines = (
+        [name for name, one in all_figures().items() if one.sweep_picture == way] for way in ("marks", "lines")
+    )
     others = list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))[:_MOST_PANELS]
     peers = list(dict.fromkeys(row["peer"] for row in rows))
     with panels(path, len(others), 1.2 + 4.2 * len(others), 3.9) as axes:
@@ -25,10 +30,17 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
             for peer, colour, mark in zip(peers, _COLOURS * 8, _MARKS * 8, strict=False):
                 mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
                 x = _positions([row[keys[0]] for row in mine])
-                theory = [row["expected_trace_covariance"] for row in mine]
+                theory = [_height(row, lines) for row in mine]
                 numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
                 one.plot(x, theory, "-" if numbers else "_", color=colour, linewidth=1.2, markersize=26)
-                one.plot(x, [_error(row) for row in mine], mark, color=colour, markerfacecolor="white", label=peer)
+                one.plot(
+                    x,
+                    [_height(row, marks) for row in mine],
+                    mark,
+                    color=colour,
+                    markerfacecolor="white",
+                    label=peer,
+                )
                 if not numbers:
                     one.set_xticks(x, [str(row[keys[0]]) for row in mine])
                     one.set_xlim(-0.5, len(x) - 0.5)
@@ -42,9 +54,9 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
         axes[0].legend()
 
 
-def _error(row: dict[str, Any]) -> float:
-    found = row["mean_squared_error"]
-    return float(row["mean_actual_trace_covariance"] if found is None else found)
+def _height(row: dict[str, Any], figures: list[str]) -> float:
+    found = shown_figure(row, figures)
+    return math.nan if found is None else found
 
 
 def _positions(values: list[Any]) -> list[float]:

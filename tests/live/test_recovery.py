@@ -14,7 +14,7 @@ import pytest
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, Command
-from evedrop.live.protocol.news import News
+from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
@@ -386,4 +386,4 @@ def test_losses_that_overlap_are_one_outage() -> None:
     recovery.look(13)
     found = [(one.process, one.slot, one.until) for one in recovery.outages]
     assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
-    assert said == recovery.outages
+    assert said == [ConnectionOutage(one.process, one.slot, one.until, one.seconds) for one in recovery.outages]

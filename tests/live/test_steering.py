@@ -92,7 +92,7 @@ class Run:
     @property
     def events(self) -> list[tuple[int, str, str]]:
         """What was done."""
-        return [(event["slot"], event["event"], event["by"]) for event in self.steering.events]
+        return [(event.slot, event.event, event.by) for event in self.steering.events]
 
 
 SET = {"link": "legitimate", "set": {"quality": 0.2}}

@@ -19,6 +19,7 @@ from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.numeric.detection import Chart
 from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection, chart_of
+from evedrop.score.summary import DetectionSummary
 from tests.builders import digests_of, part_of
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
@@ -178,13 +179,9 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
         assert chunk.alarms is not None
         detection.add(chunk.first, chunk.alarms)
     assert np.array_equal(detection.first, np.full(5, 10))
-    assert detection.summary(scenario) == {
-        "attack_from": 10,
-        "alarms": 5,
-        "false_alarms": 0,
-        "mean_delay": 1.0,
-        "first_alarm": 10,
-    }
+    assert detection.summary(scenario) == DetectionSummary(
+        attack_from=10, alarms=5, false_alarms=0, mean_delay=1.0, first_alarm=10
+    )
 
 
 @pytest.mark.parametrize(

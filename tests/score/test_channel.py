@@ -11,7 +11,7 @@ from evedrop.model.slot.account import Accountant
 from evedrop.model.slot.link import Link
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.score.channel import CONFIDENCE, channel_of, interval
+from evedrop.score.channel import CONFIDENCE, interval, link_summary_of
 from evedrop.score.sums import Tally
 from evedrop.streams import Batch
 from tests.builders import scalar_tables
@@ -79,7 +79,7 @@ def test_right_links_are_within_their_intervals() -> None:
             ],
         )
         for name in LINKS:
-            outside += channel_of(one, name, tally_of(one, name))["within_interval"] is False
+            outside += link_summary_of(one, name, tally_of(one, name)).within_interval is False
     assert outside <= 1
 
 
@@ -88,7 +88,7 @@ def test_a_link_with_another_model_is_flagged(name: str) -> None:
     """What was counted on one link is outside the interval of a model that loses otherwise."""
     one = scenario(3)
     changed = scenario(3, [{"at": 1, "link": name, "set": {"quality": 0.45}}])
-    assert channel_of(changed, name, tally_of(one, name))["within_interval"] is False
+    assert link_summary_of(changed, name, tally_of(one, name)).within_interval is False
 
 
 def test_the_interval_is_clopper_and_pearsons() -> None:
@@ -105,22 +105,24 @@ def test_the_interval_is_clopper_and_pearsons() -> None:
 
 def test_bursts_and_delays_stand_beside_their_models() -> None:
     """Mean burst length 1/r of a Gilbert link, within what 12 runs scatter; delay fractions within 5 standard errors."""
-    found = [channel_of(one := scenario(seed), "bursts", tally_of(one, "bursts")) for seed in range(12)]
-    lengths = np.array([one["mean_burst"] for one in found])
-    assert found[0]["expected_mean_burst"] == pytest.approx(1 / 0.3)
+    found = [link_summary_of(one := scenario(seed), "bursts", tally_of(one, "bursts")) for seed in range(12)]
+    lengths = np.array([one.mean_burst for one in found])
+    assert found[0].expected_mean_burst == pytest.approx(1 / 0.3)
     assert (
         abs(lengths.mean() - 1 / 0.3) < 5 * lengths.std(ddof=1) / np.sqrt(12) + 0.3
     )  # long bursts at the end are not seen
     one = scenario(5)
-    slow = channel_of(one, "slow", tally_of(one, "slow"))
+    slow = link_summary_of(one, "slow", tally_of(one, "slow"))
     total = 0.8 * one.slots * one.trials
-    for fraction, expected in zip(slow["delays"], slow["expected_delays"], strict=True):
+    assert slow.delays is not None
+    assert slow.expected_delays is not None
+    for fraction, expected in zip(slow.delays, slow.expected_delays, strict=True):
         assert abs(fraction - expected) < 5 * np.sqrt(expected * (1 - expected) / total) + 1e-12
-    assert slow["delay_quantiles"] == {"0.5": 1, "0.9": 3, "0.99": 4}
+    assert slow.delay_quantiles == {"0.5": 1, "0.9": 3, "0.99": 4}
 
 
 def test_nothing_is_said_of_what_was_not_measured() -> None:
     """Of a run that did not begin."""
     one = scenario(1)
-    found = channel_of(one, "coins", Tally(one.slots, one.trials))
-    assert (found["rate"], found["interval"], found["within_interval"], found["mean_burst"]) == (None, None, None, None)
+    found = link_summary_of(one, "coins", Tally(one.slots, one.trials))
+    assert (found.rate, found.interval, found.within_interval, found.mean_burst) == (None, None, None, None)

@@ -16,11 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.api import montecarlo, run
+from evedrop.figures.figure import ScoredSlots
 from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.receiver import Action
 from evedrop.results.writer import Results, load_results
-from evedrop.score.expectations_held import Evidence, format_expectation
+from evedrop.score.expectations_held import Evidence
+from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched import IN_STEP, Watched, WatchedSlots
@@ -109,7 +111,7 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
     unknown = found["links.naive.lost_by.nothing above 0"]
     assert (unknown["found"], unknown["held"]) == (None, None)
-    assert format_expectation(unknown).endswith(": this run does not tell")
+    assert Judged(**unknown).sentence.endswith(": this run does not tell")
     perfect = found["perfect secrecy against smart promised by theory and shown by the run"]
     assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))
@@ -147,18 +149,19 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     def watched(trials: slice, ends: list[int]) -> Watched:
         one = Watched([*watches, *steps], error[:, trials].shape[1])
         for first, end in zip([0, *ends], [*ends, 40], strict=True):
-            one.add(first, error[first:end, trials], action[first:end, trials], np.zeros(end - first))
+            nothing = np.zeros(end - first)
+            one.add(ScoredSlots(first, error[first:end, trials], action[first:end, trials], nothing, nothing))
         return one
 
     edges = [0, *sorted(blocks), 7]
     parts = Watched.of([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
     whole = watched(slice(0, 7), [])
     for watch in watches:
-        assert parts.means(watch).tolist() == whole.means(watch).tolist()
-        assert parts.mean(watch) == whole.mean(watch)
+        assert parts.tally(watch).of_trials.tolist() == whole.tally(watch).of_trials.tolist()
+        assert parts.tally(watch).value == whole.tally(watch).value
     for watch in steps:
         firsts = [next(k for k in range(watch.first, 40) if action[k, r] == Action.STATE) for r in range(7)]
-        assert parts.in_step(watch) == whole.in_step(watch) == max(firsts)
+        assert parts.tally(watch).value == whole.tally(watch).value == max(firsts)
 
 
 def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> None:
@@ -169,17 +172,17 @@ def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> No
     )
     (one,) = results.summary["expectations"]
     assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
-    assert format_expectation(one) == "expected legitimate in step by slot 3: FAILED, found none"
+    assert Judged(**one).sentence == "expected legitimate in step by slot 3: FAILED, found none"
     ranged = {"figure": "smart.used_fraction", "slots": [3, 9], "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
     short = {name: Tally(9, 1) for name in scenario.receivers}
     open_ = Secrecy("smart", Verdict.UNDECIDED, Verdict.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
-    figures = dict.fromkeys(scenario.receivers, short["smart"].figures)
-    judged = Evidence(scenario, figures, {}, short, {}, {"smart": open_}).judged("evedrop run x")
-    assert [one["held"] for one in judged] == [None] * 3
-    assert [one["found"] for one in judged[:2]] == [None] * 2
-    assert not any("replay" in one for one in judged)
+    peers = dict.fromkeys(scenario.receivers, PeerSummary({"used_fraction": 0.5}, None, False, None))
+    judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
+    assert [one.held for one in judged] == [None] * 3
+    assert [one.found for one in judged[:2]] == [None] * 2
+    assert not any("replay" in one.as_dict() for one in judged)
 
 
 @pytest.mark.parametrize(
@@ -202,14 +205,14 @@ def test_secrecy_is_held_where_theory_and_run_agree(
         claims: dict[str, Any] = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
         verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
                           trials=9, judged_by="mean")  # fmt: skip
-        (one,) = Evidence(scenario, {}, {}, {}, {}, {"smart": verdict}).judged(None)
-        assert (one["found"], one["held"]) == (found, held)
+        (one,) = Evidence(scenario, {}, {}, {}, {"smart": verdict}).judged(None)
+        assert (one.found, one.held) == (found, held)
 
 
 @pytest.mark.parametrize(
     ("account", "found", "held"),
     [
-        ({"offered": 9}, None, None),
+        ({}, None, None),
         ({"rate": 0.8, "within_interval": True}, 0.8, True),
         ({"rate": 0.2, "within_interval": False}, 0.2, False),
     ],
@@ -217,8 +220,8 @@ def test_secrecy_is_held_where_theory_and_run_agree(
 def test_a_link_must_be_within_its_interval(account: dict[str, Any], found: float | None, held: bool | None) -> None:
     """As its account says; an account that does not say leaves it open."""
     scenario = load("eavesdroppers", {"expect": [{"link": "smart"}]})
-    (one,) = Evidence(scenario, {}, {"smart": account}, {}, {}, {}).judged(None)
-    assert (one["found"], one["held"]) == (found, held)
+    (one,) = Evidence(scenario, {}, {"smart": LinkSummary(9, 9, 0, 0, 0, **account)}, {}, {}).judged(None)
+    assert (one.found, one.held) == (found, held)
 
 
 @pytest.mark.parametrize("command", ["run", "montecarlo"])
@@ -236,7 +239,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     assert "2 of 2 expectations FAILED" in done.out
     said = [line.strip() for line in done.out.splitlines()]
     for one in first:
-        assert said[said.index(format_expectation(one)) + 1] == f"see it again: {one['replay']}"
+        assert said[said.index(Judged(**one).sentence) + 1] == f"see it again: {one['replay']}"
     words = shlex.split(first[0]["replay"])
     assert words[:2] == ["evedrop", command]
     again = evedrop(*words[1:], *view, "--json", "--out", "again")

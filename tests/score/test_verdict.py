@@ -180,7 +180,7 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
     assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.HELD)
     assert found.sentence.endswith("there is no theory for these links")
-    assert (found.as_dict()["relative_by_theory"], found.as_dict()["perfect_by_theory"]) == (None, None)
+    assert (found.summary.relative_by_theory, found.summary.perfect_by_theory) == (None, None)
     nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
     assert nothing.sentence == "eve: nothing was measured; there is no theory for these links"
 

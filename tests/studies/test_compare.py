@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,7 @@ def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) ->
             assert cell.eavesdropper.mean == peer["mean_squared_error"]
             assert cell.eavesdropper.quantiles == peer["error_quantiles"]
             assert cell.legitimate.mean == alone["peers"]["legitimate"]["mean_squared_error"]
-            assert cell.secrecy.as_dict() == alone["secrecy"][cell.match.receiver]
+            assert asdict(cell.secrecy.summary) == alone["secrecy"][cell.match.receiver]
 
 
 def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
-from evedrop.score.scorekeeper import event_line
+from evedrop.score.summary import RunEvent
 from evedrop.view.replay import replay
 from tests.view.read_back import rows
 
@@ -64,5 +64,7 @@ def test_a_live_run_shows_what_was_done_to_it(evedrop: Any) -> None:
     assert [one["event"] for one in events if one["by"] == "scenario"] == ["cut legitimate"]
     assert [one["slot"] for one in events if one["event"] == "cut legitimate"] == [3]
     assert any(one["event"].startswith("link") for one in events)
-    last = {one["slot"]: event_line(one) for one in events if one["slot"]}  # the recording has the last line of a slot
+    last = {
+        one["slot"]: RunEvent(**one).line for one in events if one["slot"]
+    }  # the recording has the last line of a slot
     assert shown == {slot: [line] for slot, line in last.items()}

@@ -11,11 +11,12 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,14 +34,13 @@ from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_s
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, summary_of
+from evedrop.score.summary import Outage, RunEvent, Summary
 from evedrop.score.totals import Totals
 
 _RECORDING = "recording.rrd"
 
 
-def gather(
-    scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str
-) -> Mapping[str, Any]:
+def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str) -> Summary:
     """Fill a run's folder from those of its shards, which are then removed; returns the run's summary.
 
     started: when the first shard began, by the monotonic clock, if one did; how: as in `Ending`. Raises OSError if the folder
@@ -54,8 +54,9 @@ def gather(
     wall = 0.0 if started is None else time.monotonic() - started
     totals = Totals.merged([load_score(shard.folder, shard.scenario) for shard in shards])
     replay = replay_of(folder, scenario)
+    parts = _summaries(shards)
     ending = Ending(
-        wall, how, replay, events=_events(shards), outages=_outages(shards), misdelivered=_misdelivered(shards)
+        wall, how, replay, events=_events(parts), outages=_outages(parts), misdelivered=_misdelivered(parts)
     )
     summary = summary_of(scenario, totals, digests, ending)
     write_summary(folder, summary)
@@ -102,34 +103,33 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     return {int(start): digests[starts == start] for start in np.unique(starts)}
 
 
-def _events(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
+def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
     """The events of all shards: each once, in order of slots."""
-    found: list[Mapping[str, Any]] = []
-    for _, summary in _summaries(shards):
-        found += [one for one in summary["events"] if one not in found]
-    return sorted(found, key=lambda one: int(one["slot"]))
+    found = dict.fromkeys(event for summary in summaries.values() for event in summary.events)
+    return sorted(found, key=lambda one: one.slot)
 
 
-def _outages(shards: Sequence[Shard]) -> list[Mapping[str, Any]]:
+def _outages(summaries: Mapping[int, Summary]) -> list[Outage]:
     """The outages of all shards, each with its shard, in order of slots."""
-    found = [{"shard": shard.number, **one} for shard, summary in _summaries(shards) for one in summary["outages"]]
-    return sorted(found, key=lambda one: int(one["slot"]))
+    found = [replace(one, shard=shard) for shard, summary in summaries.items() for one in summary.outages]
+    return sorted(found, key=lambda one: one.slot)
 
 
-def _misdelivered(shards: Sequence[Shard]) -> dict[str, int]:
+def _misdelivered(summaries: Mapping[int, Summary]) -> dict[str, int]:
     """Process → messages that it dropped, in all shards together."""
-    found: dict[str, int] = {}
-    for _, summary in _summaries(shards):
-        for name, count in summary["misdelivered"].items():
-            found[name] = found.get(name, 0) + int(count)
-    return found
+    found: Counter[str] = Counter()
+    for summary in summaries.values():
+        found.update(summary.misdelivered)
+    return dict(found)
 
 
-def _summaries(shards: Sequence[Shard]) -> Iterator[tuple[Shard, Mapping[str, Any]]]:
-    """The shards that have written a summary, with it."""
+def _summaries(shards: Sequence[Shard]) -> dict[int, Summary]:
+    """Number → summary, of the shards that have written one."""
+    found = {}
     for shard in shards:
         with suppress(UsageError):
-            yield shard, load_results(shard.folder).summary
+            found[shard.number] = load_results(shard.folder).typed_summary
+    return found
 
 
 def _tidy(folder: Path, shards: Sequence[Shard]) -> None:

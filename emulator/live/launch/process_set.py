@@ -11,7 +11,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
@@ -126,7 +126,7 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
 
     left_behind = is_unfinished(folder)
     try:
-        summary = {**load_results(folder).summary, "ended": how}
+        summary = replace(load_results(folder).typed_summary, ended=how)
     except UsageError:
         totals = Totals.nothing(scenario, scenario.trials)
         summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))

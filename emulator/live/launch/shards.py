@@ -187,4 +187,4 @@ def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course:
         raise RunError(how)
     if course.failures:
         raise course.failures[0][1]
-    return 1 if any(expectation["held"] is False for expectation in summary["expectations"]) else 0
+    return 1 if summary.failed_expectations else 0

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, final
@@ -43,7 +44,8 @@ from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
-from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, event_line, summary_of
+from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, summary_of
+from evedrop.score.summary import Outage, RunEvent, Summary
 from evedrop.view.scored_slots import open_recording, showing_of, shown
 from evedrop.view.viewer import Viewer, WebAddress
 
@@ -70,7 +72,7 @@ class ObservedRun:
         """by_hand: whether the processes were started by hand, so that there is no launcher to end them."""
         self._place = Path(brief.part.results)
         self._held: HeldFolder | None = None
-        self._final: dict[str, Any] | None = None
+        self._final: Summary | None = None
         self._brief = brief
         self._by_hand = by_hand
         self._scenario = scenario
@@ -84,7 +86,7 @@ class ObservedRun:
         self._digest_rows = DigestRows(self._joiner.digests, scenario.first_trial)
         self._confirmations = confirmations
         self._steering: Steering
-        self._events: list[dict[str, Any]] = []
+        self._events: list[RunEvent] = []
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: ViewRecording | None = None
@@ -96,7 +98,7 @@ class ObservedRun:
         """Processes whose misbehaviour ended the run."""
         self._recovery: Recovery
         self._stall: Stall
-        self._outages: Sequence[Mapping[str, object]] = ()
+        self._outages: list[Outage] = []
         self._misdelivered: dict[str, int] = {}
         self._due: dict[str, GapDetector] = {}
         self._recent: tuple[float, int] = (self._started, 0)
@@ -129,7 +131,7 @@ class ObservedRun:
                 self._showing = showing_of(self._scenario)
                 path = self.folder / "recording.rrd"
                 self._recording = open_recording(
-                    self._scenario, self._brief.run, path, lambda text: tell("view", address=None, warning=text)
+                    self._scenario, self._brief.run, path, lambda text: tell(ViewOpened(None, text))
                 )
             self._steering = Steering(self._scenario, conductor, tell, self._keep)
             patience = self._brief.flow.longest_outage
@@ -162,7 +164,7 @@ class ObservedRun:
             finally:
                 self._dismiss(conductor)
                 self._recovery.give_up(self._joiner.done)
-                self._outages = self._recovery.account()
+                self._outages = self._recovery.outages
                 self._ended = time.monotonic()
             tell(RunOver())
             try:
@@ -201,7 +203,7 @@ class ObservedRun:
         for event in self._steering.events[len(self._events) :]:
             self._events.append(event)
             if self._recording is not None:
-                self._recording.note(event["slot"], "INFO", event_line(event))
+                self._recording.note(event.slot, "INFO", event.line)
 
     def _answer(self, conductor: Conductor, question: Question) -> None:
         """Take a question of the operator; a malformed one is refused and does not harm the run."""
@@ -326,12 +328,12 @@ class ObservedRun:
         except OSError as error:
             raise RunError(unwritten(error)) from error
 
-    def _so_far(self) -> dict[str, Any]:
+    def _so_far(self) -> Summary:
         """The summary of the slots so far."""
         self._ended = time.monotonic()
         return self._summary("")
 
-    def _summary(self, how: str) -> dict[str, Any]:
+    def _summary(self, how: str) -> Summary:
         """The summary; a shard also dumps its score, for the summary of the whole run."""
         folder = self.folder
         if self._brief.part.shard:
@@ -362,14 +364,13 @@ class ObservedRun:
         """
         safe = self._recording.close() if self._recording is not None else True
         try:
-            summary = {**(self._final or self._summary(how)), "ended": how}
-            if status == 0 and any(link["unexplained"] for link in summary["links"].values()):
+            summary = self._final or self._summary(how)
+            if status == 0 and any(link.unexplained for link in summary.links.values()):
                 status = RunError.exit_status
-                summary["ended"] = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
-            if status == 0 and any(expectation["held"] is False for expectation in summary["expectations"]):
+                how = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+            if status == 0 and summary.failed_expectations:
                 status = 1
-            how = str(summary["ended"])
-            write_summary(self.folder, summary)
+            write_summary(self.folder, replace(summary, ended=how))
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None

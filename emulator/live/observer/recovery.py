@@ -16,10 +16,10 @@ from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
-from evedrop.live.protocol.brief_entries import plain
 from evedrop.live.protocol.commands import Again
 from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.names import OBSERVER, RELAY, ROUTER
+from evedrop.score.summary import Outage
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
 _IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before a round is tried
@@ -51,7 +51,7 @@ class Recovery:
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
-        self.outages: list[ConnectionOutage] = []
+        self.outages: list[Outage] = []
         """All outages so far."""
 
     def look(self, done: int) -> None:
@@ -91,9 +91,9 @@ class Recovery:
     def _close(self, done: int, now: float) -> None:
         """Record the outages that ended, now that the run goes on."""
         for name, (slot, since) in self._back.items():
-            outage = ConnectionOutage(name, slot, done, now - since)
+            outage = Outage(name, slot, done, now - since)
             self.outages.append(outage)
-            self._say(outage)
+            self._say(ConnectionOutage(outage.process, outage.slot, outage.until, outage.seconds))
         self._back = {}
 
     def _miss(self, done: int, now: float) -> None:
@@ -146,9 +146,5 @@ class Recovery:
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
-        self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
+        self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
-
-    def account(self) -> list[dict[str, object]]:
-        """The outages in the form of the summary."""
-        return [plain(outage) for outage in self.outages]

@@ -5,8 +5,10 @@ Source: docs/protocol.md.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
+from evedrop.figures.links import LinkAccount
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.scenario import Scenario
@@ -19,9 +21,9 @@ def status_of(
     """The status of a run; done: how many slots are done; rate: slots per second."""
     links = {}
     for name, tally in totals.tallies.items():
-        account = tally.link
-        fraction = account["delivered"] / account["offered"] if account["offered"] else None
-        links[name] = {"offered": account["offered"], "delivered": account["delivered"], "fraction": fraction}
+        account = LinkAccount.of(tally)
+        fraction = account.delivered / account.offered if account.offered else None
+        links[name] = {"offered": account.offered, "delivered": account.delivered, "fraction": fraction}
     return {
         "slot": done,
         "slots": scenario.slots,
@@ -29,5 +31,5 @@ def status_of(
         "state": "paused" if steering.paused else "running" if steering.at is None else "held",
         "processes": conductor.processes,
         "links": links,
-        "events": steering.events,
+        "events": [asdict(event) for event in steering.events],
     }

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, final
+from typing import final
 
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.session import READY_SECONDS
@@ -24,6 +24,7 @@ from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
 from evedrop.scenario.timeline import Act, acts_of
+from evedrop.score.summary import RunEvent
 
 _PROCESS_ACTS = ("kill", "restart", "pause", "resume")
 
@@ -61,8 +62,8 @@ class Steering:
         """The last go, as the sensor was told it."""
         self.paused = False
         """Whether the run stays held until the operator resumes it."""
-        self.events: list[dict[str, Any]] = []
-        """The events so far: each with its slot, and whether the scenario or the operator caused it."""
+        self.events: list[RunEvent] = []
+        """The events so far."""
 
     def held(self, k: int) -> None:
         """The sensor holds before slot k. It may report this more than once."""
@@ -231,7 +232,7 @@ class Steering:
         self._step = None
 
     def _note(self, k: int, said: str, by: str) -> None:
-        self.events.append({"slot": k, "event": said, "by": by})
+        self.events.append(RunEvent(k, said, by))
 
     def _release(self) -> None:
         self.at = None

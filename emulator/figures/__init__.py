@@ -1,0 +1,92 @@
+"""The figures of receivers, by their name in the summary. To add one, write a class and add it to `_BUILT_IN`.
+
+An installed package adds one by an entry point of the group `evedrop.figures`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from evedrop.errors import NotRegistered
+from evedrop.figures.covariances import ExpectedTraceCovariance, MeanTraceCovariance
+from evedrop.figures.errors import MeanActualTraceCovariance, MeanSquaredError
+from evedrop.figures.figure import Figure, FigureColumn
+from evedrop.figures.packets import ReceivedFraction, UsedFraction
+from evedrop.model.registry import Registry
+from evedrop.names import LEGITIMATE
+
+_BUILT_IN: Mapping[str, type[Figure]] = {
+    "mean_squared_error": MeanSquaredError,
+    "mean_trace_covariance": MeanTraceCovariance,
+    "expected_trace_covariance": ExpectedTraceCovariance,
+    "received_fraction": ReceivedFraction,
+    "used_fraction": UsedFraction,
+    "mean_actual_trace_covariance": MeanActualTraceCovariance,
+}
+
+FIGURES: Registry[Figure] = Registry(
+    "figure",
+    Figure,  # type: ignore[type-abstract]
+    "evedrop.figures",
+    _BUILT_IN,
+)
+"""By the name in the summary."""
+
+_TAKEN = ("error_quantiles", "infinite_variance", "digest")
+"""Other entries of a receiver in the summary."""
+
+
+def figure(name: str) -> type[Figure]:
+    """A figure by its name. Raises NotRegistered if there is none, or if it cannot be loaded."""
+    if name in _TAKEN or not name.isidentifier():
+        wanted = "; expected a name of letters, digits and _ that no other entry of a receiver in the summary has"
+        raise NotRegistered(name, wanted)
+    return FIGURES[name]
+
+
+def all_figures() -> dict[str, type[Figure]]:
+    """Name → every figure that can be loaded: the built-in ones in their order, then those of installed packages."""
+    left_out = unloadable_figures()
+    return {name: figure(name) for name in _names() if name not in left_out}
+
+
+def unloadable_figures() -> dict[str, str]:
+    """The figures of installed packages that cannot be loaded, with the reason, in words that follow the name."""
+    found = {}
+    for name in _names():
+        try:
+            figure(name)
+        except NotRegistered as error:
+            found[name] = error.why
+    return found
+
+
+def figures_of(receiver: str) -> dict[str, type[Figure]]:
+    """Name → figure, of a receiver of this name."""
+    return {name: one for name, one in all_figures().items() if one.of == "receiver" or receiver != LEGITIMATE}
+
+
+def expectable_figures() -> dict[str, type[Figure]]:
+    """Name → figure, for all that an expectation can name."""
+    return {name: one for name, one in all_figures().items() if one.only_in_mode is None}
+
+
+def columns(where: Literal["column", "sweep_column"], mode: str | None = None) -> dict[FigureColumn, list[str]]:
+    """The columns of the closing table of a mode, or of a sweep's, in order → the figures that share each."""
+    found: dict[FigureColumn, list[str]] = {}
+    for name, one in all_figures().items():
+        column: FigureColumn | None = getattr(one, where)
+        there = mode is None or (mode != one.not_in_mode and one.only_in_mode in {None, mode})
+        if column is not None and there:
+            found.setdefault(column, []).append(name)
+    return dict(sorted(found.items(), key=lambda item: item[0].place))
+
+
+def shown_figure(row: Mapping[str, Any], names: Sequence[str]) -> float | None:
+    """The figure that a column or a curve shows: the first that there is among those that share it."""
+    return next((float(row[name]) for name in names if row.get(name) is not None), None)
+
+
+def _names() -> list[str]:
+    return list(dict.fromkeys([*FIGURES, *FIGURES.names]))

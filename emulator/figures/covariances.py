@@ -1,0 +1,82 @@
+"""The error covariance that a receiver believes, and the one that theory expects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+
+from evedrop.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ReceiverTotals, ScoredSlots
+from evedrop.model.process import Floats
+
+
+@final
+class MeanTraceCovariance(MeanFigure):
+    """The mean of tr P that the receiver believes."""
+
+    meaning = "of tr P, the error covariance that the receiver believes"
+    from_totals = True
+    by_trial = False
+    rests_on = "recorded trials"
+    column = FigureColumn("believed tr P", 3)
+    sweep_column = FigureColumn("believed tr P", 2)
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """Its mean over the run."""
+        return totals.trace / max(1, totals.offered)
+
+    @staticmethod
+    def values(slots: ScoredSlots) -> Floats:
+        """Its sum over trials, (c, 1)."""
+        return slots.trace[:, None]
+
+
+@final
+class ExpectedTraceCovariance(Figure):
+    """The mean trace of the actual error covariance that theory expects."""
+
+    meaning = (
+        "theory: trace of the expected actual error covariance over the same slots; null where there is no theory for "
+        "the losses of its link, or no closed form for its strategy"
+    )
+    from_totals = True
+    needs_theory = True
+    rests_on = "theory"
+    column = FigureColumn("expected tr P", 4)
+    sweep_column = FigureColumn("expected tr P", 1)
+    sweep_picture = "lines"
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """Its mean over the run; NaN without theory."""
+        return totals.expected_trace / max(1, totals.offered)
+
+    @classmethod
+    def tally(cls, trials: int) -> FigureTally:
+        """Traces of no slots yet."""
+        del trials
+        return ExpectedTraces()
+
+
+@final
+class ExpectedTraces(FigureTally):
+    """The expected traces of some slots, which are the same for all trials."""
+
+    def __init__(self) -> None:
+        self._traces: list[Floats] = []
+
+    def add(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+        self._traces.append(slots.expected.copy())
+
+    @classmethod
+    def merged(cls, parts: Sequence[ExpectedTraces]) -> ExpectedTraces:
+        """Those of the first set of trials."""
+        return parts[0]
+
+    @property
+    def value(self) -> float | None:
+        """Their mean."""
+        return float(np.mean(np.concatenate(self._traces))) if self._traces else None

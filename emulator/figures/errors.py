@@ -1,0 +1,45 @@
+"""The actual error of a receiver."""
+
+from __future__ import annotations
+
+from typing import final
+
+from evedrop.figures.figure import COVARIANCE_ONLY, FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots
+from evedrop.model.process import Floats
+
+
+class MeanError(MeanFigure):
+    """The mean of the error of the mode."""
+
+    from_totals = True
+    sweep_column = FigureColumn("mean error", 0)
+    sweep_picture = "marks"
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """Its mean over the run."""
+        return totals.error / max(1, totals.offered)
+
+    @staticmethod
+    def values(slots: ScoredSlots) -> Floats:
+        """The error, (c, R)."""
+        return slots.error
+
+
+@final
+class MeanSquaredError(MeanError):
+    """The mean of |x − x̂|²."""
+
+    meaning = "of |x − x̂|²; null in a covariance-only study"
+    not_in_mode = COVARIANCE_ONLY
+    rests_on = "observer"
+    column = FigureColumn("mean |x−x̂|²", 2)
+
+
+@final
+class MeanActualTraceCovariance(MeanError):
+    """The mean trace of the actual error covariance given the events."""
+
+    meaning = "in a covariance-only study, of the trace of the actual error covariance given the events"
+    only_in_mode = COVARIANCE_ONLY
+    column = FigureColumn("actual tr P", 2)

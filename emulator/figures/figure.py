@@ -1,0 +1,213 @@
+"""What a figure is: a number that the summary has for every receiver, or for every eavesdropper.
+
+A figure says itself how it is added, merged, checked and shown. Nothing else compares its name.
+
+Source: docs/results.md, summary.json; docs/your-own.md, a figure.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, NamedTuple, Self, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+
+Late = Sequence[NDArray[np.uint16]] | NDArray[np.uint16]
+COVARIANCE_ONLY = "covariance-only"
+"""The mode without errors."""
+
+
+@dataclass(frozen=True)
+class ScoredSlots:
+    """One receiver over c consecutive slots of R trials."""
+
+    first: int
+    """The first of the slots."""
+    error: Floats
+    """Squared error, or tr of the actual covariance in a covariance-only study, (c, R)."""
+    action: Codes
+    """(c, R)."""
+    trace: Floats
+    """Believed tr P, summed over trials, which is all that a live run knows, (c,)."""
+    expected: Floats
+    """Theory: trace of the expected actual error covariance, (c,)."""
+    late: Late | None = None
+    """Packets of earlier slots that arrived, and that were used, (c, R) each; None if the receiver accepts none."""
+    x: Floats | None = None
+    """True states, (c, n, R); None in modes without states."""
+    x_hat: Floats | None = None
+    """Estimates, (c, n, R); None in modes without states."""
+
+    @property
+    def trials(self) -> int:
+        """The number of trials."""
+        return int(self.error.shape[1])
+
+    def part(self, start: int, stop: int) -> ScoredSlots:
+        """Some of the slots, counted from the first."""
+        rows = slice(start, stop)
+        return replace(
+            self,
+            first=self.first + start,
+            error=self.error[rows],
+            action=self.action[rows],
+            trace=self.trace[rows],
+            expected=self.expected[rows],
+            late=None if self.late is None else [one[rows] for one in self.late],
+            x=None if self.x is None else self.x[rows],
+            x_hat=None if self.x_hat is None else self.x_hat[rows],
+        )
+
+
+class FigureTally(ABC):
+    """A figure's totals over a set of trials, whose slots come in order. Pickled between processes.
+
+    A trial's numbers should be added slot by slot, so that they have the same bits however slots and trials were divided.
+    """
+
+    @abstractmethod
+    def add(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+
+    @classmethod
+    @abstractmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """The totals of disjoint sets of trials, in their order."""
+
+    @property
+    @abstractmethod
+    def value(self) -> float | None:
+        """The figure over the slots so far; None if there is none."""
+
+    @property
+    def of_trials(self) -> Floats:
+        """The figure of every trial, (R,); only a figure `by_trial` has it."""
+        raise NotImplementedError
+
+
+@dataclass(kw_only=True)
+class ReceiverTotals:
+    """What is counted of every receiver. Each entry is a sum over slots and trials."""
+
+    offered: int = 0
+    """Slots times trials, which is the number of packets, except those that were not sent."""
+    unsent: int = 0
+    error: float = 0.0
+    trace: float = 0.0
+    expected_trace: float = 0.0
+    received: int = 0
+    used: int = 0
+    unexplained: int = 0
+    """Packets for which journal and receiver disagree."""
+    late: int = 0
+    """Packets that arrived after their own slot, within the window; `late_used`: those of them that were used."""
+    late_used: int = 0
+    late_sent: int = 0
+    """Packets that the router let through, but for a later slot."""
+    lost: dict[str, int] = field(default_factory=dict)
+
+
+class FigureColumn(NamedTuple):
+    """A column of a table in the terminal. Figures with the same heading share a column, for no run has both."""
+
+    heading: str
+    place: int = 99
+    """Columns stand in this order."""
+    format: str = ".4g"
+
+
+class Figure(ABC):
+    """A number of a receiver. A class, never an instance, is registered; its name in the registry is that in the summary."""
+
+    of: ClassVar[Literal["receiver", "eavesdropper"]] = "receiver"
+    """Whose figure it is."""
+    meaning: ClassVar[str] = ""
+    """What it is, with its unit."""
+    from_totals: ClassVar[bool] = False
+    """Whether a whole run's figure is computed by `of_totals`; otherwise it is the value of a tally of its own."""
+    by_trial: ClassVar[bool] = False
+    """Whether every trial has it, so that it has quantiles over trials."""
+    needs_states: ClassVar[bool] = False
+    """Whether it needs states and estimates; it is null in modes without them."""
+    needs_theory: ClassVar[bool] = False
+    """Whether it is null for a receiver without theory."""
+    only_in_mode: ClassVar[str | None] = None
+    """The only mode whose summaries have it; no expectation can name such a figure."""
+    not_in_mode: ClassVar[str | None] = None
+    """The mode in which it is null."""
+    rests_on: ClassVar[Literal["observer", "recorded trials", "receiver", "theory"]] = "receiver"
+    """Who knows it in a live run: the observer for all trials, the observer for recorded trials, or the receiver alone."""
+    column: ClassVar[FigureColumn | None] = None
+    """Its column of the closing table."""
+    sweep_column: ClassVar[FigureColumn | None] = None
+    """Its column of the printed table of a sweep. The table on disk has every figure."""
+    sweep_picture: ClassVar[Literal["marks", "lines"] | None] = None
+    """How the picture of a sweep shows it, if it does."""
+
+    @classmethod
+    @abstractmethod
+    def tally(cls, trials: int) -> FigureTally:
+        """Totals over no slots yet. Expectations over some slots use it too."""
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """The figure of a whole run from what is counted of every receiver; NaN where there is none."""
+        raise NotImplementedError
+
+
+@final
+class MeanTally(FigureTally):
+    """Sums over slots of a value, trial by trial or of all trials together."""
+
+    def __init__(self, values: Callable[[ScoredSlots], Floats], trials: int, by_trial: bool) -> None:
+        """values: (c, R), or sums over trials, (c, 1), unless by_trial."""
+        self._values, self._trials, self._by_trial = values, trials, by_trial
+        self._sums = np.zeros(trials if by_trial else 1)
+        self._slots = 0
+
+    def add(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+        self._slots += len(slots.error)
+        for row in self._values(slots):
+            self._sums += row
+
+    @classmethod
+    def merged(cls, parts: Sequence[MeanTally]) -> MeanTally:
+        """The sums of disjoint sets of trials, in their order."""
+        whole = cls(parts[0]._values, sum(part._trials for part in parts), parts[0]._by_trial)
+        sums = [part._sums for part in parts]
+        whole._sums = np.concatenate(sums) if whole._by_trial else np.sum(sums, axis=0)
+        whole._slots = min(part._slots for part in parts)
+        return whole
+
+    @property
+    def of_trials(self) -> Floats:
+        """The mean over the slots, for each trial, (R,)."""
+        return self._sums / self._slots
+
+    @property
+    def value(self) -> float | None:
+        """The mean over slots and trials."""
+        return float(self.of_trials.sum()) / self._trials if self._slots else None
+
+
+class MeanFigure(Figure):
+    """A mean over slots and trials."""
+
+    by_trial = True
+
+    @staticmethod
+    @abstractmethod
+    def values(slots: ScoredSlots) -> Floats:
+        """The value in every slot and trial, (c, R); or its sum over trials, (c, 1), of a figure that is not `by_trial`."""
+
+    @classmethod
+    def tally(cls, trials: int) -> FigureTally:
+        """Sums over no slots yet."""
+        return MeanTally(cls.values, trials, cls.by_trial)

@@ -1,0 +1,295 @@
+"""The summary of a run, as summary.json has it, with types.
+
+Each class here is one entry; its fields are the entry's keys, in their order. Entries of applications and figures of receivers
+are open: packages add to them.
+
+Source: docs/results.md, summary.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from evedrop.figures.links import LinkAccount
+from evedrop.scenario import application
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+Found = float | int | str | None
+"""A value that an expectation found. None: the run does not tell, or a receiver that must be in step never was."""
+
+
+@dataclass(frozen=True)
+class PeerSummary:
+    """A receiver."""
+
+    figures: Mapping[str, float | None]
+    """By their names in `evedrop.figures`; None where there is none."""
+    error_quantiles: Mapping[str, float] | None
+    infinite_variance: bool
+    digest: str | None
+    mode_figures: Mapping[str, float | None] = field(default_factory=dict)
+    """The figures that only the run's mode has."""
+
+    @property
+    def all_figures(self) -> dict[str, float | None]:
+        """The figures, and those of the mode."""
+        return {**self.figures, **self.mode_figures}
+
+    def figure(self, name: str) -> float | None:
+        """A figure by its name; None if there is none."""
+        return self.all_figures.get(name)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry of summary.json."""
+        own = {name: getattr(self, name) for name in _PEER}
+        return {**self.figures, **own, **self.mode_figures}
+
+
+_PEER = ("error_quantiles", "infinite_variance", "digest")
+
+
+@dataclass(frozen=True)
+class LinkSummary(LinkAccount):
+    """A link: its account, and what its models say of it. None where nothing was measured, or nothing is known."""
+
+    lost_by: Mapping[str, int] = field(default_factory=dict)
+    """Reason → packets."""
+    rate: float | None = None
+    """The fraction of packets that the loss model let through; `expected_rate`: the same by the model."""
+    expected_rate: float | None = None
+    interval: tuple[float, float] | None = None
+    """For the model's rate given the packets observed, at 99.9 % confidence."""
+    within_interval: bool | None = None
+    bursts: Sequence[int] = ()
+    """Runs of consecutive losses by their length, from 1 on."""
+    mean_burst: float | None = None
+    expected_mean_burst: float | None = None
+    delays: Sequence[float] | None = None
+    """Fractions of the delivered packets by delay in slots, the last for delays beyond the window."""
+    expected_delays: Sequence[float] | None = None
+    delay_quantiles: Mapping[str, int | None] | None = None
+
+
+@dataclass(frozen=True)
+class RunEvent:
+    """An event during the run."""
+
+    slot: int
+    event: str
+    by: str
+    """`scenario` or `operator`."""
+
+    @property
+    def line(self) -> str:
+        """The event as a line of the view."""
+        return self.event if self.by == "scenario" else f"{self.event} (by the {self.by})"
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A process that was cut off from the network."""
+
+    process: str
+    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
+    slot: int
+    """The first slot that was not joined when the loss was noticed."""
+    until: int | None
+    """The first slot that was not joined when the run went on; None if it did not."""
+    seconds: float
+    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
+    shard: int | None = None
+    """None in a run without shards, whose entry lacks it."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry of summary.json."""
+        entry = {name: value for name, value in asdict(self).items() if name != "shard"}
+        return entry if self.shard is None else {"shard": self.shard, **entry}
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was verified of a receiver's report."""
+
+    recomputed_trials: int
+    verified: Sequence[str]
+    own_word: Sequence[str]
+
+
+@dataclass(frozen=True)
+class SecrecySummary:
+    """The verdict on an eavesdropper."""
+
+    relative: str
+    perfect: str
+    relative_by_theory: bool | None
+    relative_from: int | None
+    perfect_by_theory: bool | None
+    judged_by: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class DetectionSummary:
+    """Attacks that the sensor detected."""
+
+    attack_from: int | None
+    alarms: int
+    false_alarms: int
+    mean_delay: float | None
+    first_alarm: int | None
+
+
+@dataclass(frozen=True)
+class ControllerSummary:
+    """The closed loop."""
+
+    strategy: str
+    period: int
+    acts_on: str
+    knows_input: bool
+    decisions: int
+    mean_solve_seconds: float | None
+    longest_solve_seconds: float
+    failed_fraction: float | None
+    clipped_fraction: float | None
+    mean_squared_errors: Mapping[str, float | None]
+    mean_trace_covariance: float | None
+    digest: str | None
+
+
+@dataclass(frozen=True)
+class FilterSummary:
+    """Errors against the true state, with a sensor that filters."""
+
+    mean_trace_covariance: float | None
+    mean_squared_error: float | None
+    mean_true_squared_errors: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Surprising:
+    """The trial that is furthest off."""
+
+    trial: int
+    receiver: str
+    mean_error: float
+    median: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An expectation, and whether it held."""
+
+    text: str
+    held: bool | None
+    """None: the run does not tell."""
+    found: Found
+    wanted: str
+    replay: str | None = None
+    """The command that reproduces a failure; an entry without one lacks it."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry of summary.json."""
+        return {name: value for name, value in asdict(self).items() if name != "replay" or value is not None}
+
+    @property
+    def sentence(self) -> str:
+        """The expectation as a sentence of the closing report."""
+        word = {True: "held", False: "FAILED", None: "this run does not tell"}[self.held]
+        said = f"expected {self.text}: {word}"
+        if self.found is None:
+            return said + (", found none" if self.held is False else "")
+        if isinstance(self.found, str) and self.found not in {"inf", "-inf", "nan"}:
+            return f"{said}, found {self.found}"
+        number = str(self.found) if isinstance(self.found, int) else f"{float(self.found):.6g}"
+        return f"{said}, found {number}"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A run."""
+
+    scenario: str
+    mode: str
+    seed: int
+    slots: int
+    trials: int
+    first_trial: int
+    wall_seconds: float
+    slots_per_second: float
+    ended: str
+    peers: Mapping[str, PeerSummary]
+    links: Mapping[str, LinkSummary]
+    events: Sequence[RunEvent]
+    outages: Sequence[Outage]
+    verification: Mapping[str, Verification] | None
+    misdelivered: Mapping[str, int]
+    secrecy: Mapping[str, SecrecySummary]
+    detection: DetectionSummary | None
+    controller: ControllerSummary | None
+    filter: FilterSummary | None
+    applications: Mapping[str, application.Summary]
+    """Application → its entry, which stands among the others in summary.json."""
+    surprising: Surprising | None
+    expectations: Sequence[Judged]
+
+    @property
+    def failed_expectations(self) -> int:
+        """The number of expectations that did not hold."""
+        return [one.held for one in self.expectations].count(False)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contents of summary.json; infinite and undefined numbers as they are."""
+        found: dict[str, Any] = {}
+        for one in fields(self):
+            value = getattr(self, one.name)
+            found |= value if one.name == _OPEN else {one.name: _entry(value)}
+        return found
+
+    @classmethod
+    def read(cls, found: Mapping[str, Any]) -> Summary:
+        """The summary in the contents of a summary.json.
+
+        Raises KeyError for a missing entry, and TypeError or ValueError for a value of another type.
+        """
+        own = {one.name: found[one.name] for one in fields(cls) if one.name != _OPEN}
+        others = {name: value for name, value in found.items() if name not in own}
+        peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
+        return _adapter().validate_python({**own, "peers": peers, _OPEN: others})
+
+
+_OPEN = "applications"
+
+
+def _entry(value: Any) -> Any:
+    """An entry, or several, in the form of summary.json."""
+    if isinstance(value, (PeerSummary, Outage, Judged)):
+        return value.as_dict()
+    if isinstance(value, Mapping):
+        return {name: _entry(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_entry(inner) for inner in value]
+    return asdict(value) if hasattr(value, "__dataclass_fields__") else value
+
+
+def _peer_fields(peer: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of `PeerSummary` in a receiver's entry: figures come before its other entries, those of a mode after them."""
+    names = list(peer)
+    start, stop = names.index(_PEER[0]), names.index(_PEER[-1])
+    return {
+        "figures": {name: peer[name] for name in names[:start]},
+        **{name: peer[name] for name in _PEER},
+        "mode_figures": {name: peer[name] for name in names[stop + 1 :]},
+    }
+
+
+@cache
+def _adapter() -> TypeAdapter[Summary]:
+    from pydantic import TypeAdapter  # noqa: PLC0415 - as slow to build as to import, and only readers need it
+
+    return TypeAdapter(Summary)

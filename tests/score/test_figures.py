@@ -1,0 +1,136 @@
+"""Figures of installed packages: the one of the docs, in every kind of run, and the facts that a figure says of itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from evedrop.figures import FIGURES, figure, figures_of
+from evedrop.figures.figure import ScoredSlots
+from evedrop.results.writer import load_results
+from tests.conftest import Evedrop
+
+DOCS = Path(__file__).parents[2] / "docs"
+RUN = ("--slots", "40", "--trials", "510")
+EXPECT = (
+    "--set", "expect.0={figure = 'smart.largest_error', above = 0.0}",
+    "--set", "expect.1={figure = 'smart.largest_error', below = 0.0, slots = [10, 30]}",
+    "--set", "expect.2={figure = 'smart.largest_error', above = 0.0, quantile = 0.5}",
+)  # fmt: skip
+
+
+def installed(evedrop: Evedrop, module: str, name: str = "largest_error") -> dict[str, str]:
+    """The environment in which a package that has this module adds a figure by its metadata."""
+    (evedrop.folder / "largest.py").write_text(module)
+    about = evedrop.folder / "largest-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: largest\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[evedrop.figures]\n{name} = largest:LargestError\n")
+    return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+
+
+def of_the_docs() -> str:
+    """The module of docs/your-own.md."""
+    return (DOCS / "your-own.md").read_text(encoding="utf-8").partition("# largest.py\n")[2].partition("```")[0]
+
+
+def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
+    """One file and one line of metadata: the same number live, in memory with two workers, and in shards; judged and shown."""
+    environment = installed(evedrop, of_the_docs())
+    runs = {
+        "live": ("run", "eavesdroppers", "--view", "off", *RUN),
+        "memory": ("montecarlo", "eavesdroppers", "--workers", "2", "--record-trials", "510", *RUN),
+        "shards": ("run", "eavesdroppers", "--view", "off", "--set", "shards=2", *RUN),
+    }
+    found, judged = {}, {}
+    for name, arguments in runs.items():
+        done = evedrop.process(*arguments, *EXPECT, "--out", name, env=environment)
+        assert done.status == 1, done.err
+        assert "largest |x−x̂|²" in done.out
+        summary = load_results(evedrop.folder / name).summary
+        found[name] = {receiver: peer["largest_error"] for receiver, peer in summary["peers"].items()}
+        judged[name] = [(one["held"], one["found"]) for one in summary["expectations"]]
+    assert found["live"] == found["memory"] == found["shards"]
+    assert judged["live"] == judged["memory"] == judged["shards"]
+    rows = [row for row in load_results(evedrop.folder / "memory").trials.to_pylist() if row["peer"] == "smart"]
+    errors = np.empty((40, 510))
+    for row in rows:
+        errors[row["slot"], row["trial"]] = row["squared_error"]
+    assert found["live"]["smart"] == errors.max()
+    assert judged["live"] == [
+        (True, errors.max()), (False, errors[10:30].max()), (True, np.quantile(errors.max(axis=0), 0.5)),
+    ]  # fmt: skip
+    done = evedrop.process(
+        "sweep", "eavesdroppers", "--over", "slots=20,40", "--trials", "510", "--out", "swept", env=environment
+    )
+    assert done.status == 0, done.err
+    assert "largest error" in done.out
+    table = pq.read_table(evedrop.folder / "swept" / "sweep.parquet").to_pylist()
+    assert {row["peer"]: row["largest_error"] for row in table if row["slots"] == 40} == found["memory"]
+    assert "largest_error" not in FIGURES.names
+
+
+def test_a_figure_that_needs_states_is_null_without_them(evedrop: Evedrop) -> None:
+    """And one of eavesdroppers is not the legitimate estimator's."""
+    facts = "    needs_states = True\n    of = 'eavesdropper'\n    by_trial = True\n"
+    environment = installed(evedrop, of_the_docs().replace("    by_trial = True\n", facts))
+    done = evedrop.process(
+        "montecarlo", "eavesdroppers", "--slots", "9", "--trials", "2", "--covariance-only", "--json", env=environment
+    )
+    peers = json.loads(done.out)["peers"]
+    assert peers["smart"]["largest_error"] is None
+    assert "largest_error" not in peers["legitimate"]
+    expect = "expect.0={figure = 'legitimate.largest_error', below = 1.0}"
+    done = evedrop.process("check", "eavesdroppers", "--set", expect, env=environment)
+    assert (done.status, "did you mean" in done.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "said"),
+    [
+        ("largest_error", "raise RuntimeError('not today')\n", "cannot be imported (RuntimeError: not today"),
+        ("digest", of_the_docs(), "; expected a name of letters, digits and _"),
+    ],
+)
+def test_a_figure_that_cannot_be_loaded_is_left_out(evedrop: Evedrop, name: str, module: str, said: str) -> None:
+    """The closing report says why; an expectation that names it is a mistake, with the reason."""
+    environment = installed(evedrop, module, name)
+    run = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "2")
+    done = evedrop.process(*run, env=environment)
+    assert done.status == 0, done.err
+    assert f"the figure {name} is left out" in done.out
+    assert said in done.out
+    done = evedrop.process(*run, "--set", f"expect.0={{figure = 'smart.{name}', below = 1.0}}", env=environment)
+    assert done.status == 2
+    assert said in done.err
+
+
+def test_docs_say_of_every_figure_what_it_says_itself() -> None:
+    """In the table of docs/results.md, and in the entry of docs/scenario.md those that an expectation can name."""
+    results, scenario = ((DOCS / page).read_text(encoding="utf-8") for page in ("results.md", "scenario.md"))
+    for name in FIGURES:
+        meaning = figure(name).meaning.replace("|", "\\|")
+        assert f"\n| `{name}` | {meaning} |\n" in results
+        assert (f"`{name}`" in scenario) == (figure(name).only_in_mode is None)
+
+
+@pytest.mark.parametrize("name", [name for name, one in figures_of("smart").items() if one.only_in_mode is None])
+def test_a_figure_over_all_slots_is_that_of_the_totals(name: str) -> None:
+    """Kept by its tally, or computed from what is counted of every receiver."""
+    from evedrop.score.sums import Tally, slot_sums
+
+    draw = np.random.default_rng(2)
+    error, action = draw.lognormal(size=(30, 4)), draw.integers(0, 4, (30, 4)).astype(np.uint8)
+    trace, expected = draw.lognormal(size=(30, 2)), draw.lognormal(size=30)
+    tally, kept = Tally(30, 4), figure(name).tally(4)
+    tally.add(0, error, slot_sums(error, action, trace), expected)
+    for first in (0, 11):
+        rows = slice(first, 11 if first == 0 else 30)
+        kept.add(ScoredSlots(first, error[rows], action[rows], trace[rows, 0], expected[rows]))
+    value: Any = tally.figure(name)
+    assert kept.value == pytest.approx(value, rel=1e-12)

@@ -1,0 +1,100 @@
+"""The typed summary: what was written is read with types, and written again to the byte; nothing else is read."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.api import montecarlo
+from evedrop.errors import UsageError
+from evedrop.figures import FIGURES, figure
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.results.reading import Results
+from evedrop.results.summary_file import summary_text, write_summary
+from evedrop.results.writer import load_results
+from evedrop.score.summary import Outage, Summary
+
+
+@pytest.mark.parametrize(
+    ("scenario", "mode"),
+    [
+        *(
+            (name, Mode.EXACT)
+            for name in ("acknowledged", "driving-away", "heated-room", "late", "microgrid", "vehicle")
+        ),
+        ("numerical", Mode.COVARIANCE_ONLY),
+    ],
+)
+def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario: str, mode: Mode) -> None:
+    """With filter, controller, applications, events, detection, delays, and the figure of one mode."""
+    changes: dict[str, Any] = (
+        {"event": [{"at": 3, "link": "legitimate", "set": {"quality": 0.5}}]} if scenario == "late" else {}
+    )
+    plan = Plan(mode, workers=1)
+    results = montecarlo(scenario, slots=50, trials=12, out=tmp_path / "run", plan=plan, expect=[], **changes)
+    text = (tmp_path / "run" / "summary.json").read_text(encoding="utf-8")
+    summary = results.typed_summary
+    assert summary_text(summary) == text
+    figures = [name for name in FIGURES if figure(name).only_in_mode in {None, mode.value}]
+    order = [*figures[:5], "error_quantiles", "infinite_variance", "digest", *figures[5:]]
+    assert [list(peer) for peer in results.summary["peers"].values()] == [order] * len(summary.peers)
+    outages = [Outage("smart", 3, None, 0.5), Outage("router", 4, 9, 1.0, shard=2)]
+    write_summary(tmp_path / "run", replace(summary, outages=outages))
+    again = load_results(tmp_path / "run")
+    assert again.typed_summary.outages == outages
+    assert list(again.summary["outages"][1]) == ["shard", "process", "slot", "until", "seconds"]
+    assert "shard" not in again.summary["outages"][0]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """A small run."""
+    expect = [{"figure": "smart.mean_squared_error", "below": 0.0}]
+    return montecarlo("eavesdroppers", slots=9, trials=2, out=tmp_path_factory.mktemp("run"), expect=expect)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("trials",), "two"),
+        (("ended",), None),
+        (("peers", "smart", "digest"), 5),
+        (("peers", "smart", "used_fraction"), "many"),
+        (("links", "smart", "lost"), [1]),
+        (("secrecy", "smart"), "held"),
+        (("events",), [{"slot": "x", "event": "cut", "by": "scenario"}]),
+        (("expectations", 0, "held"), "perhaps"),
+        (("detection",), {"alarms": 1}),
+    ],
+)
+def test_an_entry_of_another_type_is_named(results: Results, place: tuple[str | int, ...], value: Any) -> None:
+    """By its place, in one line."""
+    changed: Any = copy.deepcopy(dict(results.summary))
+    inner = changed
+    for name in place[:-1]:
+        inner = inner[name]
+    inner[place[-1]] = value
+    with pytest.raises(UsageError, match="is not a run summary of this version") as caught:
+        _ = Results(results.folder, changed).typed_summary
+    assert str(place[-1]) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("missing", ["slots_per_second", "peers", "expectations"])
+def test_a_missing_entry_is_named(results: Results, missing: str) -> None:
+    """As one that a summary of an older version lacks."""
+    changed = {name: value for name, value in results.summary.items() if name != missing}
+    with pytest.raises(UsageError, match=f"is not a run summary of this version .'{missing}'|KeyError.'{missing}'"):
+        _ = Results(results.folder, changed).typed_summary
+
+
+def test_infinite_numbers_are_numbers(results: Results) -> None:
+    """In the file they are strings, because JSON lacks them."""
+    changed: Any = copy.deepcopy(dict(results.summary))
+    changed["peers"]["smart"]["mean_squared_error"] = "inf"
+    assert Summary.read(changed).peers["smart"].figure("mean_squared_error") == float("inf")
