@@ -1,4 +1,4 @@
-"""The names that authors of schemes, eavesdroppers, loss models, delay models, controllers and applications import.
+"""The names that authors of schemes, eavesdroppers, loss models, delay models, controllers, applications and events import.
 
 A plug-in needs nothing else of Evedrop. Whatever is here keeps its name and its meaning within a major version.
 
@@ -26,6 +26,7 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.names import ProcessAction
 from evedrop.streams import Batch, BlockReader
 
 if TYPE_CHECKING:
@@ -37,9 +38,12 @@ if TYPE_CHECKING:
         PanelCurve,
         PanelFeed,
     )
+    from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Nothing, Return
+    from evedrop.scenario.events.event import Act, EventKind
     from evedrop.scenario.table import Table
 
 __all__ = [
+    "Act",
     "Action",
     "Application",
     "ApplicationTally",
@@ -55,14 +59,21 @@ __all__ = [
     "DelayModel",
     "Eavesdropper",
     "Encoder",
+    "EventKind",
     "Fate",
     "Flags",
     "Floats",
     "Innovation",
+    "Jamming",
     "Knowledge",
+    "Leave",
+    "LinkCut",
+    "LinkHealed",
+    "LinkSettings",
     "LossModel",
     "Naive",
     "NoInnovations",
+    "Nothing",
     "Outcomes",
     "OutcomesAt",
     "Packet",
@@ -75,8 +86,10 @@ __all__ = [
     "PlainEncoder",
     "PlainEstimator",
     "Process",
+    "ProcessAction",
     "Receiver",
     "Reception",
+    "Return",
     "Scheme",
     "Shared",
     "Table",
@@ -88,10 +101,18 @@ __all__ = [
     "update",
 ]
 
-_LATER = dict.fromkeys(
-    ("Application", "ApplicationTally", "ControlledPlant", "Panel", "PanelCurve", "PanelFeed"),
-    "evedrop.scenario.application",
-) | {"Table": "evedrop.scenario.table"}
+_LATER = (
+    dict.fromkeys(
+        ("Application", "ApplicationTally", "ControlledPlant", "Panel", "PanelCurve", "PanelFeed"),
+        "evedrop.scenario.application",
+    )
+    | dict.fromkeys(("Act", "EventKind"), "evedrop.scenario.events.event")
+    | dict.fromkeys(
+        ("Jamming", "Leave", "LinkCut", "LinkHealed", "LinkSettings", "Nothing", "Return"),
+        "evedrop.scenario.events.effects",
+    )
+    | {"Table": "evedrop.scenario.table"}
+)
 """Imported when used: pydantic, which checks tables, would slow down a receiver that uses a class of its own."""
 
 

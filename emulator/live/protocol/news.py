@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Self
 
+from evedrop.names import ProcessAction
+
 News = Mapping[str, Any]
 
 
@@ -32,8 +34,7 @@ class ProcessRequest(_Kind):
     """The observer asks the launcher to act on a process, and to confirm it."""
 
     event = "act"
-    do: str
-    """`kill`, `restart`, `pause` or `resume`."""
+    do: ProcessAction
     process: str
     first: int
     """The first slot that a restarted process handles."""
