@@ -1,4 +1,4 @@
-"""The names that authors of schemes, eavesdroppers, links, controllers, figures, panels and applications import.
+"""The names that authors of schemes, eavesdroppers, links, controllers, events, figures, panels and applications import.
 
 A plug-in needs nothing else of Evedrop. Whatever is here keeps its name and its meaning within a major version.
 
@@ -27,6 +27,7 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.names import ProcessAction
 from evedrop.streams import Batch, BlockReader
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
         PanelCurve,
         PanelFeed,
     )
+    from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Nothing, Return
+    from evedrop.scenario.events.event import Act, EventKind
     from evedrop.scenario.table import Table
     from evedrop.view.column import Column, scalars
     from evedrop.view.palette import colour
@@ -46,6 +49,7 @@ if TYPE_CHECKING:
     from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
 
 __all__ = [
+    "Act",
     "Action",
     "Application",
     "ApplicationTally",
@@ -62,6 +66,7 @@ __all__ = [
     "DelayModel",
     "Eavesdropper",
     "Encoder",
+    "EventKind",
     "Fate",
     "Figure",
     "FigureColumn",
@@ -69,11 +74,17 @@ __all__ = [
     "Flags",
     "Floats",
     "Innovation",
+    "Jamming",
     "Knowledge",
+    "Leave",
+    "LinkCut",
+    "LinkHealed",
+    "LinkSettings",
     "LossModel",
     "MeanFigure",
     "Naive",
     "NoInnovations",
+    "Nothing",
     "Outcomes",
     "OutcomesAt",
     "Packet",
@@ -88,8 +99,10 @@ __all__ = [
     "PlainEncoder",
     "PlainEstimator",
     "Process",
+    "ProcessAction",
     "Receiver",
     "Reception",
+    "Return",
     "Scene",
     "SceneSlots",
     "Scheme",
@@ -121,6 +134,16 @@ _LATER = {
         "PanelCurve",
         "PanelFeed",
     ),
+    "evedrop.scenario.events.effects": (
+        "Jamming",
+        "Leave",
+        "LinkCut",
+        "LinkHealed",
+        "LinkSettings",
+        "Nothing",
+        "Return",
+    ),
+    "evedrop.scenario.events.event": ("Act", "EventKind"),
     "evedrop.scenario.table": ("Table",),
     "evedrop.view.column": ("Column", "scalars"),
     "evedrop.view.palette": ("colour",),

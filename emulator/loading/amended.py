@@ -11,11 +11,9 @@ from typing import Any
 from evedrop.errors import ScenarioError
 from evedrop.loading.file import checked
 from evedrop.plugins import named_in
+from evedrop.scenario.events import EVENTS
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
-
-ADDED = ("set", "cut", "heal")
-"""The kinds of event that can be added during a run: all of them concern links."""
 
 
 def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenario:
@@ -25,9 +23,10 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
     """
     tables = scenario.model_dump(mode="json", exclude_none=True)
     number = len(tables["event"])
-    strange = [name for name in event if name not in (*ADDED, "link")]
+    kinds = [kind for kind in EVENTS.values() if kind.by_operator]
+    strange = [name for name in event if not any(name in kind.own_entries() for kind in kinds)]
     if strange:
-        known = listed(["link with set", *ADDED[1:]])
+        known = listed([" with ".join(kind.own_entries()) for kind in kinds])
         raise ScenarioError("event", [f"{name}: cannot be done now; expected {known}" for name in strange])
     if scenario.modules is None and any(named_in(event)):
         name = next(iter(named_in(event)))

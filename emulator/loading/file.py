@@ -14,13 +14,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from pydantic import (
-    ValidationError,
-)
+from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, is_folder, is_there, shown, text_of
-from evedrop.loading.mistakes import across_tables, sentences
+from evedrop.loading.mistakes import mistakes_across
 from evedrop.model.registry import place_of
 from evedrop.plugins import named_in
 from evedrop.scenario.disturbances import disturbances_beside, disturbances_read
@@ -28,7 +26,9 @@ from evedrop.scenario.drawn import with_faults
 from evedrop.scenario.dry_run import dry_run, foreign
 from evedrop.scenario.filter_noise import filter_noise_read
 from evedrop.scenario.recordings import beside, read_recordings
+from evedrop.scenario.sentences import sentences
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.valid import ValidTables
 from evedrop.scenario.values import unusable
 
 MOST_BYTES = 2**28
@@ -149,12 +149,13 @@ def checked(
     try:
         scenario = Scenario.model_validate(tables)
     except ValidationError as error:
-        raise ScenarioError(source, [*sentences(error), *recordings, *_across(tables, beyond_horizon, None)]) from error
+        mistakes = [*sentences(error, Scenario), *recordings, *_across(tables, beyond_horizon, None)]
+        raise ScenarioError(source, mistakes) from error
     broken = dry_run(scenario)
     # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
     mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
     if scenario.nemesis is not None:
-        tables, found = with_faults(tables, scenario, sentences)
+        tables, found = with_faults(tables, scenario)
         mistakes += found
         if not mistakes:
             scenario = Scenario.model_validate(tables)
@@ -169,7 +170,7 @@ def _across(
 ) -> list[str]:
     """Mistakes across tables; an error that a custom class raises when asked is a mistake too, unless silent."""
     try:
-        return across_tables(tables, beyond_horizon, scenario)
+        return mistakes_across(ValidTables.of(tables, scenario), beyond_horizon)
     except Exception as error:
         if not foreign(tables):
             raise

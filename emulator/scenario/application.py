@@ -9,7 +9,7 @@ Source: docs/your-own.md, applications.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -20,7 +20,6 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.registry import Registry
 from evedrop.scenario.table import Table
-from evedrop.scenario.words import as_toml, listed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -230,31 +229,3 @@ def unloadable_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[s
             except NotRegistered as error:
                 found[name] = error.why
     return found
-
-
-def application_mistakes(applications: Mapping[str, type[Application]], tables: Mapping[str, Any]) -> Iterator[str]:
-    """Mistakes of applications across tables: no plant, names that the plant does not have, and a receiver of the same name."""
-    for name, application in applications.items():
-        yield from _mistakes_of(name, application, tables)
-        if name in (tables.get("eavesdroppers") or {}):
-            yield f"eavesdroppers.{name}: is a name that the {name}'s figures use; expected another"
-
-
-def _mistakes_of(name: str, application: type[Application], tables: Mapping[str, Any]) -> Iterator[str]:
-    table, plant, process = tables[name], tables.get("plant"), tables.get("process")
-    if not isinstance(plant, Mapping) or not isinstance(tables.get("controller"), Mapping):
-        described = "which it describes; expected both, or no such table"
-        yield f"{name}: is given without a [plant] and a [controller], {described}"
-        return
-    if not isinstance(table, Mapping):
-        return
-    for entry, kind in application.names.items():
-        given = table.get(entry)
-        if not isinstance(given, str):
-            continue
-        where, holder = (f"process.{kind}", process) if kind == "states" else (f"plant.{kind}", plant)
-        names = holder.get(kind) if isinstance(holder, Mapping) else None
-        there = [one for one in names if isinstance(one, str)] if isinstance(names, list) else []
-        if given not in there:
-            choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(given)}, …]"
-            yield f"{name}.{entry}: is {as_toml(given)}, which is not among {where}; {choice}"

@@ -5,73 +5,59 @@ Source: docs/scenario.md, plant and controller.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from pydantic import ValidationError
 
 from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.names import LEGITIMATE
+from evedrop.scenario.events.effects import Leave
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.table import numbers
-from evedrop.scenario.tables import LegitimateTable
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.valid import ValidTables
+from evedrop.scenario.words import listed
 
 
-def loop_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
-    """Mistakes in the plant, the controller and `knows_input`, as far as a faulty file can be checked."""
-    plant, controller = tables.get("plant"), tables.get("controller")
-    if isinstance(controller, Mapping) and not (isinstance(plant, Mapping) and plant.get("inputs")):
+def loop_mistakes(tables: ValidTables) -> Iterator[str]:
+    """Mistakes in the plant, the controller and `knows_input`."""
+    plant, given = tables.plant, tables.given
+    if "controller" in given and ("plant" not in given or (plant is not None and not plant.inputs)):
         yield (
             "plant: has no inputs, but there is a controller; expected a table [plant] with inputs and input_matrix, or no "
             "[controller]"
         )
-    if isinstance(plant, Mapping) and plant.get("inputs") and controller is None:
-        names = plant["inputs"]
-        inputs = (
-            listed(names) if isinstance(names, list) and all(isinstance(one, str) for one in names) else as_toml(names)
-        )
+    if plant is not None and plant.inputs and "controller" not in given:
+        inputs = listed(plant.inputs)
         yield f"controller: is missing; expected a table [controller] that decides {inputs}, or a plant without inputs"
-    legitimate = tables.get(LEGITIMATE)
-    if isinstance(legitimate, Mapping) and legitimate.get("knows_input") is True and controller is None:
+    if tables.legitimate is not None and tables.legitimate.knows_input and "controller" not in given:
         yield f"{LEGITIMATE}.knows_input: is true, but nothing has inputs; expected a [plant] and a [controller], or no such line"
-    process = _process(tables)
-    if process is not None and isinstance(plant, Mapping):
-        yield from _beside_process(plant, process)
-        yield from _rows(plant, tables.get("slots"))
-        yield from _beside_plant(tables, process)
-    if isinstance(controller, Mapping):
-        yield from _outages(tables, controller)
+    if tables.process is not None and plant is not None:
+        yield from _beside_process(plant, tables.process)
+        yield from _rows(plant, tables.slots)
+        if tables.controller is not None:
+            yield from _beside_plant(plant, tables.controller, tables.process, tables.slot_seconds or 1.0)
+    if tables.controller is not None:
+        yield from _outages(tables, tables.controller)
 
 
-def _process(tables: Mapping[str, Any]) -> ProcessTable | None:
-    try:
-        return ProcessTable.model_validate(tables.get("process"))
-    except ValidationError:
-        return None
-
-
-def _beside_process(plant: Mapping[str, Any], process: ProcessTable) -> Iterator[str]:
+def _beside_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:
     n = len(process.A)
-    for name in ("input_matrix", "disturbance_matrix", "noise"):
-        rows = plant.get(name)
-        if rows is None or not numbers(rows):
+    matrices = {name: getattr(plant, name) for name in ("input_matrix", "disturbance_matrix", "noise")}
+    for name, rows in matrices.items():
+        if rows is None:
             continue
         if len(rows) != n:
             yield f"plant.{name}: has {len(rows)} rows; expected {n}, one for each state"
         elif name == "noise":
             yield from _noise_mistakes(rows, n)
-    start = plant.get("start")
     inside = {"process.reference": process.around}
-    if start is not None and numbers([start]):
-        if len(start) != n:
-            yield f"plant.start: has {len(start)} entries; expected {n}, one for each state"
-        else:
-            inside["start"] = start
-    for name, what in limit_mistakes(plant, "state", n, "one for each state", inside):
+    if plant.start is not None and len(plant.start) != n:
+        yield f"plant.start: has {len(plant.start)} entries; expected {n}, one for each state"
+    elif plant.start is not None:
+        inside["start"] = plant.start
+    limits = {"state_lower": plant.state_lower, "state_upper": plant.state_upper}
+    for name, what in limit_mistakes(limits, "state", n, "one for each state", inside):
         yield f"{name}: {what}" if name.startswith("process.") else f"plant.{name}: {what}"
 
 
@@ -89,21 +75,16 @@ def _noise_mistakes(rows: Sequence[Sequence[float]], n: int) -> Iterator[str]:
         yield "plant.noise: has an eigenvalue below 0; expected a covariance, such as 1e-6 times the identity, or 0"
 
 
-def _rows(plant: Mapping[str, Any], slots: Any) -> Iterator[str]:
-    rows = plant.get("disturbance_values")
-    if plant.get("disturbances") and isinstance(rows, list) and type(slots) is int and 0 < len(rows) < slots:
+def _rows(plant: PlantTable, slots: int | None) -> Iterator[str]:
+    rows = plant.disturbance_values
+    if plant.disturbances and rows and slots is not None and len(rows) < slots:
         yield f"plant.disturbance_values: has {len(rows)} rows; expected slots, which is {slots}, or more"
 
 
-def _beside_plant(tables: Mapping[str, Any], process: ProcessTable) -> Iterator[str]:
+def _beside_plant(
+    plant: PlantTable, controller: ControllerTable, process: ProcessTable, slot_seconds: float
+) -> Iterator[str]:
     """Wrong numbers of weights, and the strategy's objections."""
-    try:
-        rows = tables["plant"].get("disturbance_values")
-        few = {"disturbance_values": rows[:1]} if isinstance(rows, list) else {}
-        plant = PlantTable.model_validate({**tables["plant"], **few})
-        controller = ControllerTable.model_validate(tables.get("controller"))
-    except ValidationError:
-        return
     n, m = len(process.A), len(plant.inputs)
     wrong = False
     for name, count, why in (
@@ -122,30 +103,23 @@ def _beside_plant(tables: Mapping[str, Any], process: ProcessTable) -> Iterator[
         return
     if plant.disturbance_matrix is not None and len(plant.disturbance_matrix) != n:
         return
-    seconds = tables.get("slot_seconds")
-    slot_seconds = float(seconds) if isinstance(seconds, (int, float)) and seconds > 0 else 1.0
     assignment = assignment_of(controller, process.process, plant_of(plant, process.around), slot_seconds)
     for entry, what in CONTROLLERS[controller.strategy].objections(assignment):
         yield f"controller.{entry}: {what}"
 
 
-def _outages(tables: Mapping[str, Any], controller: Mapping[str, Any]) -> Iterator[str]:
+def _outages(tables: ValidTables, controller: ControllerTable) -> Iterator[str]:
     """The legitimate estimator must be present while the controller waits for its estimate or it waits for the inputs."""
-    try:
-        knows = LegitimateTable.model_validate(tables.get(LEGITIMATE)).knows_input
-    except ValidationError:
-        knows = False
-    if controller.get("acts_on", "estimate") != "estimate" and not knows:
+    if controller.acts_on == "estimate":
+        why = "the controller acts on its estimate"
+    elif tables.legitimate is not None and tables.legitimate.knows_input:
+        why = "it is told the inputs"
+    else:
         return
-    why = (
-        "the controller acts on its estimate"
-        if controller.get("acts_on", "estimate") == "estimate"
-        else "it is told the inputs"
-    )
-    for i, event in enumerate(tables.get("event", []) if isinstance(tables.get("event"), list) else []):
-        for kind in ("kill", "pause"):
-            if isinstance(event, Mapping) and event.get(kind) == LEGITIMATE:
+    for i, event in tables.event:
+        for act in event.acts():
+            if isinstance(act.effect, Leave) and LEGITIMATE in act.names:
                 yield (
-                    f"event.{i}.{kind}: is {LEGITIMATE}, but {why}, and the loop would stand still; expected a cut of its link, "
-                    "over which the estimate is carried on"
+                    f"event.{i}.{act.entry}: is {LEGITIMATE}, but {why}, and the loop would stand still; expected a cut of its "
+                    "link, over which the estimate is carried on"
                 )

@@ -16,35 +16,36 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from evedrop.kernels.elementary import log
+from evedrop.model.links.link import Fate
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.across import Sentences
-from evedrop.scenario.link_table import changed_link
-from evedrop.scenario.nemesis import FAULTS, NEMESIS, NemesisTable
+from evedrop.scenario.events import EVENTS
+from evedrop.scenario.events.effects import Leave, LinkCut, LinkHealed, LinkSettings, Return
+from evedrop.scenario.events.event import EventKind, Fault
+from evedrop.scenario.link_table import LinkTable, changed_link
+from evedrop.scenario.nemesis import NEMESIS, NemesisTable
+from evedrop.scenario.sentences import sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import acts_of
 from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
 MOST_EVENTS = 10_000
 """The most events of a scenario, including those of the file."""
-_LEAVES = ("kill", "pause")
 _BLOCK = 256  # faults drawn at once
 
 Span = tuple[int, int]
 """Slots [from, to)."""
 
 
-def with_faults(
-    tables: Mapping[str, Any], scenario: Scenario, sentences: Sentences
-) -> tuple[dict[str, Any], list[str]]:
+def with_faults(tables: Mapping[str, Any], scenario: Scenario) -> tuple[dict[str, Any], list[str]]:
     """Replace the nemesis in the tables by its events; also returns its mistakes.
 
     scenario: the tables as a scenario, valid by themselves, with a nemesis.
     """
     table = scenario.nemesis
     assert table is not None  # noqa: S101 - asked by the caller
-    found = [*_mistakes(table, scenario, sentences)]
+    found = [*_mistakes(table, scenario)]
     nemesis = _Nemesis(table, scenario)
     room = MOST_EVENTS - len(scenario.event)
     events = [] if found else [event for _, event in zip(range(room + 1), nemesis.events(), strict=False)]
@@ -57,7 +58,7 @@ def with_faults(
     return {**rest, "event": [*own, *sorted(events, key=lambda event: int(event["from"]))]}, found
 
 
-def _mistakes(table: NemesisTable, scenario: Scenario, sentences: Sentences) -> Iterator[str]:
+def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
     """Mistakes that `set` makes on any of the links."""
     said = set[str]()
     for name in _targets(table, scenario) if table.set is not None else ():
@@ -65,7 +66,7 @@ def _mistakes(table: NemesisTable, scenario: Scenario, sentences: Sentences) -> 
         try:
             changed = changed_link(link, table.set or {})
         except ValidationError as error:
-            lines = [f"{NEMESIS}.set.{line}" for line in sentences(error)]
+            lines = [f"{NEMESIS}.set.{line}" for line in sentences(error, LinkTable)]
         else:
             lines = []
             if "correlation" in (table.set or {}):
@@ -94,74 +95,75 @@ class _Nemesis:
         self.targets = _targets(table, scenario)
         self._until = scenario.slots if table.to is None else table.to
         self._root = stream_key(root_of_seed(scenario.seed if table.seed is None else table.seed), NEMESIS)
+        self._kinds = sorted((EVENTS[one] for one in table.faults), key=lambda kind: (_fault(kind).place, kind.kind))
         self._taken = {name: self._taken_by_file(name) for name in self.targets}
 
     def events(self) -> Iterator[dict[str, Any]]:
         """All events: first those that concern several receivers at once, then each receiver's own."""
-        if "partition" in self._table.faults:
-            yield from self._partitions()
+        for kind in self._kinds:
+            if _fault(kind).together:
+                yield from self._together(kind)
         for name in self.targets:
             yield from self._own(name)
 
     @property
     def possible(self) -> bool:
         """Whether any of the faults may happen to any of the targets."""
-        return "partition" in self._table.faults or any(map(self.kinds, self.targets))
+        return any(_fault(kind).together for kind in self._kinds) or any(map(self.kinds, self.targets))
 
-    def kinds(self, name: str) -> list[str]:
-        """The faults that may happen to one receiver alone, in the order of `FAULTS`."""
+    def kinds(self, name: str) -> list[type[EventKind]]:
+        """The faults that may happen to one receiver alone, in the order of their places."""
         scenario = self._scenario
         loop = scenario.controller is not None and (
             scenario.controller.acts_on == "estimate" or scenario.legitimate.knows_input
         )
-        barred = {"partition"}
+        barred: set[object] = set()
         if loop and name == LEGITIMATE:  # the loop would stand still
-            barred.update(_LEAVES)
-        if any(event.kind == "set" and name in event.names for event in scenario.event):
-            barred.add("set")
-        return [kind for kind in FAULTS if kind in self._table.faults and kind not in barred]
+            barred.add(Leave)
+        if any(event.does is LinkSettings and name in event.names for event in scenario.event):
+            barred.add(LinkSettings)
+        return [kind for kind in self._kinds if kind.does not in barred and not _fault(kind).together]
 
     def _taken_by_file(self, name: str) -> list[Span]:
         """The slots in which the file's own events cut a receiver off or make it leave."""
-        opens = {"cut": "heal", "kill": "restart", "pause": "resume"}
-        acts = sorted((act for event in self._scenario.event for act in acts_of(event)), key=lambda act: act.at)
         spans: list[Span] = []
-        begun: dict[str, int] = {}
-        for act in acts:
-            if name in act.names and act.kind in opens:
-                begun[opens[act.kind]] = act.at
-            elif name in act.names and act.kind in opens.values():
-                spans.append((begun.pop(act.kind, act.at), act.at))
+        begun: dict[Fate, int] = {}
+        for act in acts_of(self._scenario.event):
+            if name in act.names and isinstance(act.effect, (LinkCut, Leave)):
+                begun[act.effect.reason] = act.at
+            elif name in act.names and isinstance(act.effect, (LinkHealed, Return)):
+                spans.append((begun.pop(act.effect.reason, act.at), act.at))
         return spans + [(start, NEVER) for start in begun.values()]
 
-    def _partitions(self) -> Iterator[dict[str, Any]]:
-        """Events of partitions: an independent fair coin decides for each receiver whether it is cut off."""
-        coins = {name: self._coins(name) for name in self.targets}
-        for start, end, _ in self._spans("partition"):
+    def _together(self, kind: type[EventKind]) -> Iterator[dict[str, Any]]:
+        """Events of a kind that happens to several: an independent fair coin decides for each receiver."""
+        coins = {name: self._coins(kind, name) for name in self.targets}
+        for start, end, _ in self._spans(kind.kind):
             heads = [name for name in self.targets if next(coins[name])]
             inside = [name for name in heads if self._free(name, start, end)]
             for name in inside:
                 self._taken[name].append((start, end))
             if inside:
-                yield {"from": start, "to": end, "partition": inside}
+                yield self._event(kind, start, end, inside)
 
-    def _coins(self, name: str) -> Iterator[bool]:
-        for draws in _draws(self._root, f"partition/{name}"):
+    def _coins(self, kind: type[EventKind], name: str) -> Iterator[bool]:
+        for draws in _draws(self._root, f"{kind.kind}/{name}"):
             yield from (draws[:, 0] < 0.5).tolist()
 
     def _own(self, name: str) -> Iterator[dict[str, Any]]:
         kinds, needed = self.kinds(name), self._scenario.leaks.get(name)
         for start, end, choice in self._spans(f"receiver/{name}") if kinds else ():
             kind = kinds[int(choice * len(kinds))]
-            missed = kind in _LEAVES and needed is not None and start <= needed < end
+            missed = kind.does is Leave and needed is not None and start <= needed < end
             if missed or not self._free(name, start, end):
                 continue
-            if kind == "set":
-                yield {"from": start, "to": end, "link": name, "set": self._table.set}
-            elif kind == "kill" and self._table.state is not None:
-                yield {"from": start, "to": end, "kill": name, "state": self._table.state}
-            else:
-                yield {"from": start, "to": end, kind: name}
+            yield self._event(kind, start, end, name)
+
+    def _event(self, kind: type[EventKind], start: int, end: int, names: str | list[str]) -> dict[str, Any]:
+        """The table of an event."""
+        given = {entry: getattr(self._table, entry) for entry in _fault(kind).entries}
+        own = {entry: value for entry, value in given.items() if value is not None}
+        return {"from": start, "to": end, str(kind.names_in): names, **own}
 
     def _free(self, name: str, start: int, end: int) -> bool:
         """Whether at least one slot separates a span from all others of a receiver."""
@@ -181,6 +183,11 @@ class _Nemesis:
                     return
                 before = min(start + length, self._until)
                 yield start, before, choice
+
+
+def _fault(kind: type[EventKind]) -> Fault:
+    assert kind.fault is not None  # noqa: S101 - checked with the table
+    return kind.fault
 
 
 def _draws(root: bytes, name: str) -> Iterator[Floats]:

@@ -24,6 +24,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.names import LEGITIMATE
 from evedrop.plugins import names_in
+from evedrop.scenario.events.effects import LinkSettings
 from evedrop.scenario.table import model_mistakes
 from evedrop.scenario.tables import EavesdropperTable, Scenario
 from evedrop.scenario.words import as_toml
@@ -103,8 +104,10 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
         yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
     for i, event in enumerate(scenario.event):
         # Mistakes in the models of an event show across tables and are reported there.
-        if event.set is not None and not _model_mistakes(event.set):
-            yield from _settings_mistakes(f"event.{i}.set", event.set, problem)
+        for act in event.acts():
+            settings = act.effect.entries if isinstance(act.effect, LinkSettings) else None
+            if settings is not None and not _model_mistakes(settings):
+                yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem)
 
 
 def _model_mistakes(settings: Mapping[str, Any]) -> bool:

@@ -227,25 +227,24 @@ class Around:
     applications: Mapping[str, type[Application]] = field(default_factory=dict)
     """Those whose tables the scenario has."""
 
-    def mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self, expectation: ExpectTable) -> list[Found]:
         """Unknown receivers and figures, slots beyond the run, and quantiles of too few trials."""
         found: list[Found] = []
-        figure = expectation.get("figure")
-        if isinstance(figure, str):
-            found += self._figure_mistakes(figure)
-            application = figure.partition(".")[0]
+        if expectation.figure is not None:
+            found += self._figure_mistakes(expectation.figure)
+            application = expectation.figure.partition(".")[0]
             if application in self.applications:
                 mean = (
                     f"is set, but the {application}'s figures are means over trials of the whole run; remove the line"
                 )
-                found += [(name, mean) for name in ("slots", "quantile") if expectation.get(name) is not None]
+                found += [(name, mean) for name in ("slots", "quantile") if getattr(expectation, name) is not None]
         names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
         for entry, known in names.items():
-            name = expectation.get(entry)
-            if isinstance(name, str) and name not in known:
+            name = getattr(expectation, entry)
+            if name is not None and name not in known:
                 choice = f"expected {listed(known)}" if known else "there is no eavesdropper; add one"
                 found.append((entry, f"is {as_toml(name)}; {choice}{_near(name, known)}"))
-        return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.get("quantile"))
+        return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
 
     def _figure_mistakes(self, figure: str) -> list[Found]:
         link = link_figure(figure)
@@ -284,22 +283,20 @@ class Around:
         choice += [f"{name}.RECEIVER.FIGURE ({', '.join(of_receivers)})"] if of_receivers else []
         return [("figure", f"is {as_toml(figure)}; expected {' or '.join(choice)}{_near(figure, known)}")]
 
-    def _slot_mistakes(self, expectation: Mapping[str, Any]) -> list[Found]:
+    def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
         if self.slots is None:
             return []
         found: list[Found] = []
-        span: Any = expectation.get("slots")
-        whole = isinstance(span, list) and [type(slot) for slot in span] == [int, int]
-        if whole and 0 <= span[0] < span[1] > self.slots:
+        span = expectation.slots
+        if span is not None and span[1] > self.slots:
             found.append(("slots", f"is {as_toml(span)}; expected from < to ≤ slots, which is {self.slots}"))
-        for name in ("by", "since"):
-            slot = expectation.get(name)
-            if type(slot) is int and slot >= self.slots:
+        for name, slot in (("by", expectation.by), ("since", expectation.since)):
+            if slot is not None and slot >= self.slots:
                 found.append((name, f"is {slot}; expected a slot of the run, 0 to {self.slots - 1}"))
         return found
 
-    def _quantile_mistakes(self, quantile: Any) -> list[Found]:
-        if self.trials is None or not isinstance(quantile, float) or not 0.0 < quantile < 1.0:
+    def _quantile_mistakes(self, quantile: float | None) -> list[Found]:
+        if self.trials is None or quantile is None:
             return []
         # At least one trial is expected beyond the quantile; the tolerance is there because decimals seldom hit 1/q exactly.
         least = math.ceil(1.0 / min(quantile, 1.0 - quantile) - 1e-9)

@@ -9,16 +9,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.local_filter import MOST_STATES, FilterStep, settled
 from evedrop.model.process import Floats, Process
-from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.plant import PlantTable, plant_of
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.table import numbers
+from evedrop.scenario.valid import ValidTables
 
 FILTER = "filter"
 
@@ -28,8 +26,9 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
     process = tables.get("process")
     if not isinstance(process, dict) or process.get("Q") != FILTER:
         return []
-    n = len(process["A"]) if isinstance(process.get("A"), list) else 1
-    process["Q"] = np.eye(max(1, n) if n <= MOST_STATES else 1).tolist()  # a placeholder until Q is known
+    rows = process.get("A")
+    n = len(rows) if isinstance(rows, list) and 0 < len(rows) <= MOST_STATES else 1
+    process["Q"] = np.eye(n).tolist()  # a placeholder until Q is known
     plant = tables.get("plant")
     if not isinstance(plant, Mapping) or plant.get("output_matrix") is None:
         return [
@@ -37,7 +36,10 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
             "in [plant]"
         ]
     try:
-        step = settled_of(process, plant)
+        # Disturbances may be numbers for a whole day, and do not matter here.
+        bare = {name: value for name, value in plant.items() if not name.startswith("disturbance")}
+        made = ProcessTable.model_validate({**process, "singular_noise": False})
+        step = settled_of(made, PlantTable.model_validate(bare))
     except ValueError:  # a mistake in process or plant, reported elsewhere
         return []
     process["Q"] = step.innovation.tolist()
@@ -45,21 +47,13 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
     return []
 
 
-def settled_of(process: Mapping[str, Any], plant: Mapping[str, Any]) -> FilterStep:
-    """The steady state of the tables' filter. Raises ValidationError or ValueError if it does not exist."""
-    n = len(process["A"]) if isinstance(process.get("A"), list) else 1
-    made = ProcessTable.model_validate({**process, "Q": np.eye(n).tolist(), "singular_noise": False})
-    table = PlantTable.model_validate(without_disturbances(plant))
-    A, n = np.array(made.A), len(made.A)
-    if table.output_matrix is None or measured_mistakes(plant, n):
+def settled_of(process: ProcessTable, plant: PlantTable) -> FilterStep:
+    """The steady state of the tables' filter. Raises ValueError if it does not exist."""
+    n = len(process.A)
+    if plant.output_matrix is None or measured_mistakes(plant, n):
         raise ValueError("no filter")
-    bare = plant_of(table, made.around)
-    return settled(Process(A, np.eye(n), np.array(made.initial_covariance)), bare)
-
-
-def without_disturbances(plant: Mapping[str, Any]) -> dict[str, Any]:
-    """A plant without its disturbances, which may be numbers for a whole day."""
-    return {name: value for name, value in plant.items() if not name.startswith("disturbance")}
+    known = Process(np.array(process.A), np.eye(n), np.array(process.initial_covariance))
+    return settled(known, plant_of(plant, process.around))
 
 
 def is_singular(Q: Floats) -> bool:
@@ -67,12 +61,12 @@ def is_singular(Q: Floats) -> bool:
     return bool(np.any(np.diag(semidefinite_factor(Q)) == 0.0))
 
 
-def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
+def measured_mistakes(plant: PlantTable, n: int) -> list[str]:
     """Mistakes in the sensor's measurement of n states."""
-    C, V = plant.get("output_matrix"), plant.get("measurement_noise")
-    found = []
-    if C is None or not numbers(C):
-        return []
+    C, V = plant.output_matrix, plant.measurement_noise
+    found: list[str] = []
+    if C is None or V is None:
+        return found
     if max(n, len(C)) > MOST_STATES:
         large = f"is of {len(C)} measurements of {n} states"
         return [
@@ -81,8 +75,6 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
         found.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")
-    if V is None or not numbers(V):
-        return found
     noise, p = [*map(len, V)], len(C)
     if noise != [p] * p:
         found.append(
@@ -99,40 +91,35 @@ def measured_mistakes(plant: Mapping[str, Any], n: int) -> list[str]:
     return found
 
 
-def filter_mistakes(tables: Mapping[str, Any]) -> Iterator[str]:
+def filter_mistakes(tables: ValidTables) -> Iterator[str]:
     """Mistakes in the sensor's filter together with process, scheme and eavesdroppers."""
-    process, plant = tables.get("process"), tables.get("plant")
-    if not isinstance(process, Mapping):
+    process, plant, encoding, scheme = tables.process, tables.plant, tables.encoding, tables.scheme
+    if process is None:
         return
-    if isinstance(plant, Mapping) and plant.get("output_matrix") is not None and isinstance(process.get("A"), list):
-        wrong = measured_mistakes(plant, len(process["A"]))
+    if plant is not None and plant.output_matrix is not None:
+        wrong = measured_mistakes(plant, len(process.A))
         yield from wrong
         try:
             settled_of(process, plant)
-        except ValidationError:
-            pass
         except ValueError:
             if not wrong:
                 yield (
                     "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state, "
                     "and plant.noise must move every state, or the filter ends up ignoring all measurements"
                 )
-        encoding = tables.get("encoding")
-        name = str(encoding.get("scheme")) if isinstance(encoding, Mapping) else ""
-        scheme = SCHEMES.get(name)
-        if scheme is not None and scheme.decides_initial_state():
-            yield f"plant.output_matrix: is given, but the scheme {name} decides x_0 itself; expected another scheme"
-    if process.get("singular_noise") is True:
-        eavesdroppers = tables.get("eavesdroppers")
-        for name, table in (eavesdroppers if isinstance(eavesdroppers, Mapping) else {}).items():
-            for entry in ("strategy", "reads_as"):
-                if isinstance(table, Mapping) and _inverts_noise(table.get(entry)):
+        if encoding is not None and scheme is not None and scheme.decides_initial_state():
+            decides = f"the scheme {encoding.scheme} decides x_0 itself"
+            yield f"plant.output_matrix: is given, but {decides}; expected another scheme"
+    if process.singular_noise:
+        for name, table in tables.eavesdroppers.items():
+            for entry, strategy in (("strategy", table.strategy), ("reads_as", table.reads_as)):
+                if strategy is not None and _inverts_noise(strategy):
                     yield (
-                        f"eavesdroppers.{name}.{entry}: is {table[entry]}, which uses the inverse of Q, and Q may be "
+                        f"eavesdroppers.{name}.{entry}: is {strategy}, which uses the inverse of Q, and Q may be "
                         "singular; expected another strategy, or a Q that is not"
                     )
 
 
-def _inverts_noise(strategy: object) -> bool:
-    kind = STRATEGIES.get(strategy) if isinstance(strategy, str) else None
+def _inverts_noise(strategy: str) -> bool:
+    kind = STRATEGIES.get(strategy)
     return kind is not None and kind.inverts_noise

@@ -8,24 +8,38 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 
-from evedrop.scenario.events import Slot
-from evedrop.scenario.table import Found, Table, one_of
-from evedrop.scenario.words import as_toml, listed
+from evedrop.model.registry import is_own
+from evedrop.scenario.events import EVENTS
+from evedrop.scenario.events.event import Fault, Slot
+from evedrop.scenario.table import Found, Table, expected
+from evedrop.scenario.words import as_toml, listed, near
 
 NEMESIS = "nemesis"
-FAULTS = ("kill", "pause", "cut", "set", "partition")
-"""The faults it can draw, each as in `[[event]]`."""
+
+
+def fault_of(name: object) -> Fault | None:
+    """How events of this name are drawn; None if they are not."""
+    kind = EVENTS.get(name) if isinstance(name, str) and not is_own(name) else None
+    return None if kind is None else kind.fault
+
+
+def _drawn(name: str) -> str:
+    if fault_of(name) is None:
+        faults = sorted(one for one in EVENTS.names if fault_of(one) is not None)
+        raise expected(listed(faults), near(name, faults))
+    return name
+
 
 Mean = Annotated[float, Field(strict=True, ge=1.0, le=1e8)]
-Fault = Annotated[str, Field(strict=True), AfterValidator(one_of(FAULTS))]
+FaultName = Annotated[str, Field(strict=True), AfterValidator(_drawn)]
 
 
 class NemesisTable(Table):
     """`[nemesis]`: which faults hit which receivers, how often and for how long."""
 
-    faults: Annotated[list[Fault], Field(min_length=1, examples=[["kill", "pause", "cut"]])]
+    faults: Annotated[list[FaultName], Field(min_length=1, examples=[["kill", "pause", "cut"]])]
     targets: Annotated[
         list[Annotated[str, Field(strict=True)]] | None, Field(min_length=1, examples=[["legitimate"]])
     ] = None
@@ -43,13 +57,7 @@ class NemesisTable(Table):
         found: list[Found] = []
         faults = table.get("faults")
         if isinstance(faults, list):
-            if "set" in faults and table.get("set") is None:
-                found.append(
-                    ("set", "is missing, but the fault set is drawn; expected what changes: set = { quality = 0.2 }")
-                )
-            for entry, fault in (("set", "set"), ("state", "kill")):
-                if fault not in faults and table.get(entry) is not None:
-                    found.append((entry, f'is given, but "{fault}" is not among faults; add it, or remove the line'))
+            found += cls._fault_mistakes(table, faults)
         for entry in ("faults", "targets"):
             names = table.get(entry)
             if isinstance(names, list) and len(set(map(str, names))) < len(names):
@@ -59,15 +67,25 @@ class NemesisTable(Table):
             found.append(("to", f"is {to}, not after from, which is {start}; expected a later slot"))
         return found
 
+    @classmethod
+    def _fault_mistakes(cls, table: Mapping[str, Any], faults: Sequence[object]) -> Iterator[Found]:
+        """Entries that a fault needs, and entries that no fault uses."""
+        drawn = {name: fault for name in dict.fromkeys(map(str, faults)) if (fault := fault_of(name)) is not None}
+        for name, fault in drawn.items():
+            for entry, what in fault.needs.items():
+                if table.get(entry) is None:
+                    example = as_toml((cls.model_fields[entry].examples or [0])[0])
+                    yield entry, f"is missing, but the fault {name} is drawn; expected {what}: {entry} = {example}"
+        used = {entry for fault in drawn.values() for entry in fault.entries}
+        for name, kind in EVENTS.items():
+            for entry in kind.fault.entries if kind.fault is not None else ():
+                if entry not in used and table.get(entry) is not None:
+                    yield entry, f'is given, but "{name}" is not among faults; add it, or remove the line'
 
-def nemesis_mistakes(tables: Mapping[str, Any], receivers: Sequence[str]) -> Iterator[str]:
-    """Slots outside the run, and targets that are not receivers."""
-    try:
-        table = NemesisTable.model_validate(tables.get(NEMESIS))
-    except ValidationError:
-        return
-    slots = tables.get("slots")
-    if type(slots) is int and slots > 0:
+
+def nemesis_mistakes(table: NemesisTable, slots: int | None, receivers: Sequence[str]) -> Iterator[str]:
+    """Slots outside the run, and targets that are not receivers; slots: None if they are not valid."""
+    if slots is not None:
         if table.start >= slots:
             yield f"{NEMESIS}.from: is {table.start}, but the last slot is {slots - 1}; expected a slot of the run"
         if table.to is not None and table.to > slots:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, get_args
 
 from pydantic import (
     AfterValidator,
@@ -92,6 +92,17 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, serialize_by_alias=True)
 
     @classmethod
+    def entries(cls) -> list[str]:
+        """The names of its entries."""
+        return [field.alias or name for name, field in cls.model_fields.items()]
+
+    @classmethod
+    def inner(cls, entry: str) -> type[Table] | None:
+        """The table, or the tables of a list or by name, that an entry has; None if it has no such table."""
+        field = cls.model_fields.get(entry)
+        return None if field is None else _table_in(field.annotation)
+
+    @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Mistakes that need several entries to be seen. The table may contain entries with mistakes of their own."""
         del table
@@ -114,6 +125,13 @@ class Table(BaseModel):
         if together:
             raise mistakes
         return table
+
+
+def _table_in(annotation: Any) -> type[Table] | None:
+    """The first class of tables in a type such as `list[LinkTable] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, Table):
+        return annotation
+    return next((found for one in get_args(annotation) if (found := _table_in(one)) is not None), None)
 
 
 def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:

@@ -33,8 +33,8 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
-from evedrop.scenario.application import applications_in, unloadable_in
-from evedrop.scenario.events import EventTable
+from evedrop.scenario.application import APPLICATIONS, applications_in, unloadable_in
+from evedrop.scenario.events.table import AnyEvent, event_table
 from evedrop.scenario.expect import ExpectTable
 from evedrop.scenario.link_table import LinkField, LinkTable, WindowField, changed_link
 from evedrop.scenario.nemesis import NemesisTable
@@ -241,7 +241,7 @@ class Scenario(Table):
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
     network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
-    event: Annotated[list[EventTable], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
+    event: Annotated[list[AnyEvent], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
     )
     nemesis: Annotated[
@@ -252,6 +252,20 @@ class Scenario(Table):
     ] = Field(default_factory=list)
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
     _applications: dict[str, Table] = PrivateAttr(default_factory=dict)
+
+    @classmethod
+    def entries(cls) -> list[str]:
+        """All of them, applications included."""
+        return [name for name in super().entries() if name != "made_with"] + APPLICATIONS.names
+
+    @classmethod
+    def inner(cls, entry: str) -> type[Table] | None:
+        """The tables of applications, and that of events of all kinds."""
+        if entry == "event":
+            return event_table()
+        if entry not in cls.model_fields and entry in APPLICATIONS:
+            return APPLICATIONS[entry].table
+        return super().inner(entry)
 
     @property
     def applications(self) -> Mapping[str, Table]:

@@ -9,46 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import NEVER, Change, ReceiverOutage
-from evedrop.scenario.events import EventTable
-from evedrop.scenario.words import as_toml
-
-_REASONS = {"kill": Fate.DOWN, "pause": Fate.PAUSED}
-_ENDS = {"cut": "heal", "partition": "heal", "jam": "jammed", "kill": "restart", "pause": "resume"}
-_JAMMING = {"jam": "acknowledgements are attacked", "jammed": "acknowledgements are no longer attacked"}
+from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Return
+from evedrop.scenario.events.event import Act, EventKind
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 """Maps a receiver and the changed entries of its link to the link's new settings."""
-
-
-@dataclass(frozen=True)
-class Act:
-    """One thing done at one slot."""
-
-    at: int
-    kind: str
-    """`set`, `cut`, `heal`, `kill`, `restart`, `pause`, `resume`, `jam`, `jammed` or `note`."""
-    names: tuple[str, ...]
-    """The receivers it is done to."""
-    changes: Mapping[str, Any] | None = None
-    """For a `set`: the link's entries; None restores those of the scenario."""
-    text: str = ""
-    """For a note."""
-
-    @property
-    def said(self) -> str:
-        """The act as a line of a journal."""
-        if self.kind == "note":
-            return self.text
-        if self.kind in _JAMMING:
-            return _JAMMING[self.kind]
-        if self.kind != "set":
-            return f"{self.kind} {', '.join(self.names)}"
-        changes = (
-            [] if self.changes is None else [f"{entry} = {as_toml(value)}" for entry, value in self.changes.items()]
-        )
-        return f"link {', '.join(self.names)}: {', '.join(changes) or 'as at first'}"
 
 
 @dataclass(frozen=True)
@@ -83,29 +49,27 @@ class Timeline:
         """Slots [from, to) in which acknowledgements are attacked; None if no event says so: they are then always attacked."""
         spans: list[list[int]] = []
         for act in self.acts:
-            if act.kind == "jam":
-                spans.append([act.at, NEVER])
-            elif act.kind == "jammed":
-                spans[-1][1] = act.at
+            match act.effect:
+                case Jamming(on=True):
+                    spans.append([act.at, NEVER])
+                case Jamming():
+                    spans[-1][1] = act.at
         return spans or None
 
     @classmethod
-    def of(cls, events: Iterable[EventTable], receivers: Sequence[str], changed: Changed) -> Timeline:
+    def of(cls, events: Iterable[EventKind], receivers: Sequence[str], changed: Changed) -> Timeline:
         """The timeline of events that have been checked."""
-        acts = sorted((act for event in events for act in acts_of(event)), key=lambda act: act.at)
+        acts = acts_of(events)
         return cls(
-            tuple(acts),
+            acts,
             {name: tuple(_changes(name, acts, changed)) for name in receivers},
-            {name: tuple(_outages(name, acts, events)) for name in receivers},
+            {name: tuple(_outages(name, acts)) for name in receivers},
         )
 
 
-def acts_of(event: EventTable) -> Iterator[Act]:
-    """The beginning of an event, and its end if it lasts."""
-    kind = "cut" if event.kind == "partition" else event.kind
-    yield Act(event.first, kind, event.names, event.set, event.note or "")
-    if event.to is not None:
-        yield Act(event.to, _ENDS.get(event.kind, "set"), event.names, None)
+def acts_of(events: Iterable[EventKind]) -> tuple[Act, ...]:
+    """Everything that events do, in order of slots."""
+    return tuple(sorted((act for event in events for act in event.acts()), key=lambda act: act.at))
 
 
 def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Change]:
@@ -113,11 +77,14 @@ def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Chang
     for act in acts:
         if name not in act.names:
             continue
-        if act.kind == "set":
-            entries = {} if act.changes is None else _over(entries, act.changes)
-            yield Change(act.at, settings=changed(name, entries))
-        elif act.kind in ("cut", "heal"):
-            yield Change(act.at, cut=act.kind == "cut")
+        match act.effect:
+            case LinkSettings(changes):
+                entries = {} if changes is None else _over(entries, changes)
+                yield Change(act.at, settings=changed(name, entries))
+            case LinkCut():
+                yield Change(act.at, cut=True)
+            case LinkHealed():
+                yield Change(act.at, cut=False)
 
 
 def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,19 +94,15 @@ def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
     return {**{name: value for name, value in entries.items() if name not in gone}, **changes}
 
 
-def _outages(name: str, acts: Sequence[Act], events: Iterable[EventTable]) -> Iterator[Away]:
-    states = {
-        (event.first if event.kind == "restart" else event.to): event.state for event in events if name in event.names
-    }
-    began: Act | None = None
+def _outages(name: str, acts: Sequence[Act]) -> Iterator[Away]:
+    began: tuple[int, Leave] | None = None
     for act in acts:
         if name not in act.names:
             continue
-        if act.kind in _REASONS:
-            began = act
-        elif began is not None and act.kind == _ENDS[began.kind]:
-            keeps = began.kind == "pause" or states.get(act.at) == "last"
-            yield Away(began.at, act.at, _REASONS[began.kind], keeps)
+        if isinstance(act.effect, Leave):
+            began = act.at, act.effect
+        elif began is not None and isinstance(act.effect, Return):
+            yield Away(began[0], act.at, began[1].reason, act.effect.keeps_state)
             began = None
     if began is not None:
-        yield Away(began.at, NEVER, _REASONS[began.kind], began.kind == "pause")
+        yield Away(began[0], NEVER, began[1].reason, began[1].keeps_state)

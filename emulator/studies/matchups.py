@@ -14,7 +14,6 @@ from typing import Any
 
 from evedrop.errors import NotRegistered, ScenarioError, UsageError
 from evedrop.loading import checked
-from evedrop.loading.mistakes import lacking_streams
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.readers import RESERVED
 from evedrop.model.registry import Registry
@@ -22,6 +21,8 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.results.comparison import Match, receiver_name
 from evedrop.scenario import Scenario
+from evedrop.scenario.across import lacking_streams
+from evedrop.scenario.events.effects import Jamming
 from evedrop.scenario.words import listed, near
 
 ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}
@@ -180,7 +181,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
         "event": [
             table
             for event, table in zip(scenario.event, tables["event"], strict=True)
-            if event.kind != "jam" and set(event.names) <= {LEGITIMATE}
+            if event.does is not Jamming and set(event.names) <= {LEGITIMATE}
         ],
         "expect": [],
         "record_trials": 1,

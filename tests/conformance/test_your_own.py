@@ -121,7 +121,7 @@ def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedro
     """The router knows where the run's modules are; a run that was started without any gets none on the way."""
     shifts = {"link": "legitimate", "set": {"loss": {"model": "shifts:Shifts", "period": 10, "good": 0.9, "bad": 0.1}}}
     scenario = load(tutorial.folder / "three.toml")
-    assert with_event(scenario, shifts, 30).event[0].set == shifts["set"]
+    assert with_event(scenario, shifts, 30).event[0].model_dump(exclude_none=True) == {"at": 30, **shifts}
     with pytest.raises(ScenarioError, match="set: names shifts:Shifts, and the run was started without modules"):
         with_event(load("vehicle"), shifts, 30)
     event = 'event=[{from = 5, to = 15, kill = "tracker"}, {at = 10, link = "naive", set = {loss = {model = "shifts:Shifts", '

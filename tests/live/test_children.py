@@ -165,7 +165,7 @@ MALFORMED = {
     b'{"event": "ended", "status": 0}': "how is missing",
     b'{"event": "ended", "status": "0", "how": ""}': "status is '0', expected a whole number",
     b'{"event": "started", "k": 1}': "k is an unknown entry",
-    b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}': "do is 'dance', expected one of kill",
+    b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}': "do is 'dance', expected one of end, start",
     b'{"event": "progress", "done": 1, "rate": true, "rate_unit": "", "squared_errors": {}}': "rate is True, expected",
     b'{"event": "progress", "done": -1, "rate": 1, "rate_unit": "", "squared_errors": {}}': "done is -1, expected",
 }

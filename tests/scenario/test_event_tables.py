@@ -215,6 +215,14 @@ def test_what_events_come_to() -> None:
     assert scenario.timeline.holds[20][0].said == "cut legitimate, eve"
 
 
+def test_a_restart_keeps_the_state_that_it_says() -> None:
+    """Whatever else ends in the same slot."""
+    killed, cut = {"from": 10, "to": 20, "kill": "eve", "state": "last"}, {"from": 12, "to": 20, "cut": "eve"}
+    for events in ((killed, cut), (cut, killed)):
+        (away,) = right(*events).timeline.outages["eve"]
+        assert away.keeps_state
+
+
 def test_events_survive_being_written_and_read() -> None:
     """A checked scenario, dumped as tables, is the same scenario."""
     scenario = right({"from": 20, "to": 25, "cut": "eve"}, {"at": 30, "link": "eve", "set": {"quality": 0.5}})

@@ -121,12 +121,13 @@ def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
     from pydantic import ValidationError
 
     from evedrop.live.observer.observer import observe
-    from evedrop.loading.mistakes import sentences
+    from evedrop.scenario import Scenario
+    from evedrop.scenario.sentences import sentences
 
     try:
         return observe(brief, _report, serve)
     except ValidationError as error:
-        lines = "; ".join(sentences(error)[:_MOST_TOLD])
+        lines = "; ".join(sentences(error, Scenario)[:_MOST_TOLD])
         raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
 
 

@@ -107,7 +107,10 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
 
 def _event(name: str, words: list[str]) -> dict[str, Any]:
     """The change as an event of a scenario, without its time."""
-    if words in (["cut"], ["heal"]):
+    from evedrop.scenario.events import EVENTS
+
+    alone = {kind for kind, event in EVENTS.items() if event.by_operator and event.names_in == kind}
+    if len(words) == 1 and words[0] in alone:
         return {words[0]: name}
     changes: dict[str, Any] = {}
     for word in words:

@@ -32,7 +32,7 @@ from evedrop.live.protocol.news import (
     Started,
     read_news,
 )
-from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
 from evedrop.signals import SHOW_STACKS, held_back
@@ -204,19 +204,18 @@ class Children:
 
         Raises RunError if a process cannot be restarted.
         """
-        name, do = request.process, request.do
-        process = self._processes[name]
-        if do == "kill":
+        name, process = request.process, self._processes[request.process]
+        if request.do == ProcessAction.END:
             self._killed.add(process.pid)
             process.kill()
             process.wait()
             if process.stdin is not None:
                 process.stdin.close()
-        elif do == "restart":
+        elif request.do == ProcessAction.START:
             self.start(replace(self._briefs[name], first=request.first), again=True)
         else:
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal({"pause": signal.SIGSTOP, "resume": signal.SIGCONT}[do])
+                process.send_signal(signal.SIGSTOP if request.do == ProcessAction.STOP else signal.SIGCONT)
         observer = self._processes[OBSERVER].stdin
         if observer is not None:
             with contextlib.suppress(OSError):

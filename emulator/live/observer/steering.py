@@ -23,10 +23,9 @@ from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
-from evedrop.scenario.timeline import Act, acts_of
+from evedrop.scenario.events.effects import Leave, Return
+from evedrop.scenario.events.event import Act
 from evedrop.score.summary import RunEvent
-
-_PROCESS_ACTS = ("kill", "restart", "pause", "resume")
 
 
 @final
@@ -50,7 +49,7 @@ class Steering:
         """The slot before which the sensor holds; None while it does not."""
         self._pending: list[Act] = []
         self._left: dict[str, int] = {}
-        self._waiting: Act | None = None
+        self._waiting: tuple[Act, Leave | Return] | None = None
         self._confirmed = True
         self._since = 0.0
         self._orders: deque[Order] = deque()
@@ -138,13 +137,12 @@ class Steering:
 
     def _settled(self) -> bool:
         """Whether the last act on a process has taken effect."""
-        act = self._waiting
-        if act is None:
+        if self._waiting is None:
             return True
-        # A process that was paused for long loses its connection, and must have it back.
-        there = {"kill": False, "restart": True, "resume": True}.get(act.kind)
+        act, effect = self._waiting
+        there = effect.action.connected
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
-            if act.kind in ("restart", "resume"):
+            if isinstance(effect, Return):
                 self._conductor.absent -= set(act.names)
                 self._tell(Back())
             self._waiting = None
@@ -161,15 +159,15 @@ class Steering:
 
     def _may(self, act: Act) -> bool:
         """Whether an act may begin: a receiver that is to go must have left, since it may not have seen the hold yet."""
-        return act.kind not in ("kill", "pause") or all(self._left.get(name) == act.at for name in act.names)
+        return not isinstance(act.effect, Leave) or all(self._left.get(name) == act.at for name in act.names)
 
     def _do(self, k: int, act: Act) -> None:
         self._note(k, act.said, "scenario")
-        if act.kind in _PROCESS_ACTS:
-            if act.kind in ("kill", "pause"):
+        if isinstance(act.effect, (Leave, Return)):
+            if isinstance(act.effect, Leave):
                 self._conductor.absent |= set(act.names)
-            self._waiting, self._confirmed, self._since = act, False, time.monotonic()
-            self._tell(ProcessRequest(act.kind, act.names[0], k, len(self.events)))
+            self._waiting, self._confirmed, self._since = (act, act.effect), False, time.monotonic()
+            self._tell(ProcessRequest(act.effect.action, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""
@@ -204,7 +202,7 @@ class Steering:
         except ScenarioError as error:
             order.refuse(*error.mistakes)
             return
-        act = next(acts_of(changed.event[-1]))
+        act = next(changed.event[-1].acts())
         self._scenario = changed
         self._note(k, act.said, "operator")
         self._keep(changed)

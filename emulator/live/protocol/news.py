@@ -24,8 +24,7 @@ from evedrop.live.protocol.brief_entries import (
     text,
     whole,
 )
-
-_ACTS = ("kill", "restart", "pause", "resume")
+from evedrop.names import ProcessAction
 
 
 def _real(path: str, found: Any) -> Iterator[str]:
@@ -34,9 +33,9 @@ def _real(path: str, found: Any) -> Iterator[str]:
         yield f"{path} is {found!r:.40}, expected a number"
 
 
-def _act(path: str, found: Any) -> Iterator[str]:
-    if found not in _ACTS:
-        yield f"{path} is {found!r:.40}, expected one of {', '.join(_ACTS)}"
+def _action(path: str, found: Any) -> Iterator[str]:
+    if found not in [*ProcessAction]:
+        yield f"{path} is {found!r:.40}, expected one of {', '.join(ProcessAction)}"
 
 
 _TEXTS: Check = listed(text)
@@ -87,8 +86,7 @@ class ProcessRequest(News):
     """The observer asks the launcher to act on a process, and to confirm it."""
 
     event = "act"
-    do: str = field(metadata=entry(_act))
-    """`kill`, `restart`, `pause` or `resume`."""
+    do: ProcessAction = field(metadata=entry(_action, ProcessAction))
     process: str = field(metadata=entry(text))
     first: int = field(metadata=entry(SLOT))
     """The first slot that a restarted process handles."""

@@ -1,0 +1,137 @@
+"""Mistakes in events that only show when tables are compared: names, slots, changes of links, and the order of events.
+
+Source: docs/scenario.md, events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from evedrop.model.links.link import Fate
+from evedrop.scenario.events.effects import Leave, LinkCut, LinkHealed, LinkSettings, Return
+from evedrop.scenario.events.event import Act, EventKind, Surroundings
+from evedrop.scenario.link_table import LinkTable, changed_link
+from evedrop.scenario.sentences import sentences
+from evedrop.scenario.valid import ValidTables
+from evedrop.scenario.words import as_toml, listed
+
+Numbered = tuple[int, Act]
+"""An act with the number of its event."""
+
+
+def event_mistakes(tables: ValidTables) -> Iterator[str]:
+    """Mistakes across tables in events that are valid by themselves, each with the number of its event."""
+    attack = None if tables.acknowledgements is None else tables.acknowledgements.attack
+    surroundings = Surroundings(
+        tables.scheme,
+        "" if tables.encoding is None else tables.encoding.scheme,
+        attack if "acknowledgements" in tables.given else "none",
+    )
+    for i, event in tables.event:
+        path = f"event.{i}"
+        if tables.slots is not None:
+            yield from _when_mistakes(path, event, tables.slots)
+        for name in event.names:
+            if name not in tables.receivers:
+                hint = ": it is not a receiver" if name in ("sensor", "router", "observer") else ""
+                yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(tables.receivers)}"
+        yield from (f"{path}.{entry}: {what}" for entry, what in event.compared(surroundings))
+        for act in event.acts():
+            if isinstance(act.effect, LinkSettings) and act.effect.entries is not None:
+                for name in act.names:
+                    yield from _change_mistakes(f"{path}.{act.entry}", name, act.effect.entries, tables)
+    yield from _order_mistakes(tables)
+    kinds = dict.fromkeys(type(event) for _, event in tables.event)
+    for kind in kinds:
+        yield from kind.in_turn([(i, event) for i, event in tables.event if type(event) is kind])
+
+
+def _acts(tables: ValidTables) -> list[Numbered]:
+    """Everything that happens, in order of slots."""
+    return sorted(((i, act) for i, event in tables.event for act in event.acts()), key=lambda one: one[1].at)
+
+
+def away_in(tables: ValidTables, name: str, slot: int) -> str | None:
+    """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
+    away = None
+    for i, act in _acts(tables):
+        if act.at <= slot and name in act.names and isinstance(act.effect, (Leave, Return)):
+            away = (i, act.at, act.effect.reason) if isinstance(act.effect, Leave) else None
+    return None if away is None else f"{name} is {_said(away[2])} (event.{away[0]}, from slot {away[1]} on)"
+
+
+def _said(reason: Fate) -> str:
+    return reason.name.lower()
+
+
+def _when_mistakes(path: str, event: EventKind, slots: int) -> Iterator[str]:
+    if event.first >= slots:
+        entry = "at" if event.at is not None else "from"
+        yield f"{path}.{entry}: is {event.first}, but the last slot is {slots - 1}; expected a slot of the run"
+    if event.to is not None and event.to > slots:
+        yield f"{path}.to: is {event.to}; expected at most {slots}, the end of the run"
+
+
+def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], tables: ValidTables) -> Iterator[str]:
+    """Mistakes in changed entries of a receiver's link. Pooled links become one, with a quality or a loss model of its own."""
+    link = tables.links.get(name)
+    if link is None:
+        if name not in tables.eavesdroppers or tables.eavesdroppers[name].links is None:
+            return
+        if not {"quality", "loss"} & set(changes):
+            yield f"{path}: {name} has several links; expected a quality or a loss, for the one link that replaces them"
+            return
+        link = LinkTable(quality=1.0)
+    known = [entry for entry in LinkTable.model_fields if entry != "correlation"]
+    for entry in changes:
+        if entry not in known:
+            yield f"{path}.{entry}: is not a link setting that can be changed; expected {listed(known)}"
+    try:
+        changed = changed_link(link, {entry: value for entry, value in changes.items() if entry in known})
+    except ValidationError as error:
+        yield from (f"{path}.{line}" for line in sentences(error, LinkTable))
+        return
+    if changed.in_seconds and "slot_seconds" not in tables.given:
+        yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
+    if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
+        yield f"{path}.loss.model: differs from the first one, but the link's losses are tied to another link's"
+
+
+def _order_mistakes(tables: ValidTables) -> Iterator[str]:
+    """Events that end something that has not begun, or begin something during it or during another outage."""
+    acts = _acts(tables)
+    for name in tables.receivers:
+        yield from _order_mistakes_of(name, [(i, act) for i, act in acts if name in act.names])
+
+
+def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
+    """acts: those on this receiver."""
+    cut: int | None = None
+    away: tuple[int, Fate] | None = None
+    ended = -1
+    for i, act in acts:
+        path = f"event.{i}.{act.entry}: {name}"
+        match act.effect:
+            case LinkCut():
+                if cut is not None:
+                    yield f"{path} is cut already, from slot {cut} on; expected a heal before"
+                cut = act.at
+            case LinkHealed():
+                if cut is None:
+                    yield f"{path} is not cut at slot {act.at}; expected a cut before"
+                cut = None
+            case Leave(reason):
+                if away is not None:
+                    yield f"{path} is {_said(away[1])} already, from slot {away[0]} on; expected it to be back"
+                elif act.at == ended:
+                    yield f"{path} is back in slot {act.at} only; expected a later slot"
+                away = act.at, reason
+            case Return(reason, after=after):
+                if away is None or away[1] != reason:
+                    yield f"{path} is not {_said(reason)} at slot {act.at}; expected a {after} before"
+                elif act.at <= away[0]:
+                    yield f"{path} leaves in slot {act.at} only; expected a later slot"
+                away, ended = None, act.at

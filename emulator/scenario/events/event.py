@@ -1,0 +1,133 @@
+"""The base class of the kinds of event: when an event happens, and what a kind says about itself.
+
+Source: docs/scenario.md, events; docs/your-own.md, an event.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import Field
+
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.scenario.events.effects import Effect
+from evedrop.scenario.table import Found, Table
+from evedrop.streams import MOST_SLOTS
+
+Names = str | list[str]
+Slot = Annotated[int, Field(strict=True, ge=0, le=MOST_SLOTS, examples=[400])]
+
+
+@dataclass(frozen=True)
+class Act:
+    """One thing done at one slot."""
+
+    at: int
+    entry: str
+    """The entry of the event that mistakes about it name."""
+    names: tuple[str, ...]
+    """The receivers it is done to."""
+    said: str
+    """The line of a journal."""
+    effect: Effect
+
+
+@dataclass(frozen=True)
+class Fault:
+    """How a nemesis draws events of a kind."""
+
+    place: int
+    """Among the kinds that a draw chooses from: another place changes the faults of every seed."""
+    together: bool = False
+    """Whether one event happens to several receivers, for each of which a coin decides."""
+    needs: Mapping[str, str] = field(default_factory=dict)
+    """Entries of `[nemesis]` that the event needs → what they are."""
+    may_have: tuple[str, ...] = ()
+    """Entries of `[nemesis]` that the event has if they are given."""
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The entries of `[nemesis]` that go into the event."""
+        return (*self.needs, *self.may_have)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The parts of a scenario that a single event is compared with; None where there is a mistake."""
+
+    scheme: type[Scheme] | None
+    scheme_name: str
+    attack: str | None
+    """On acknowledgements; `none` if there is none."""
+
+
+class When(Table):
+    """The slots of an event."""
+
+    at: Slot | None = None
+    start: Annotated[Slot | None, Field(alias="from")] = None
+    to: Slot | None = None
+
+
+class EventKind(When):
+    """`[[event]]`: one thing that happens `at` a slot, or lasts `from` one slot `to` another. A class for each kind."""
+
+    kind: ClassVar[str]
+    """Its name in the registry, and its main entry."""
+    does: ClassVar[type[Effect]]
+    """What it does when it begins."""
+    lasts: ClassVar[bool] = False
+    """Whether it can last `from` one slot `to` another."""
+    names_in: ClassVar[str | None] = None
+    """The entry with the receivers it happens to; None if it happens to none."""
+    by_operator: ClassVar[bool] = False
+    """Whether an operator can cause it during a run. Only for built-in kinds that change links."""
+    fault: ClassVar[Fault | None] = None
+    """How a nemesis draws it; None if it does not."""
+    alone: ClassVar[Mapping[str, str]] = {}
+    """Entries besides `kind` → the mistake where such an entry is given without any kind that has it."""
+
+    @abstractmethod
+    def acts(self) -> Iterator[Act]:
+        """The beginning of the event, and its end if it lasts."""
+
+    def compared(self, surroundings: Surroundings) -> Iterator[Found]:
+        """Mistakes that show only with other tables. Slots, receivers and changes of links are checked for every kind."""
+        del surroundings
+        yield from ()
+
+    @classmethod
+    def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
+        """Mistakes that show only among all events of this kind; events: each with its number."""
+        del events
+        yield from ()
+
+    @classmethod
+    def own_entries(cls) -> list[str]:
+        """Its entries besides the slots."""
+        return [name for name in cls.model_fields if name not in When.model_fields]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The receivers it happens to."""
+        found: Any = () if self.names_in is None else getattr(self, self.names_in)
+        return (found,) if isinstance(found, str) else tuple(found)
+
+    @property
+    def first(self) -> int:
+        """The slot in which it begins."""
+        slot = self.at if self.at is not None else self.start
+        assert slot is not None  # noqa: S101 - checked when it was made
+        return slot
+
+    def begin(self, said: str, effect: Effect) -> Act:
+        """Its beginning."""
+        return Act(self.first, self.kind, self.names, said, effect)
+
+
+def spoken(names: Sequence[str]) -> str:
+    """Receivers in a line of a journal."""
+    return ", ".join(names)

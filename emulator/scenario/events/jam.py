@@ -1,0 +1,51 @@
+"""`jam`: acknowledgements are attacked, as `[acknowledgements]` describes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Annotated, Self
+
+from pydantic import Field
+
+from evedrop.scenario.events.effects import Jamming
+from evedrop.scenario.events.event import Act, EventKind, Surroundings
+from evedrop.scenario.table import Found
+from evedrop.scenario.words import as_toml
+
+_JAMMED = "acknowledgements"
+
+
+class Jam(EventKind):
+    """`jam`: the attack goes on only during such events."""
+
+    jam: Annotated[str, Field(examples=[_JAMMED])]
+
+    kind = "jam"
+    does = Jamming
+    lasts = True
+
+    def acts(self) -> Iterator[Act]:
+        """The attack's beginning and end."""
+        yield self.begin("acknowledgements are attacked", Jamming(on=True))
+        if self.to is not None:
+            yield Act(self.to, self.kind, (), "acknowledgements are no longer attacked", Jamming(on=False))
+
+    def compared(self, surroundings: Surroundings) -> Iterator[Found]:
+        """There must be acknowledgements and an attack on them."""
+        scheme = surroundings.scheme
+        if self.jam != _JAMMED:
+            yield "jam", f"is {as_toml(self.jam)}; expected {as_toml(_JAMMED)}"
+        elif scheme is not None and not scheme.needs_acknowledgements:
+            name = surroundings.scheme_name
+            yield "jam", f"the scheme {name} has no acknowledgements that could be jammed; remove the event"
+        elif surroundings.attack == "none":
+            yield "jam", 'no attack is described; expected acknowledgements.attack = "all", or another, as well'
+
+    @classmethod
+    def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
+        """An attack must end before the next one begins."""
+        jams = sorted(((event.first, event.to, i) for i, event in events), key=lambda one: one[0])
+        for (_, to, _), (first, _, i) in pairwise(jams):
+            if to is None or to > first:
+                yield f"event.{i}.jam: begins in slot {first}, while another one lasts; expected that one to end first"

@@ -1,0 +1,114 @@
+"""`[[event]]` as a table with the entries of all kinds: checked as a whole, then made an event of its kind.
+
+So an entry of a wrong kind or type, two kinds at once and a wrong time are all reported together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field, PlainValidator, SerializeAsAny, create_model
+
+from evedrop.errors import NotRegistered
+from evedrop.scenario.events import EVENTS
+from evedrop.scenario.events.event import EventKind, When
+from evedrop.scenario.table import Found
+from evedrop.scenario.words import listed
+
+
+class EventTable(When):
+    """The entries of some kinds of event; all of them may be missing."""
+
+    kinds: ClassVar[Mapping[str, type[EventKind]]]
+    broken: ClassVar[Mapping[str, str]]
+    """Kinds of installed packages that cannot be loaded → why, in words that follow the name."""
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Mistakes unless exactly one thing happens, at a time that is stated in one way."""
+        return [*cls._what_mistakes(table), *cls._when_mistakes(table)]
+
+    @classmethod
+    def _given(cls, table: Mapping[str, Any]) -> list[type[EventKind]]:
+        return [kind for name, kind in cls.kinds.items() if table.get(name) is not None]
+
+    @classmethod
+    def _what_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        given = cls._given(table)
+        unloadable = [name for name in cls.broken if table.get(name) is not None]
+        found: list[Found] = [(name, f"is an event{cls.broken[name]}") for name in unloadable]
+        if len(given) != 1 and not unloadable:
+            said = f"has {listed([kind.kind for kind in given])} at once" if given else "does not say what happens"
+            found.append(("event", f'{said}; expected one of {listed([*cls.kinds])}, such as cut = "legitimate"'))
+        if len(given) == 1:
+            found += given[0].mistakes(table)
+        has = {entry for kind in given for entry in kind.own_entries()}
+        alone = {entry: what for kind in cls.kinds.values() for entry, what in kind.alone.items()}
+        return found + [
+            (entry, what) for entry, what in alone.items() if table.get(entry) is not None and entry not in has
+        ]
+
+    @classmethod
+    def _when_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        at, start, to = (table.get(name) for name in ("at", "from", "to"))
+        given = cls._given(table)
+        if (at is None) == (start is None):
+            return [("at", "and from are both there" if at is not None else "is missing; expected at = 400")]
+        if start is None and to is not None:
+            return [("to", "is given without from; expected from and to, or only at")]
+        if start is not None and to is None:
+            return [("to", "is missing, but from is given; expected the slot in which it ends")]
+        if type(start) is int and type(to) is int and to <= start:
+            return [("to", f"is {to}, not after from, which is {start}; expected a later slot")]
+        if start is not None and len(given) == 1 and not given[0].lasts:
+            return [("from", f"is given, but {given[0].kind} happens in one slot; expected at")]
+        return []
+
+
+def event_table(entries: Iterable[str] | None = None) -> type[EventTable]:
+    """The table of the built-in kinds; of packages' kinds too if some of these entries are not built in, or for None."""
+    built_in = _table_of(tuple(EVENTS.items()), ())
+    if entries is not None and set(entries) <= set(built_in.entries()):
+        return built_in
+    kinds, broken = dict(EVENTS), {}
+    for name in EVENTS.names:
+        if EVENTS.foreign(name):
+            try:
+                kind = EVENTS[name]
+            except NotRegistered as error:
+                broken[name] = error.why
+                continue
+            if getattr(kind, "kind", None) == name and name in kind.own_entries():
+                kinds[name] = kind
+            else:
+                broken[name] = f", whose class {kind.__name__} has not that kind and entry; expected both"
+    return _table_of(tuple(kinds.items()), tuple(broken.items()))
+
+
+@lru_cache(maxsize=8)
+def _table_of(kinds: tuple[tuple[str, type[EventKind]], ...], broken: tuple[tuple[str, str], ...]) -> type[EventTable]:
+    fields: dict[str, Any] = {}
+    for _, kind in kinds:
+        for entry in kind.own_entries():
+            field = kind.model_fields[entry]
+            annotation: Any = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+            fields.setdefault(entry, (annotation | None, Field(None, examples=field.examples)))
+    fields |= {name: (Any, None) for name, _ in broken}
+    table = create_model("EventTable", __base__=EventTable, **fields)
+    table.kinds, table.broken = dict(kinds), dict(broken)
+    return table
+
+
+def event_of(found: object) -> EventKind:
+    """The event that a table describes. Raises ValidationError with every mistake in it."""
+    if isinstance(found, EventKind):
+        return found
+    table = event_table(found if isinstance(found, Mapping) else ())
+    checked = table.model_validate(found)
+    entries = checked.model_dump(exclude_none=True, exclude_unset=True)
+    return next(kind for name, kind in table.kinds.items() if name in entries).model_validate(entries)
+
+
+AnyEvent = Annotated[SerializeAsAny[EventKind], PlainValidator(event_of)]
