@@ -10,7 +10,7 @@ from typing import Any, Self
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import Bounds, Command, read_command
+from evedrop.live.protocol.commands import Bounds, ControlCommand, read_command
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 from tests.conftest import LIMIT
@@ -102,16 +102,16 @@ class FakeSession:
 
     appear = ready
 
-    def wait_for(self, kind: type[Command]) -> None:
+    def wait_for(self, kind: type[ControlCommand]) -> None:
         """Until the test commands it."""
         while not isinstance(self.command(), kind):
             pass
 
-    def command(self, receivers: Collection[str] | None = None) -> Command:
+    def command(self, receivers: Collection[str] | None = None) -> ControlCommand:
         """The next command, which the test gives."""
         message = Reader(self.keys.control(self._process), self._stage.commands.get(timeout=LIMIT))
         return read_command(message, Bounds(self._slots, receivers))
 
-    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
+    def commanded(self, receivers: Collection[str] | None = None) -> ControlCommand | None:
         """The next command if the test has given one."""
         return None if self._stage.commands.empty() else self.command(receivers)

@@ -13,7 +13,7 @@ import pytest
 
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.protocol.brief import Flow
-from evedrop.live.protocol.commands import Again, Command
+from evedrop.live.protocol.commands import Again, ControlCommand
 from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.loading import load
 from evedrop.ports import free_port
@@ -341,7 +341,7 @@ class Conducted:
         """As the test says."""
         return self.another_router
 
-    def command(self, name: str, command: Command) -> None:
+    def command(self, name: str, command: ControlCommand) -> None:
         """Note the rounds."""
         if name == "sensor" and isinstance(command, Again):
             self.rounds.append(command.slot)

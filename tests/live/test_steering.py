@@ -10,7 +10,7 @@ import pytest
 from evedrop.live.network.operator import Answer, Request, read_answer
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
-from evedrop.live.protocol.commands import Command, Go, Hold, LinkChange
+from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
 from evedrop.live.protocol.news import Held, News
 from evedrop.loading import checked
 from evedrop.model.slot.link import Change
@@ -21,7 +21,7 @@ SLOTS = 100
 TABLES = scalar_tables(1.0, 0.01, slots=SLOTS, eavesdroppers={"smart": {"strategy": "smart", "link": {"quality": 0.7}}})
 
 
-Sent = tuple[str, Command]
+Sent = tuple[str, ControlCommand]
 """A process, and what it is told."""
 
 
@@ -45,7 +45,7 @@ class Told:
     away: set[str] = field(default_factory=set)
     sent: list[Sent] = field(default_factory=list)
 
-    def command(self, name: str, command: Command) -> None:
+    def command(self, name: str, command: ControlCommand) -> None:
         """Keep it."""
         self.sent.append((name, command))
 

@@ -17,7 +17,7 @@ from typing import final
 from evedrop.environment import lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.launch.starter import Process, Starter, start_process
+from evedrop.live.launch.starter import StartedProcess, Starter, start_process
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.news import (
@@ -101,7 +101,7 @@ class Children:
         self._folder, self._starter = folder, starter
         self._lock_step = lock_step
         self._private = private
-        self._processes: dict[str, Process] = {}
+        self._processes: dict[str, StartedProcess] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
         self._unread = 0
         """How many processes were started again and have not joined the run yet; they may not have read their briefs."""
@@ -172,7 +172,7 @@ class Children:
         self._processes[brief.process] = process
         threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
 
-    def _follow(self, name: str, process: Process) -> None:
+    def _follow(self, name: str, process: StartedProcess) -> None:
         if process.stdout is not None:
             with process.stdout as lines:
                 for line in lines:

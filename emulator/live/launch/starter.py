@@ -11,7 +11,7 @@ from typing import IO, Protocol
 from evedrop.names import OBSERVER
 
 
-class Process(Protocol):
+class StartedProcess(Protocol):
     """The part of `subprocess.Popen` that the launcher uses."""
 
     @property
@@ -45,11 +45,11 @@ class Process(Protocol):
 class Starter(Protocol):
     """Starts the process of a role with the file of its brief; an observer's news come on `stdout`."""
 
-    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Process:
+    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
         """Start it. Raises OSError."""
 
 
-def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Process:
+def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
     """Start `evedrop ROLE BRIEF` in a session of its own."""
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "evedrop", role, str(brief)],

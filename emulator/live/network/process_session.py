@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from evedrop.live.network.resending import ReplayBuffer
-from evedrop.live.protocol.commands import Command
+from evedrop.live.protocol.commands import ControlCommand
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.whereabouts import Place
 
@@ -57,11 +57,11 @@ class ProcessSession(Protocol):
     def appear(self) -> None:
         """Show that this process is present."""
 
-    def wait_for(self, kind: type[Command]) -> None:
+    def wait_for(self, kind: type[ControlCommand]) -> None:
         """Wait for a command."""
 
-    def command(self, receivers: Collection[str] | None = None) -> Command:
+    def command(self, receivers: Collection[str] | None = None) -> ControlCommand:
         """Wait for the next command."""
 
-    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
+    def commanded(self, receivers: Collection[str] | None = None) -> ControlCommand | None:
         """The next command, or None."""

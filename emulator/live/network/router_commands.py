@@ -12,7 +12,7 @@ from typing import final
 
 from evedrop.errors import EvedropError
 from evedrop.live.network.process_session import ProcessSession
-from evedrop.live.protocol.commands import Again, Command, End
+from evedrop.live.protocol.commands import Again, ControlCommand, End
 from evedrop.names import ROUTER
 
 
@@ -42,7 +42,7 @@ class Commands:
         """
         self._session, self._receivers, self._knock, self._waiting = session, receivers, knock, tuple(waiting)
         self._patience = patience
-        self._orders: SimpleQueue[tuple[int, Command] | None] = SimpleQueue()
+        self._orders: SimpleQueue[tuple[int, ControlCommand] | None] = SimpleQueue()
         self._news = threading.Condition()
         self._asked = Again(0, 0)
         self._heeded = 0
@@ -61,7 +61,7 @@ class Commands:
         self._wake()
         self._knock()
 
-    def _sort(self, command: Command) -> None:
+    def _sort(self, command: ControlCommand) -> None:
         match command:
             case Again():
                 with self._news:
@@ -89,7 +89,7 @@ class Commands:
         if self.over() or self._asked.round != self._heeded:
             raise ReplayRequested
 
-    def next(self) -> Command:
+    def next(self) -> ControlCommand:
         """The next command of the current round; those of earlier rounds are skipped. Raises ReplayRequested as `check` does."""
         while True:
             with self._session.place.waiting(self._session.keys.control(ROUTER)):

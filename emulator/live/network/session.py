@@ -36,7 +36,7 @@ from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, over, refusal
-from evedrop.live.protocol.commands import Abandon, Again, Bounds, Command, End, Where, read_command
+from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, End, Where, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, reader_of
 from evedrop.live.protocol.message_limits import low_pass
@@ -365,10 +365,10 @@ class Session:
                     return
         self._commands.put(payload)
 
-    def _read(self, payload: bytes, receivers: Collection[str] | None = None) -> Command:
+    def _read(self, payload: bytes, receivers: Collection[str] | None = None) -> ControlCommand:
         return read_command(Reader(self._control, payload), Bounds(self._slots, receivers))
 
-    def wait_for(self, kind: type[Command]) -> None:
+    def wait_for(self, kind: type[ControlCommand]) -> None:
         """Wait for one command of the conductor: `Start` or `End`."""
         with self.place.waiting(self._control):
             while not isinstance(self.command(), kind):
@@ -376,10 +376,10 @@ class Session:
         if kind is End:
             self.conclude()
 
-    def command(self, receivers: Collection[str] | None = None) -> Command:
+    def command(self, receivers: Collection[str] | None = None) -> ControlCommand:
         """Wait for the next command of the conductor; receivers: those that it may name, any by default."""
         return self._read(self._commands.get(), receivers)
 
-    def commanded(self, receivers: Collection[str] | None = None) -> Command | None:
+    def commanded(self, receivers: Collection[str] | None = None) -> ControlCommand | None:
         """The next command of the conductor, or None without waiting."""
         return None if self._commands.empty() else self.command(receivers)

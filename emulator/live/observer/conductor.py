@@ -14,7 +14,7 @@ from evedrop.live.network.declared import Question
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
-from evedrop.live.protocol.commands import Abandon, Command, End, Start
+from evedrop.live.protocol.commands import Abandon, ControlCommand, End, Start
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 
 _AFTERTHOUGHT_SECONDS = 0.5  # the user who ended a process may be about to end the observer: then the run did not fail
@@ -137,11 +137,11 @@ class Conductor:
         self._stop.check(_AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
-    def command(self, name: str, command: Command) -> None:
+    def command(self, name: str, command: ControlCommand) -> None:
         """Send a command to one process."""
         self._commands[name](command.pack())
 
-    def ask(self, command: Command) -> None:
+    def ask(self, command: ControlCommand) -> None:
         """Send a command to every process that is present and reports."""
         for name in self.keys:
             if self._present[name]:

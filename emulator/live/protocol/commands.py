@@ -26,7 +26,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Command:
+class ControlCommand:
     """A command without fields; the others add theirs."""
 
     do: ClassVar[str]
@@ -42,42 +42,42 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Start(Command):
+class Start(ControlCommand):
     """To the sensor: all processes are there; begin."""
 
     do = "start"
 
 
 @dataclass(frozen=True)
-class End(Command):
+class End(ControlCommand):
     """To all: the run is over; confirm it and leave."""
 
     do = "end"
 
 
 @dataclass(frozen=True)
-class Where(Command):
+class Where(ControlCommand):
     """To all: report where you are."""
 
     do = "where"
 
 
 @dataclass(frozen=True)
-class Hold(Command):
+class Hold(ControlCommand):
     """To the sensor: stop before the next slot."""
 
     do = "hold"
 
 
 @dataclass(frozen=True)
-class Unknown(Command):
+class Unknown(ControlCommand):
     """A command that this version does not know, and ignores."""
 
     do = "unknown"
 
 
 @dataclass(frozen=True)
-class Abandon(Command):
+class Abandon(ControlCommand):
     """To all: the run was given up."""
 
     do = "abandon"
@@ -94,7 +94,7 @@ class Abandon(Command):
 
 
 @dataclass(frozen=True)
-class Go(Command):
+class Go(ControlCommand):
     """To router and sensor: go on after a hold."""
 
     do = "go"
@@ -124,7 +124,7 @@ class Go(Command):
 
 
 @dataclass(frozen=True)
-class LinkChange(Command):
+class LinkChange(ControlCommand):
     """To the router: change a link."""
 
     do = "change"
@@ -145,7 +145,7 @@ class LinkChange(Command):
 
 
 @dataclass(frozen=True)
-class Again(Command):
+class Again(ControlCommand):
     """To all: send the messages again that may have been lost with a connection."""
 
     do = "again"
@@ -198,11 +198,11 @@ def _changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
     )
 
 
-_KINDS: Mapping[str, type[Command]] = {
+_KINDS: Mapping[str, type[ControlCommand]] = {
     kind.do: kind for kind in (Start, End, Where, Hold, Abandon, Go, LinkChange, Again)
 }
 
 
-def read_command(message: Reader, bounds: Bounds) -> Command:
+def read_command(message: Reader, bounds: Bounds) -> ControlCommand:
     """Decode a command. Raises MalformedMessage."""
     return _KINDS.get(message.text("do"), Unknown).read(message, bounds)

@@ -249,7 +249,7 @@ def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> di
     return {"k": message.slot(value["k"]), "held": message.flag("held")}
 
 
-def control_of(value: dict[str, Any]) -> commands.Command:
+def control_of(value: dict[str, Any]) -> commands.ControlCommand:
     """A command with these fields."""
 
     def changes(of: list[dict[str, Any]]) -> tuple[Change, ...]:

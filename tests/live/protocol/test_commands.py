@@ -13,7 +13,7 @@ from evedrop.live.protocol.commands import (
     Abandon,
     Again,
     Bounds,
-    Command,
+    ControlCommand,
     End,
     Go,
     Hold,
@@ -29,7 +29,7 @@ BOUNDS = Bounds(100, ("eve", "legitimate"))
 CHANGES = (Change(4, cut=True), Change(100, {"loss": {"model": "bernoulli", "quality": 0.5}}))
 
 
-def read(process: str, payload: bytes) -> Command:
+def read(process: str, payload: bytes) -> ControlCommand:
     """A command as this process reads it."""
     return read_command(Reader(f"evedrop/r/control/{process}", payload), BOUNDS)
 
@@ -50,7 +50,7 @@ def read(process: str, payload: bytes) -> Command:
         ("router", Again(1, 7, {"eve": CHANGES, "legitimate": ()})),
     ],
 )
-def test_a_command_is_read_as_it_was_packed(process: str, command: Command) -> None:
+def test_a_command_is_read_as_it_was_packed(process: str, command: ControlCommand) -> None:
     """By the process to which it is sent."""
     assert read(process, command.pack()) == command
 
