@@ -16,6 +16,7 @@ from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.view.plant_slots import Showing, driven_scene
 from tests.conftest import Evedrop
+from tests.packages import install
 
 SHORT = {"slots": 300, "expect": []}
 
@@ -125,16 +126,13 @@ encoding = { scheme = "innovation", state_probability = 0.5 }
 legitimate = { link = { quality = 0.8 } }
 expect = [{ figure = "platoon.smallest_gap", below = 0.0 }]
 """
+PLATOON = {"evedrop.applications": {"platoon": "platooning:Platoon"}}
 
 
 def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """The one of the docs, a file and a line of metadata: in memory, live and in a sweep, with expectation and closing line."""
     page = (Path(__file__).parents[2] / "docs" / "your-own.md").read_text(encoding="utf-8")
-    (evedrop.folder / "platooning.py").write_text(page.partition("# platooning.py\n")[2].partition("```")[0])
-    about = evedrop.folder / "platooning-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: platooning\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[evedrop.applications]\nplatoon = platooning:Platoon\n")
+    install(evedrop.folder, {"platooning.py": page.partition("# platooning.py\n")[2].partition("```")[0]}, PLATOON)
     (evedrop.folder / "two.toml").write_text(SCENARIO)
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     said = []
@@ -154,11 +152,7 @@ def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) 
 
 def test_an_application_that_cannot_be_loaded_is_a_mistake_of_who_uses_it(evedrop: Evedrop) -> None:
     """With the reason, beside the scenario's other mistakes; scenarios without its table do not notice."""
-    (evedrop.folder / "platooning.py").write_text("import nothing_of_this_name\n")
-    about = evedrop.folder / "platooning-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: platooning\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[evedrop.applications]\nplatoon = platooning:Platoon\n")
+    install(evedrop.folder, {"platooning.py": "import nothing_of_this_name\n"}, PLATOON)
     (evedrop.folder / "two.toml").write_text(SCENARIO.replace("slots = 200", "slots = -1"))
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     done = evedrop.process("check", "two.toml", env=environment)

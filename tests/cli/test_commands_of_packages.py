@@ -6,6 +6,7 @@ from importlib import import_module
 
 from evedrop.cli.commands import MODULES
 from tests.conftest import Evedrop
+from tests.packages import install
 
 COMMAND = """
 from evedrop.cli.command import Command
@@ -20,11 +21,7 @@ COMMANDS = (Command("greet", greet, "say hello", (lambda parser: parser.add_argu
 
 def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
     """One file and one line: it is in the help, has options, and its result is the exit status."""
-    (evedrop.folder / "greeting.py").write_text(COMMAND)
-    about = evedrop.folder / "greeting-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[evedrop.commands]\ngreet = greeting\n")
+    install(evedrop.folder, {"greeting.py": COMMAND}, {"evedrop.commands": {"greet": "greeting"}})
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     assert "greet       say hello" in evedrop.process("--help", env=environment).out
     done = evedrop.process("greet", "you", env=environment)
@@ -33,12 +30,9 @@ def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
 
 def test_a_package_that_is_broken_breaks_no_help(evedrop: Evedrop) -> None:
     """One that cannot be imported, and one that takes the name of a command, are named; all other commands are there."""
-    (evedrop.folder / "broken.py").write_text("raise RuntimeError('not today')\n")
-    (evedrop.folder / "taking.py").write_text(COMMAND.replace('"greet", greet', '"run", greet'))
-    about = evedrop.folder / "both-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: both\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[evedrop.commands]\nbroken = broken\nrun = taking\n")
+    broken, taking = "raise RuntimeError('not today')\n", COMMAND.replace('"greet", greet', '"run", greet')
+    commands = {"broken": "broken", "run": "taking"}
+    install(evedrop.folder, {"broken.py": broken, "taking.py": taking}, {"evedrop.commands": commands})
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     done = evedrop.process("--help", env=environment)
     assert done.status == 0

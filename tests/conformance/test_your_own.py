@@ -15,6 +15,7 @@ from evedrop.results.writer import load_results
 from tests.builders import digests_of
 from tests.conformance.own_classes import BLOCK, PAGE
 from tests.conftest import Evedrop
+from tests.packages import install
 
 pytestmark = pytest.mark.usefixtures("imports_forgotten")
 
@@ -91,12 +92,12 @@ def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
 def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Entry points of a package on the path are names like any other, in every process; the built-in ones stay."""
     site = tutorial.folder / "site"
-    (site / "mypackage-1.0.dist-info").mkdir(parents=True)
-    (site / "mypackage-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mypackage\nVersion: 1.0\n")
-    (site / "mypackage-1.0.dist-info" / "entry_points.txt").write_text(
-        "[evedrop.schemes]\nflip = flipped:Flipped\nplain = flipped:Flipped\n"
-        "[evedrop.eavesdroppers]\ntrack = tracker:Tracker\n[evedrop.links]\nshifts = shifts:Shifts\nbad = shifts:Shift\n"
-    )
+    entries = {
+        "evedrop.schemes": {"flip": "flipped:Flipped", "plain": "flipped:Flipped"},
+        "evedrop.eavesdroppers": {"track": "tracker:Tracker"},
+        "evedrop.links": {"shifts": "shifts:Shifts", "bad": "shifts:Shift"},
+    }
+    install(site, {}, entries)
     for module in tutorial.folder.glob("*.py"):
         module.rename(site / module.name)
     monkeypatch.setenv("PYTHONPATH", str(site), prepend=":")

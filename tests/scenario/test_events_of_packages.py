@@ -11,6 +11,7 @@ from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import EventKind
 from tests.builders import digests_of
 from tests.conftest import Evedrop
+from tests.packages import install
 
 DOCS = Path(__file__).parents[2] / "docs"
 SCENARIO = """
@@ -26,11 +27,7 @@ event = [{ at = 20, dim = "smart" }, { from = 30, to = 40, cut = "smart" }]
 
 def with_package(evedrop: Evedrop, code: str) -> dict[str, str]:
     """An environment in which a package with this code says that it has the event `dim`."""
-    (evedrop.folder / "dimming.py").write_text(code)
-    about = evedrop.folder / "dimming-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: dimming\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[evedrop.events]\ndim = dimming:Dim\n")
+    install(evedrop.folder, {"dimming.py": code}, {"evedrop.events": {"dim": "dimming:Dim"}})
     return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
 
 

@@ -14,6 +14,7 @@ from evedrop.figures import FIGURES, figure, figures_of
 from evedrop.figures.figure import ScoredSlots
 from evedrop.results.writer import load_results
 from tests.conftest import Evedrop
+from tests.packages import install
 
 DOCS = Path(__file__).parents[2] / "docs"
 RUN = ("--slots", "40", "--trials", "510")
@@ -26,11 +27,7 @@ EXPECT = (
 
 def installed(evedrop: Evedrop, module: str, name: str = "largest_error") -> dict[str, str]:
     """The environment in which a package that has this module adds a figure by its metadata."""
-    (evedrop.folder / "largest.py").write_text(module)
-    about = evedrop.folder / "largest-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: largest\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[evedrop.figures]\n{name} = largest:LargestError\n")
+    install(evedrop.folder, {"largest.py": module}, {"evedrop.figures": {name: "largest:LargestError"}})
     return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
 
 

@@ -17,6 +17,7 @@ from evedrop.model.process import Floats
 from evedrop.view.replay import replay
 from tests.builders import digests_of
 from tests.conftest import Evedrop
+from tests.packages import install
 from tests.view.read_back import rows
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-own.md"
@@ -24,15 +25,6 @@ SECTION = re.compile(r"^## A panel$.*?(?=^## )", re.MULTILINE | re.DOTALL)
 BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 GROUP = "evedrop.panels"
 SLOTS = 60
-
-
-def install(folder: Path, panels: dict[str, str]) -> None:
-    """The metadata of a package with these panels, by their names."""
-    about = folder / "package-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: package\nVersion: 1.0\n")
-    lines = [f"{name} = {target}" for name, target in panels.items()]
-    (about / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *lines, ""]))
 
 
 @pytest.fixture
@@ -53,8 +45,8 @@ def tutorial(site: Path) -> Path:
     found = SECTION.search(PAGE.read_text(encoding="utf-8"))
     assert found is not None
     blocks = dict(BLOCK.findall(found[0]))
-    (site / "ratio.py").write_text(blocks["ratio.py"], encoding="utf-8")
-    install(site, tomllib.loads(blocks["pyproject.toml"])["project"]["entry-points"][GROUP])
+    entries = tomllib.loads(blocks["pyproject.toml"])["project"]["entry-points"]
+    install(site, {"ratio.py": blocks["ratio.py"]}, entries)
     return site
 
 
@@ -143,7 +135,7 @@ def install_broken(site: Path) -> None:
     for case, (body, _) in BROKEN.items():
         (site / f"broken_{case}.py").write_text(f"{HEAD}\n\n{body}\n")
     (site / "sound.py").write_text(HEAD)
-    install(site, {case: f"broken_{case}:Mine" for case in BROKEN} | {"sound": "sound:Sound"})
+    install(site, {}, {GROUP: {case: f"broken_{case}:Mine" for case in BROKEN} | {"sound": "sound:Sound"}})
 
 
 def check_warnings(text: str, prefix: str) -> None:
