@@ -171,6 +171,16 @@ def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
     assert tables_whole(live) > 0
 
 
+def test_a_process_deletes_its_brief_when_it_has_read_it(evedrop: Evedrop) -> None:
+    """Its keys do not stay on disk: from the first slot on no brief is left, and none after a process was started again."""
+    live = evedrop.live("restart", "--pace", "0")
+    live.running()
+    assert live.briefs() == {}
+    done = live.end()
+    assert done.status == 0, done.err
+    live.nothing_left()
+
+
 @pytest.mark.parametrize("when", ["folder", "first child"])
 def test_keys_of_a_killed_launcher_do_not_stay(evedrop: Evedrop, when: str) -> None:
     """Killed before its processes have read their briefs: no brief, key or password is left, and no process."""

@@ -52,6 +52,8 @@ def process(options: argparse.Namespace) -> int:
     if options.role != "observer":  # which ends in order
         leave_on_signals()
     brief = read_brief(options.brief, options.role)
+    if brief.ends_with_stdin:  # of a launcher, which writes another one for a process that it starts again
+        options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
     if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
         brief = replace(brief, part=replace(brief.part, results=str(options.out)))
     if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:

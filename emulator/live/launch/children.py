@@ -22,8 +22,6 @@ from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.news import (
     Alive,
-    Back,
-    ConnectionOutage,
     Finishing,
     News,
     ProcessRequest,
@@ -103,8 +101,6 @@ class Children:
         self._private = private
         self._processes: dict[str, StartedProcess] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
-        self._unread = 0
-        """How many processes were started again and have not joined the run yet; they may not have read their briefs."""
         self.silent_seconds = 0.0
         """For how long the observer has been silent."""
         self.started = False
@@ -144,7 +140,6 @@ class Children:
         Raises RunError if the system cannot start it.
         """
         self._briefs[brief.process] = brief
-        self._unread += again
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:
             state_file = str((self._private / f"{brief.process}.state").absolute())
             brief = replace(brief, part=replace(brief.part, state_file=state_file))
@@ -233,23 +228,15 @@ class Children:
             return news
         self.silent_seconds = 0.0
         match news:
-            case Started() | Back() | ConnectionOutage():
-                self._unread = max(0, self._unread - 1) if self.started else 0  # at the start, all have
+            case Started():
                 self.started = True
-                if not self._unread:
-                    self._forget_briefs()
             case ProcessRequest():
                 self.act(news)
             case RunOver():
                 self.over = True
             case Finishing():
                 self._finishing = True
-        return None if isinstance(news, Alive | Back | ProcessRequest | RunOver | Finishing) else news
-
-    def _forget_briefs(self) -> None:
-        """Delete the briefs: every process has read its own by now, and the keys should not stay on disk."""
-        for path in self._private.glob("*.json"):
-            path.unlink(missing_ok=True)
+        return None if isinstance(news, Alive | ProcessRequest | RunOver | Finishing) else news
 
     def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `ended` news, or None if it sent none.

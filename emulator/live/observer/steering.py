@@ -18,7 +18,7 @@ from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
-from evedrop.live.protocol.news import Back, Held, News, ProcessRequest
+from evedrop.live.protocol.news import Held, News, ProcessRequest
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
@@ -144,7 +144,6 @@ class Steering:
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
             if isinstance(effect, Return):
                 self._conductor.absent -= set(act.names)
-                self._tell(Back())
             self._waiting = None
             return True
         self._despair(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")

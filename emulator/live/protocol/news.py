@@ -95,13 +95,6 @@ class ProcessRequest(News):
 
 
 @dataclass(frozen=True)
-class Back(News):
-    """A process that was restarted or resumed is on the network again."""
-
-    event = "back"
-
-
-@dataclass(frozen=True)
 class ConnectionOutage(News):
     """A process was cut off, and the run has gone on or ended since."""
 
@@ -192,7 +185,6 @@ _KINDS: Mapping[str, type[News]] = {
         Started,
         Held,
         ProcessRequest,
-        Back,
         ConnectionOutage,
         RunProgress,
         RunOver,
