@@ -118,7 +118,7 @@ def connected(
     """
     endpoint = endpoint_of(door.router, door.identity)
     began = clock.monotonic()
-    failures, waiting = Failures(clock), Waiting(door.process, door.router, clock)
+    failures, waiting = Failures(clock, endpoint.secure), Waiting(door.process, door.router, clock)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
@@ -134,8 +134,8 @@ def connected(
                     f"the router's host {endpoint.host} is not known here ({why}); write it into /etc/hosts, or write the "
                     "briefs again with --connect and a name or address that this host knows"
                 ) from error
-            if failures.refused and _cut_off(endpoint):
-                failures = Failures(clock)
+            if failures.refused and cut_off(endpoint):
+                failures = Failures(clock, endpoint.secure)
             if failures.refused:
                 raise BriefError(
                     f"{door.router} does not let this brief in, which is of run {door.run}: the router there is of another run, "
@@ -155,8 +155,9 @@ def connected(
 class Failures:
     """The results of the attempts so far."""
 
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+    def __init__(self, clock: Clock, secure: bool = False) -> None:
+        """secure: whether a router shows its certificate before it can refuse anybody."""
+        self._clock, self._secure = clock, secure
         self._unknown: float | None = None
         self._refused: float | None = None
         self._refusals = 0
@@ -166,8 +167,10 @@ class Failures:
         now = self._clock.monotonic()
         unknown = isinstance(error, socket.gaierror)
         self._unknown = (self._unknown or now) if unknown else None
-        # A listener that hangs up refuses us; one that is slow, or not there, may still answer.
-        hung_up = isinstance(error, zenoh.ZError | ssl.SSLError | ConnectionResetError | BrokenPipeError)
+        # A listener that hangs up refuses us; one that is slow, or not there, may still answer. Under TLS a connection that ends
+        # before there is a certificate was ended by something in between, such as a proxy whose router is down.
+        cut = isinstance(error, ssl.SSLEOFError | ConnectionResetError | BrokenPipeError)
+        hung_up = isinstance(error, zenoh.ZError | ssl.SSLError) if not cut else not self._secure
         if hung_up and seconds < _QUICK_SECONDS:
             self._refused, self._refusals = self._refused or now, self._refusals + 1
         elif not hung_up:
@@ -188,7 +191,7 @@ class Failures:
         )
 
 
-def _cut_off(endpoint: Endpoint) -> bool:
+def cut_off(endpoint: Endpoint) -> bool:
     """Whether it is the network that ends connections, not the program there: it ends those on which nothing is said, too.
 
     A program that hangs up on everybody does it at once.
