@@ -77,5 +77,5 @@ def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_
         endpoint = door.router.replace("tcp/", "tls/")
         brief = briefs_of(scenario_of(), endpoint, ObserverTask(tmp_path, False), ends_with_stdin=False)["eve"]
         assert brief.identity is not None
-        with pytest.raises(RunError, match="no router answered at .* within 10 s"):
+        with pytest.raises(RunError, match=r"no router answered at .* within 10 s"):
             Session(replace(brief, patience=10), clock=TestClock())
