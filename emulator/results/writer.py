@@ -152,6 +152,11 @@ class ResultsWriter:
             self._figures_before = True
             self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
 
+    def write_rows(self, at: str) -> None:
+        """Write all rows to disk now. Raises OSError as `checkpoint` does."""
+        self._at = at
+        self._round()
+
     def settle(self, at: str, figures: Summary) -> None:
         """Write everything to disk, with the last figures; no rows may follow. Raises OSError as `checkpoint` does."""
         self._at = at

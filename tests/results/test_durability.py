@@ -25,8 +25,14 @@ from evedrop.results.writer import Results, ResultsWriter, load_results
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
+from tests.rogue import with_rogue
 
 ENDLESS = ("--slots", "1000000")
+NEVER_CONFIRMS = """
+import threading
+from evedrop.live.network.session import Session
+Session.conclude = lambda self: threading.Event().wait()
+"""
 
 
 def kill_all(live: Live) -> None:
@@ -266,3 +272,15 @@ def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -
 def sizes(folder: Path) -> dict[str, int]:
     """File → its size, of an unfinished results folder."""
     return {path.name: path.stat().st_size for path in (folder / UNFINISHED).iterdir()}
+
+
+def test_all_rows_are_on_disk_before_processes_are_told_to_end(evedrop: Evedrop) -> None:
+    """A router may be gone then, and never confirm its end: an observer that is killed while it waits has lost nothing."""
+    live = evedrop.live(
+        "eavesdroppers", "--slots", "300", "--pace", "0", env=with_rogue(evedrop, "router", NEVER_CONFIRMS)
+    )
+    wait_until(lambda: last_round(live.folder).slots == 300, "all slots on disk", 60.0)
+    os.kill(live.child("observer"), signal.SIGKILL)
+    done = live.end()
+    assert done.status == 3, done.err
+    assert live.results.slots.num_rows == 4 * 300

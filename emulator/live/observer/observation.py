@@ -155,6 +155,7 @@ class ObservedRun:
                     self._recovery.look(self._joiner.done)
                     self._save()
                     self._look(conductor)
+                self._save_rows()  # processes may take long to confirm their end, and this one may be killed meanwhile
             except EvedropError as error:
                 self._suspects = conductor.missing
                 self._accused = error.at_fault if isinstance(error, RunError) else ()
@@ -319,6 +320,13 @@ class ObservedRun:
     def _at(self) -> str:
         """How far the run has come, in words."""
         return f"slot {self._joiner.done}"
+
+    def _save_rows(self) -> None:
+        """Save all rows. Raises RunError if they cannot be written."""
+        try:
+            self._writer.write_rows(self._at)
+        except OSError as error:
+            raise RunError(unwritten(error)) from error
 
     def _save(self) -> None:
         """Save the results so far, from time to time. Raises RunError if they cannot be written."""
