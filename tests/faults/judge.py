@@ -175,7 +175,8 @@ def _of_summary(status: int, run: Run, hits: Sequence[Fault], results: Results, 
         for name, table in tables.items():
             if name in reference.tables and len(table) != len(reference.tables[name]):
                 yield f"{name} has {len(table)} rows, not {len(reference.tables[name])}"
-    elif summary["ended"] == "complete" and status != KILLED:
+    # A signal may come when the run is complete, and end a launcher that prints its report.
+    elif summary["ended"] == "complete" and status not in (KILLED, INTERRUPTED):
         yield f"status {status}, and the summary says complete"
     if not any(fault.target in ("observer", "launcher") and fault.kind == "kill" for fault in hits):
         if summary["slots"] < run.done:

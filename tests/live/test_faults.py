@@ -171,11 +171,25 @@ def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
     assert tables_whole(live) > 0
 
 
+def test_a_paused_process_does_not_outlive_its_launcher(evedrop: Evedrop) -> None:
+    """Paused by an event, it cannot notice that the launcher is killed: the system continues it, and it ends."""
+    pause = "event.0={from = 5, to = 900000, pause = 'smart'}"
+    live = evedrop.live("eavesdroppers", *ENDLESS, "--set", pause)
+    wait_until(lambda: "T" in _state(live.child("smart")), "a paused process")
+    live.process.kill()
+    live.process.communicate()
+    wait_until(lambda: not live.left(), "no process left", SECONDS)
+
+
+def _state(pid: int) -> str:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
 def test_a_process_deletes_its_brief_when_it_has_read_it(evedrop: Evedrop) -> None:
     """Its keys do not stay on disk: from the first slot on no brief is left, and none after a process was started again."""
     live = evedrop.live("restart", "--pace", "0")
     live.running()
-    assert live.briefs() == {}
+    wait_until(lambda: live.briefs() == {}, "no brief left")
     done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()

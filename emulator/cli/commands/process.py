@@ -41,6 +41,7 @@ def brief(options: argparse.Namespace) -> int:
 
 def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
+    from evedrop.live.network.launcher_watch import continue_when_launcher_dies
     from evedrop.live.protocol.brief import read_brief
     from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart
     from evedrop.plugins import look_in
@@ -52,8 +53,9 @@ def process(options: argparse.Namespace) -> int:
     if options.role != "observer":  # which ends in order
         leave_on_signals()
     brief = read_brief(options.brief, options.role)
-    if brief.ends_with_stdin:  # of a launcher, which writes another one for a process that it starts again
+    if brief.ends_with_stdin:  # started by a launcher, which writes another brief for a process that it starts again
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
+        continue_when_launcher_dies()
     if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
         brief = replace(brief, part=replace(brief.part, results=str(options.out)))
     if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
