@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -96,12 +97,12 @@ def door_of(entry: Credentials) -> RouterAddress:
     return RouterAddress(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
 
 
-def _once(door: RouterAddress) -> zenoh.Config:
-    """The configuration of a session that is closed when its connection is lost: Zenoh must not reconnect it."""
+def _once(door: RouterAddress) -> RouterAddress:
+    """The same address for sessions that are closed when their connection is lost: Zenoh must not reconnect them."""
     config = dict(door.config)
     config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
     config["transport"] = {**config["transport"], "unicast": dict(ATTEMPT)}
-    return zenoh.Config.from_json5(json.dumps(config))
+    return replace(door, config=config)
 
 
 def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
@@ -170,8 +171,8 @@ class Session:
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router, clock)
         if config is None or listen is None:
-            door = door_of(brief)
-            once = _once(door)
+            door = _once(door_of(brief))
+            once = zenoh.Config.from_json5(json.dumps(door.config))
             first = connected(door, self.patience, meanwhile, clock)
             self._connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
         else:
