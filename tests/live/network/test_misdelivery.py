@@ -186,12 +186,13 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(0))])
         assert funnelled.get(timeout=LIMIT_SECONDS) == progress(0)  # so the one before it has arrived too
         ids = {str(session._connection.session.zid())}
-        for number in range(3):
+        for _ in range(3):
             stage.cable.flap()
             assert [tokens.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
             assert [watched.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
+            # One flap may cost two sessions; the news of the second then come early at the next flap.
+            until(lambda: str(session._connection.session.zid()) not in ids, "another session")
             ids.add(str(session._connection.session.zid()))
-            assert len(ids) == number + 2
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
         assert [inbox.recv(), inbox.recv()] == [progress(1), progress(2)]
