@@ -23,7 +23,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from evedrop.cli import main as cli
-from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.results.writer import Results, load_results
 from tests.privileged import say_what_was_skipped
 
@@ -100,10 +99,6 @@ class Live:
     def briefs(self) -> dict[str, Path]:
         """Process name → the brief it was given, as far as they are written."""
         return {path.stem: path for path in self.temporary.glob("evedrop-*/*.json")}
-
-    def brief(self, name: str) -> AnyBrief:
-        """The brief of one process, as soon as it is there."""
-        return read_brief(wait_until(lambda: self.briefs().get(name), f"a brief of {name}"))
 
     def children(self) -> dict[str, int]:
         """Process name → process id."""

@@ -30,7 +30,7 @@ class ExpectedTraceStream(Protocol):
 
 @final
 class _Unknown:
-    """The stream of a receiver for which there is no theory."""
+    """The stream of a receiver that no theory covers."""
 
     def next_traces(self, slots: int) -> Floats:
         """NaN for each slot, (slots,)."""
@@ -77,7 +77,7 @@ class Expectation:
         return Expectation(self.process, self.law, self.bound_at)
 
     def stream(self) -> ExpectedTraceStream:
-        """The expected traces from slot 0 on; NaN where there is no theory."""
+        """The expected traces from slot 0 on; NaN without a theory."""
         if self.closed is not None:
             return ClosedStream(self.closed)
         if self._outcomes is not None:
@@ -85,12 +85,12 @@ class Expectation:
         return _Unknown() if self._known is None else modulated.ModulatedCovariance(self.process, *self._known)
 
     def traces(self, slots: int) -> Floats:
-        """The expected traces of slots 0 … slots−1, (slots,); NaN where there is no theory."""
+        """The expected traces of slots 0 … slots−1, (slots,); NaN without a theory."""
         return self.stream().next_traces(slots)
 
     @property
     def limit(self) -> float:
-        """Trace of the limit, for the link in its last state; inf if unbounded, NaN where there is no theory."""
+        """Trace of the limit, for the link in its last state; inf if unbounded, NaN without a theory."""
         if self.closed is not None:
             return self.closed.limit
         if self._outcomes is not None:
@@ -148,5 +148,5 @@ def _genie(mu_d: float, quality: float) -> Outcomes:
 
 
 def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
-    """Receiver → trace of the expected actual error covariance in every slot, (slots,); NaN where there is no theory."""
+    """Receiver → trace of the expected actual error covariance in every slot, (slots,); NaN without a theory."""
     return {name: one.traces(scenario.slots) for name, one in expectations_of(scenario).items()}

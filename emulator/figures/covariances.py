@@ -7,16 +7,15 @@ from typing import final
 
 import numpy as np
 
-from evedrop.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ReceiverTotals, ScoredSlots
+from evedrop.figures.figure import FigureColumn, FigureTally, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure
 from evedrop.model.process import Floats
 
 
 @final
-class MeanTraceCovariance(MeanFigure):
+class MeanTraceCovariance(MeanFigure, TotalsFigure):
     """The mean of tr P that the receiver believes."""
 
     meaning = "of tr P, the error covariance that the receiver believes"
-    from_totals = True
     by_trial = False
     rests_on = "recorded trials"
     column = FigureColumn("believed tr P", 3)
@@ -34,14 +33,13 @@ class MeanTraceCovariance(MeanFigure):
 
 
 @final
-class ExpectedTraceCovariance(Figure):
+class ExpectedTraceCovariance(TotalsFigure):
     """The mean trace of the actual error covariance that theory expects."""
 
     meaning = (
-        "theory: trace of the expected actual error covariance over the same slots; null where there is no theory for "
-        "the losses of its link, or no closed form for its strategy"
+        "theory: trace of the expected actual error covariance over the same slots; null if no theory covers the losses "
+        "of its link, or if no closed form is known for its strategy"
     )
-    from_totals = True
     needs_theory = True
     rests_on = "theory"
     column = FigureColumn("expected tr P", 4)

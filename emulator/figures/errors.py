@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.figures.figure import COVARIANCE_ONLY, FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots
+from evedrop.figures.figure import COVARIANCE_ONLY, FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure
 from evedrop.model.process import Floats
 
 
-class MeanError(MeanFigure):
+class MeanError(MeanFigure, TotalsFigure):
     """The mean of the error of the mode."""
 
-    from_totals = True
     sweep_column = FigureColumn("mean error", 0)
     sweep_picture = "marks"
 

@@ -1,6 +1,6 @@
-"""What a figure is: a number that the summary has for every receiver, or for every eavesdropper.
+"""The base classes of figures: numbers that the summary has for every receiver, or for every eavesdropper.
 
-A figure says itself how it is added, merged, checked and shown. Nothing else compares its name.
+The class of a figure says how it is added, merged, checked and shown. No other code compares its name.
 
 Source: docs/results.md, summary.json; docs/your-own.md, a figure.
 """
@@ -86,9 +86,9 @@ class FigureTally(ABC):
         """The figure over the slots so far; None if there is none."""
 
     @property
-    def of_trials(self) -> Floats:
-        """The figure of every trial, (R,); only a figure `by_trial` has it."""
-        raise NotImplementedError
+    def of_trials(self) -> Floats | None:
+        """The figure of every trial, (R,); None for a figure that is not `by_trial`."""
+        return None
 
 
 @dataclass(kw_only=True)
@@ -129,8 +129,6 @@ class Figure(ABC):
     """Whose figure it is."""
     meaning: ClassVar[str] = ""
     """What it is, with its unit."""
-    from_totals: ClassVar[bool] = False
-    """Whether a whole run's figure is computed by `of_totals`; otherwise it is the value of a tally of its own."""
     by_trial: ClassVar[bool] = False
     """Whether every trial has it, so that it has quantiles over trials."""
     needs_states: ClassVar[bool] = False
@@ -155,10 +153,14 @@ class Figure(ABC):
     def tally(cls, trials: int) -> FigureTally:
         """Totals over no slots yet. Expectations over some slots use it too."""
 
+
+class TotalsFigure(Figure):
+    """A figure that a whole run computes from what is counted of every receiver, without a tally."""
+
     @classmethod
+    @abstractmethod
     def of_totals(cls, totals: ReceiverTotals) -> float:
-        """The figure of a whole run from what is counted of every receiver; NaN where there is none."""
-        raise NotImplementedError
+        """The figure of a whole run; NaN if it has none."""
 
 
 @final

@@ -6,17 +6,16 @@ from typing import final
 
 import numpy as np
 
-from evedrop.figures.figure import FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots
+from evedrop.figures.figure import FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
 
 
 @final
-class ReceivedFraction(MeanFigure):
+class ReceivedFraction(MeanFigure, TotalsFigure):
     """The fraction of packets that were received."""
 
     meaning = "packets received"
-    from_totals = True
     rests_on = "observer"
     column = FigureColumn("received", 0, ".4f")
 
@@ -33,11 +32,10 @@ class ReceivedFraction(MeanFigure):
 
 
 @final
-class UsedFraction(MeanFigure):
+class UsedFraction(MeanFigure, TotalsFigure):
     """The fraction of packets that were received and used."""
 
     meaning = "packets received and used"
-    from_totals = True
     column = FigureColumn("used", 1, ".4f")
 
     @classmethod

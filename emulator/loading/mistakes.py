@@ -27,8 +27,9 @@ from evedrop.scenario.expect import Around
 from evedrop.scenario.filter_noise import filter_mistakes
 from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.nemesis import nemesis_mistakes
+from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.sentences import sentences
-from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES, EavesdropperTable
+from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
 from evedrop.scenario.valid import ValidTables
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
@@ -100,11 +101,11 @@ def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:
         if LEGITIMATE not in scheme.closed_forms and legitimate_outcomes(scheme) is None:
             return f"no closed form is known for the scheme {tables.encoding.scheme}"
     if law_of(LinkSchedule(link.settings(1.0), receiver.window)) is None:
-        return f"there is no theory for {name}'s link"
+        return f"no theory covers {name}'s link"
     if tables.scenario is None or not sound:
         return None
     known = expectations_of(tables.scenario)[name].known
-    return None if known else f"there is no theory for {name} with these links, attacks and events together"
+    return None if known else f"no theory covers {name} with these links, attacks and events together"
 
 
 def _secret_mistakes(file: str) -> list[str]:

@@ -111,6 +111,8 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
         raise failure
     if not merger.complete:
         raise Interrupted("interrupted; the results so far are in the results folder")
+    if summary.ended != how:  # a figure failed
+        raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0
 
 

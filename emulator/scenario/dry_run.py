@@ -25,8 +25,9 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.names import LEGITIMATE
 from evedrop.plugins import names_in
 from evedrop.scenario.events.effects import LinkSettings
+from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.table import model_mistakes
-from evedrop.scenario.tables import EavesdropperTable, Scenario
+from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import as_toml
 from evedrop.streams import Batch
 

@@ -5,12 +5,14 @@ Source: docs/scenario.md, events.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
 
 from evedrop.model.links.link import Fate
+from evedrop.model.registry import place_of
 from evedrop.scenario.events.effects import Leave, LinkCut, LinkHealed, LinkSettings, Return
 from evedrop.scenario.events.event import Act, EventKind, Surroundings
 from evedrop.scenario.link_table import LinkTable, changed_link
@@ -38,7 +40,7 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
             if name not in tables.receivers:
                 hint = ": it is not a receiver" if name in ("sensor", "router", "observer") else ""
                 yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(tables.receivers)}"
-        yield from (f"{path}.{entry}: {what}" for entry, what in event.compared(surroundings))
+        yield from _own(path, type(event), partial(_compared, path, event, surroundings))
         for act in event.acts():
             if isinstance(act.effect, LinkSettings) and act.effect.entries is not None:
                 for name in act.names:
@@ -46,7 +48,20 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
     yield from _order_mistakes(tables)
     kinds = dict.fromkeys(type(event) for _, event in tables.event)
     for kind in kinds:
-        yield from kind.in_turn([(i, event) for i, event in tables.event if type(event) is kind])
+        events = [(i, event) for i, event in tables.event if type(event) is kind]
+        yield from _own(f"event.{events[0][0]}", kind, partial(kind.in_turn, events))
+
+
+def _compared(path: str, event: EventKind, surroundings: Surroundings) -> Iterator[str]:
+    return (f"{path}.{entry}: {what}" for entry, what in event.compared(surroundings))
+
+
+def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> list[str]:
+    """The mistakes that a kind finds itself; the class of a package may fail."""
+    try:
+        return list(ask())
+    except Exception as error:
+        return [f"{path}.{kind.kind}: cannot be checked: {kind.__name__} raised {place_of(error)}"]
 
 
 def _acts(tables: ValidTables) -> list[Numbered]:

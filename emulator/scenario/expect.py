@@ -223,7 +223,7 @@ class Around:
     slots: int | None
     trials: int | None
     no_theory: Callable[[str], str | None]
-    """Why there is no theory for a receiver; None if there is."""
+    """Why no theory covers a receiver; None if one does."""
     applications: Mapping[str, type[Application]] = field(default_factory=dict)
     """Those whose tables the scenario has."""
 

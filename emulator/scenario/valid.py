@@ -24,12 +24,11 @@ from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.nemesis import NemesisTable
 from evedrop.scenario.plant import ControllerTable, PlantTable
 from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
 from evedrop.scenario.table import Table
 from evedrop.scenario.tables import (
     AcknowledgementsTable,
-    EavesdropperTable,
     EncodingTable,
-    LegitimateTable,
     Scenario,
 )
 

@@ -82,7 +82,10 @@ class Evidence:
         if self.tallies[receiver].done < wanted[1].end:
             return None
         tally = self.tallies[receiver].watched.tally(wanted[1])
-        return tally.value if expect.quantile is None else float(np.quantile(tally.of_trials, expect.quantile))
+        if expect.quantile is None:
+            return tally.value
+        found = tally.of_trials
+        return None if found is None else float(np.quantile(found, expect.quantile))
 
     def _link(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         account = self.links[str(expect.link)]
@@ -94,7 +97,7 @@ class Evidence:
         relative = expect.secrecy == "relative"
         shown = verdict.relative if relative else verdict.perfect
         promised = verdict.relative_by_theory if relative else verdict.perfect_by_theory
-        theory = {True: "theory promises it", False: "theory denies it", None: "there is no theory for these links"}
+        theory = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
         run = {Verdict.HELD: "the run shows it", Verdict.FAILED: "the run shows that it fails"}
         found = f"{theory[promised]}, {run.get(shown, f'the run has {shown.value}')}"
         complete = all(tally.done == tally.slots for tally in self.tallies.values())

@@ -119,7 +119,8 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
 def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> Summary:
     """The summary of docs/results.md; a digest is None if there is none, or if the run was cut short.
 
-    An accused process has no digest either: what it reported is contradicted.
+    An accused process has no digest either: what it reported is contradicted. A complete run with a package's figure that
+    failed is not `complete`: it ended with that failure.
     """
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
@@ -132,6 +133,9 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     user = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
+    expectations = Evidence(scenario, peers, links, tallies, secret, applications).judged(ending.replay)
+    # Known only now that every figure has been computed.
+    failures = totals.failures if ending.how == Ending.how else []
     return Summary(
         scenario=scenario.title,
         mode=ending.mode,
@@ -141,7 +145,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         first_trial=scenario.first_trial,
         wall_seconds=ending.wall_seconds,
         slots_per_second=user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
-        ended=ending.how,
+        ended=failures[0] if failures else ending.how,
         peers=peers,
         links=links,
         events=ending.events,
@@ -156,7 +160,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         filter=None if totals.filter is None else totals.filter.summary(scenario),
         applications=applications,
         surprising=_surprising(scenario, tallies),
-        expectations=Evidence(scenario, peers, links, tallies, secret, applications).judged(ending.replay),
+        expectations=expectations,
     )
 
 

@@ -55,7 +55,7 @@ _PEER = ("error_quantiles", "infinite_variance", "digest")
 
 @dataclass(frozen=True)
 class LinkSummary(LinkAccount):
-    """A link: its account, and what its models say of it. None where nothing was measured, or nothing is known."""
+    """A link: its account, and what its models predict. A number is None if it was not measured, or if the model has none."""
 
     lost_by: Mapping[str, int] = field(default_factory=dict)
     """Reason → packets."""

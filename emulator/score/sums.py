@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.figures import figure
-from evedrop.figures.figure import ReceiverTotals
+from evedrop.figures.figure import ReceiverTotals, TotalsFigure
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
@@ -165,7 +165,7 @@ class Tally(ReceiverTotals):
     def figure(self, name: str) -> float | None:
         """A figure of the run by its name; None where there is none."""
         found = figure(name)
-        if not found.from_totals:
+        if not issubclass(found, TotalsFigure):
             return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
         value = found.of_totals(self) if self.offered else math.nan
         return None if math.isnan(value) else value

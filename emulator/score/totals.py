@@ -40,6 +40,11 @@ class Totals:
             FilterTally.of(scenario),
         )
 
+    @property
+    def failures(self) -> list[str]:
+        """Why figures of packages failed, in words."""
+        return [failure for tally in self.tallies.values() for failure in tally.watched.failures]
+
     @classmethod
     def merged(cls, parts: Sequence[Totals]) -> Totals:
         """The totals of disjoint sets of trials, in their order."""

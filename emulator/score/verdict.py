@@ -49,7 +49,7 @@ class Secrecy:
     trials: int
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
-    unknown: str = "there is no theory for these links"
+    unknown: str = "no theory covers these links"
     """The sentence's ending where theory makes no claim."""
 
     @property

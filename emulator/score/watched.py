@@ -11,10 +11,11 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.figures import figure, figures_of
-from evedrop.figures.figure import FigureTally, ScoredSlots
+from evedrop.figures import FIGURES, figure, figures_of
+from evedrop.figures.figure import FigureTally, ScoredSlots, TotalsFigure
 from evedrop.model.receiver import Action
 from evedrop.scenario import ExpectTable, Scenario
+from evedrop.score.guarded_figure import GuardedTally
 
 IN_STEP = "in_step"
 _NEVER = -1
@@ -54,7 +55,9 @@ def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
     found = {}
     for receiver in scenario.receivers:
         own = [
-            WatchedSlots(name, 0, scenario.slots) for name, one in figures_of(receiver).items() if not one.from_totals
+            WatchedSlots(name, 0, scenario.slots)
+            for name, one in figures_of(receiver).items()
+            if not issubclass(one, TotalsFigure)
         ]
         found[receiver] = tuple(dict.fromkeys([*own, *(watch for name, watch in wanted if name == receiver)]))
     return found
@@ -86,15 +89,19 @@ class FirstState(FigureTally):
         return None if (self._first == _NEVER).any() else int(self._first.max())
 
 
+def _tally(what: str, trials: int) -> FigureTally:
+    """Totals of a quantity over no slots yet."""
+    if what == IN_STEP:
+        return FirstState(trials)
+    return GuardedTally(what, trials) if FIGURES.foreign(what) else figure(what).tally(trials)
+
+
 @final
 class Watched:
     """What is kept of R trials."""
 
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
-        self._kept = {
-            watch: FirstState(trials) if watch.what == IN_STEP else figure(watch.what).tally(trials)
-            for watch in watches
-        }
+        self._kept = {watch: _tally(watch.what, trials) for watch in watches}
 
     def add(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
@@ -103,6 +110,11 @@ class Watched:
             stateless = slots.x is None and watch.what != IN_STEP and figure(watch.what).needs_states
             if start < stop and not stateless:
                 kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
+
+    @property
+    def failures(self) -> list[str]:
+        """Why figures of packages failed, in words."""
+        return [one.failure for one in self._kept.values() if isinstance(one, GuardedTally) and one.failure]
 
     def tally(self, watch: WatchedSlots) -> FigureTally:
         """The totals of a quantity over its slots."""

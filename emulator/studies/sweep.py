@@ -158,7 +158,13 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
     merger = Merger(scenario, plan.mode)
     for result in results:
         merger.add(result)
-    return merger.summary(Ending(time.monotonic() - started)) if merger.complete else None
+    if not merger.complete:
+        return None
+    ending = Ending(time.monotonic() - started)
+    summary = merger.summary(ending)
+    if summary.ended != ending.how:  # a figure failed
+        raise RunError(summary.ended)
+    return summary
 
 
 def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: Plan) -> list[tuple[Point, Scenario]]:

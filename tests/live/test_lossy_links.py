@@ -1,4 +1,4 @@
-"""Runs behind links that remember: the same bits live and in memory, theory met, and no theory where there is none."""
+"""Runs behind links that remember: the same bits live and in memory, and theory met where there is one."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ LOSSES: dict[str, dict[str, Any]] = {
     "trace": {"model": "trace", "outcomes": "110100111", "random_start": True},
 }
 UNKNOWN = ("distance", "pattern", "trace")
-"""Those for which there is no theory."""
+"""Those that no theory covers."""
 
 
 def scenario(**changes: Any) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
     assert nulls.num_rows == 300 * len(UNKNOWN)
     verdict = memory.summary["secrecy"]["pattern"]
     assert (verdict["relative_by_theory"], verdict["perfect_by_theory"]) == (None, None)
-    assert verdict["sentence"].endswith("there is no theory for these links")
+    assert verdict["sentence"].endswith("no theory covers these links")
     assert memory.summary["secrecy"]["markov"]["relative_by_theory"] is not None
 
 

@@ -28,10 +28,12 @@ from tests.conftest import Evedrop, Live, wait_until
 from tests.rogue import with_rogue
 
 ENDLESS = ("--slots", "1000000")
-NEVER_CONFIRMS = """
+WAITS_FOR_OTHERS = """
 import threading
-from evedrop.live.network.session import Session
-Session.conclude = lambda self: threading.Event().wait()
+from evedrop.live.observer.conductor import Conductor
+Conductor.end = lambda self, patience: threading.Event().wait()
+from evedrop.results.writer import ResultsWriter
+ResultsWriter.checkpoint = lambda *all: None
 """
 
 
@@ -274,13 +276,12 @@ def sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in (folder / UNFINISHED).iterdir()}
 
 
-def test_all_rows_are_on_disk_before_processes_are_told_to_end(evedrop: Evedrop) -> None:
-    """A router may be gone then, and never confirm its end: an observer that is killed while it waits has lost nothing."""
-    live = evedrop.live(
-        "eavesdroppers", "--slots", "300", "--pace", "0", env=with_rogue(evedrop, "router", NEVER_CONFIRMS)
-    )
-    wait_until(lambda: last_round(live.folder).slots == 300, "all slots on disk", 60.0)
+def test_all_rows_are_on_disk_before_the_observer_waits_for_the_others_to_end(evedrop: Evedrop) -> None:
+    """A router that is gone never confirms: an observer that is killed while it waits has lost nothing."""
+    rogue = with_rogue(evedrop, "observer", WAITS_FOR_OTHERS)
+    live = evedrop.live("eavesdroppers", "--slots", "60", "--pace", "0", env=rogue)
+    wait_until(lambda: last_round(live.folder).slots == 60, "all slots on disk", 60.0)
     os.kill(live.child("observer"), signal.SIGKILL)
     done = live.end()
     assert done.status == 3, done.err
-    assert live.results.slots.num_rows == 4 * 300
+    assert live.results.slots.num_rows == 4 * 60

@@ -257,7 +257,7 @@ def test_an_expectation_that_events_leave_without_theory_is_refused(
     figure = f"{receiver}.expected_trace_covariance"
     expect = [{"figure": figure, "below": 1.0}]
     (line,) = mistakes(event, expect=expect, **more)
-    why = f"there is no theory for {receiver} with these links, attacks and events together"
+    why = f"no theory covers {receiver} with these links, attacks and events together"
     assert line == f'expect.0.figure: is "{figure}", but {why}; expected another figure'
     assert right(expect=expect, **more)
 

@@ -80,6 +80,58 @@ def test_mistakes_in_an_event_of_a_package_are_named(
     assert line in done.err
 
 
+BEGIN = '        yield self.begin(f"dim {self.dim}", LinkSettings({"quality": 0.1}))\n'
+FAILING = {
+    "acts raise": (
+        BEGIN,
+        "        raise ValueError('no')\n" + BEGIN,
+        "acts() raised ValueError: no, dimming.py line 14",
+    ),
+    "no acts": (BEGIN, "        return None\n", "acts() gave none; expected an Act, or several"),
+    "other acts": (BEGIN, "        yield 3\n", "acts() gave 3; expected an Act with an effect"),
+    "no receiver": ('    names_in = "dim"\n', "", "it names no receiver; expected one, or several"),
+    "mistakes raise": (
+        "    def acts",
+        "    @classmethod\n    def mistakes(cls, table):\n        raise ValueError('no')\n\n    def acts",
+        "cannot be checked: Dim.mistakes raised ValueError: no, dimming.py line 15",
+    ),
+    "compared raises": (
+        "    def acts",
+        "    def compared(self, surroundings):\n        raise ValueError('no')\n\n    def acts",
+        "event.0.dim: cannot be checked: Dim raised ValueError: no, dimming.py line 14",
+    ),
+    "in_turn raises": (
+        "    def acts",
+        "    @classmethod\n    def in_turn(cls, events):\n        raise ValueError('no')\n\n    def acts",
+        "event.0.dim: cannot be checked: Dim raised ValueError: no, dimming.py line 15",
+    ),
+}
+"""What fails → the line of the module, what stands there instead, and what is said."""
+
+
+@pytest.mark.parametrize("case", FAILING)
+def test_an_event_that_fails_is_a_mistake_of_who_uses_it(evedrop: Evedrop, case: str) -> None:
+    """Before anything is started, with the error and its line."""
+    line, instead, said = FAILING[case]
+    page = (DOCS / "your-own.md").read_text(encoding="utf-8")
+    code = page.partition("# dimming.py\n")[2].partition("```")[0]
+    assert line in code
+    environment = with_package(evedrop, code.replace(line, instead))
+    (evedrop.folder / "dim.toml").write_text(SCENARIO)
+    done = evedrop.process("check", "dim.toml", env=environment)
+    assert done.status == 2
+    assert said in done.err
+    assert "Traceback" not in done.err
+
+
+def test_an_event_that_names_nobody_is_a_mistake(evedrop: Evedrop) -> None:
+    """An empty list."""
+    (evedrop.folder / "cut.toml").write_text(SCENARIO.replace('dim = "smart"', "cut = []"))
+    done = evedrop("check", "cut.toml")
+    assert done.status == 2
+    assert "event.0.cut: is an event that cannot be carried out: it names no receiver; expected one" in done.err
+
+
 def test_an_event_that_cannot_be_loaded_is_a_mistake_of_who_uses_it(evedrop: Evedrop) -> None:
     """With the reason, beside the scenario's other mistakes; scenarios without it do not notice."""
     environment = with_package(evedrop, "import nothing_of_this_name\n")

@@ -142,7 +142,7 @@ def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
         {"figure": f"smart.{figure}", "below": 1.0} for figure in ("received_fraction", "expected_trace_covariance")
     ]
     (line,) = mistakes({**queue, "expect": expect})
-    assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but there is no theory for')
+    assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but no theory covers')
     (line,) = mistakes({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
     assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another figure")
 

@@ -1,4 +1,4 @@
-"""Figures of installed packages: the one of the docs, in every kind of run, and the facts that a figure says of itself."""
+"""Figures of installed packages: the one in docs/your-own.md in every kind of run, and figures that fail."""
 
 from __future__ import annotations
 
@@ -131,3 +131,53 @@ def test_a_figure_over_all_slots_is_that_of_the_totals(name: str) -> None:
         kept.add(ScoredSlots(first, error[rows], action[rows], trace[rows, 0], expected[rows]))
     value: Any = tally.figure(name)
     assert kept.value == pytest.approx(value, rel=1e-12)
+
+
+ADD, VALUE, TRIALS, TALLY = (
+    "        self.largest = np.maximum",
+    "return float(largest) if largest >= 0.0 else None",
+    "def of_trials(self)",
+    "return LargestTally(trials)",
+)
+FAILING = {
+    "an error in a slot": (ADD, f"        raise ValueError('no')\n{ADD}", "ValueError: no, largest.py line {}"),
+    "an error at the end": (VALUE, "raise ValueError('no')", "ValueError: no, largest.py line {}"),
+    "no number": (VALUE, "return 'abc'", "value gave 'abc'; expected a number, or None"),
+    "no trials": (TRIALS, "def of_each_trial(self)", "of_trials gave None; expected an array of 4 numbers"),
+    "no tally": (TALLY, "return None", "tally() gave None; expected a FigureTally"),
+}
+"""What fails → the line of the module, what stands there instead, and what is said."""
+
+
+@pytest.mark.parametrize("case", FAILING)
+@pytest.mark.parametrize("how", ["in memory", pytest.param("live", marks=pytest.mark.long)])
+def test_a_figure_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: str) -> None:
+    """It is null; all else is measured and saved; then the run fails with status 3, and names figure, error and line."""
+    line, instead, said = FAILING[case]
+    module = of_the_docs().replace(line, instead)
+    said = said.format(module[: module.find(instead.splitlines()[0])].count("\n") + 1)
+    environment = installed(evedrop, module)
+    command = ("run", "--view", "off") if how == "live" else ("montecarlo", "--workers", "1")
+    expect = "expect.0={figure = 'smart.largest_error', above = 0.0, quantile = 0.5}"
+    changes = ("--slots", "30", "--trials", "4", "--set", expect, "--out", "run")
+    done = evedrop.process(command[0], "eavesdroppers", *command[1:], *changes, env=environment)
+    assert done.status == 3, done.err
+    assert f"the figure largest_error of an installed package failed: {said}" in done.err
+    assert "Traceback" not in done.err
+    summary = load_results(evedrop.folder / "run").summary
+    assert summary["ended"] in done.err
+    assert summary["slots"] == 30
+    assert summary["peers"]["smart"]["mean_squared_error"] > 0.0
+    assert summary["peers"]["smart"]["digest"] is not None
+    assert summary["expectations"][0]["held"] is None
+
+
+def test_what_a_figure_prints_does_not_mix_with_the_news(evedrop: Evedrop) -> None:
+    """It goes to the observer's log, and the launcher reads every line of news."""
+    prints = f"        print('hello', end='')\n        import os; os.write(1, b'again')\n{ADD}"
+    environment = installed(evedrop, of_the_docs().replace(ADD, prints))
+    done = evedrop.process("run", "eavesdroppers", "--slots", "60", "--view", "off", "--out", "run", env=environment)
+    assert done.status == 0, done.err
+    log = (evedrop.folder / "run" / "logs" / "observer.log").read_text()
+    assert log
+    assert log.replace("hello", "").replace("again", "") == ""

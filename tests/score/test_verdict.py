@@ -179,10 +179,10 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     found = secrecy((user, expected[0]), ("eve", other, expected[1]))
     assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
     assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.HELD)
-    assert found.sentence.endswith("there is no theory for these links")
+    assert found.sentence.endswith("no theory covers these links")
     assert (found.summary.relative_by_theory, found.summary.perfect_by_theory) == (None, None)
     nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
-    assert nothing.sentence == "eve: nothing was measured; there is no theory for these links"
+    assert nothing.sentence == "eve: nothing was measured; no theory covers these links"
 
 
 def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:

@@ -11,7 +11,7 @@ import sys
 import threading
 from contextlib import suppress
 from types import TracebackType
-from typing import Self, final
+from typing import Self, TextIO, final
 
 from evedrop.live.protocol.news import Alive, News
 
@@ -19,19 +19,31 @@ _BEAT_SECONDS = 1.0
 _LINE = threading.Lock()  # one line at a time
 
 
-def set_news_apart() -> None:
-    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the news."""
+_TO: list[TextIO] = []
+"""Where the news of a launched observer go; empty before `set_news_apart`, and by hand."""
+
+
+def set_news_apart(launched: bool) -> None:
+    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the news.
+
+    launched: by a launcher, which reads nothing else. What a package's class prints then goes to the log, too.
+    """
     sys.stdout.flush()
-    sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    apart = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
+    if launched:
+        _TO.append(apart)
+    else:
+        sys.stdout = apart
 
 
 def tell(news: News) -> None:
     """Write a line to standard output for the launcher; works also without a reader."""
     left = memoryview(news.line)
     with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
+        to = _TO[0] if _TO else sys.stdout
         while left:
-            left = left[os.write(sys.stdout.fileno(), left) :]
+            left = left[os.write(to.fileno(), left) :]
 
 
 @final

@@ -376,6 +376,8 @@ class ObservedRun:
             if status == 0 and any(link.unexplained for link in summary.links.values()):
                 status = RunError.exit_status
                 how = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
+            if status == 0 and summary.ended != how:  # a figure failed
+                status, how = RunError.exit_status, summary.ended
             if status == 0 and summary.failed_expectations:
                 status = 1
             write_summary(self.folder, replace(summary, ended=how))

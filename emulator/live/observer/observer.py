@@ -45,8 +45,8 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
-    set_news_apart()
     by_hand = not brief.ends_with_stdin
+    set_news_apart(launched=not by_hand)
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)

@@ -17,7 +17,8 @@ import numpy as np
 
 from evedrop.errors import BriefError
 from evedrop.files import Unreadable, opened, why_of
-from evedrop.live.protocol.brief_entries import (
+from evedrop.live.protocol.brief_parts import PARTS, Identity, Part
+from evedrop.live.protocol.entries import (
     MATRIX,
     anything,
     entry,
@@ -34,7 +35,6 @@ from evedrop.live.protocol.brief_entries import (
     text,
     whole,
 )
-from evedrop.live.protocol.brief_parts import PARTS, Identity, Part
 from evedrop.model.process import Process, mistakes_of
 from evedrop.streams import MOST_SLOTS, Batch
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from evedrop.live.protocol.brief_entries import (
+from evedrop.live.protocol.entries import (
     LIMITS,
     MATRIX,
     NUMBERS,

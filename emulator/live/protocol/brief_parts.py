@@ -17,7 +17,7 @@ from evedrop.live.protocol.brief_closed_loop import (
     SensorPlantEntry,
     Wiring,
 )
-from evedrop.live.protocol.brief_entries import (
+from evedrop.live.protocol.entries import (
     SLOT,
     Check,
     anything,

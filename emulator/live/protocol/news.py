@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from evedrop.live.protocol.brief_entries import (
+from evedrop.live.protocol.entries import (
     SLOT,
     Check,
     entry,

@@ -1,4 +1,4 @@
-"""What an event can do to links, receivers and processes. Whoever carries it out knows these effects, and no kind of event.
+"""The effects that an event can have on links, receivers and processes. Code that carries them out knows no kinds of event.
 
 Source: docs/architecture.md, events.
 """

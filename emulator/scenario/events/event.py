@@ -10,10 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
+from evedrop.errors import NoAnswer
+from evedrop.model.registry import place_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.scenario.events.effects import Effect
+from evedrop.scenario.events.effects import Effect, Jamming, Leave, Nothing, Return
 from evedrop.scenario.table import Found, Table
 from evedrop.streams import MOST_SLOTS
 
@@ -94,6 +97,17 @@ class EventKind(When):
     def acts(self) -> Iterator[Act]:
         """The beginning of the event, and its end if it lasts."""
 
+    @model_validator(mode="after")
+    def _acts_are_usable(self) -> Self:
+        """Report what is wrong with the acts of a package's class before anybody carries them out."""
+        try:
+            _expect_acts(list(self.acts()))
+        except Exception as error:
+            said = str(error) if isinstance(error, NoAnswer) else f"acts() raised {place_of(error)}"
+            wrong = [(self.kind, f"is an event that cannot be carried out: {said}")]
+            raise PydanticCustomError("mistakes", "one", {"mistakes": wrong}) from error
+        return self
+
     def compared(self, surroundings: Surroundings) -> Iterator[Found]:
         """Mistakes that show only with other tables. Slots, receivers and changes of links are checked for every kind."""
         del surroundings
@@ -126,6 +140,19 @@ class EventKind(When):
     def begin(self, said: str, effect: Effect) -> Act:
         """Its beginning."""
         return Act(self.first, self.kind, self.names, said, effect)
+
+
+def _expect_acts(acts: Sequence[object]) -> None:
+    """Raise NoAnswer unless these are acts, and those that concern receivers name them."""
+    if not acts:
+        raise NoAnswer("acts() gave none; expected an Act, or several")
+    for act in acts:
+        if not isinstance(act, Act) or not isinstance(act.effect, Effect):
+            raise NoAnswer(f"acts() gave {act!r:.60}; expected an Act with an effect")
+        if not act.names and not isinstance(act.effect, (Nothing, Jamming)):
+            raise NoAnswer("it names no receiver; expected one, or several")
+        if len(act.names) != 1 and isinstance(act.effect, (Leave, Return)):
+            raise NoAnswer("it names several receivers; expected one")
 
 
 def spoken(names: Sequence[str]) -> str:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field, PlainValidator, SerializeAsAny, create_model
 
 from evedrop.errors import NotRegistered
+from evedrop.model.registry import asked
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import EventKind, When
 from evedrop.scenario.table import Found
@@ -43,7 +44,7 @@ class EventTable(When):
             said = f"has {listed([kind.kind for kind in given])} at once" if given else "does not say what happens"
             found.append(("event", f'{said}; expected one of {listed([*cls.kinds])}, such as cut = "legitimate"'))
         if len(given) == 1:
-            found += given[0].mistakes(table)
+            found += asked(given[0], table)
         has = {entry for kind in given for entry in kind.own_entries()}
         alone = {entry: what for kind in cls.kinds.values() for entry, what in kind.alone.items()}
         return found + [

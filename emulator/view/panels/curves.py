@@ -72,12 +72,12 @@ def thinned(scene: Scene, slots: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats) -> Iterator[Column]:
-    """log10 of squared errors or traces (c,) where there are any.
+    """log10 of squared errors or traces (c,), without those that are NaN.
 
     Everything below a floor is raised to it, because a state that was received is known exactly. The floor is a decade below one
     step's noise, or two for a mean over trials with and without errors.
     """
-    known = ~np.isnan(values)  # there is no theory for some links
+    known = ~np.isnan(values)  # no theory covers some links
     if known.any():
         floor = 10.0 ** (np.floor(np.log10(scene.noise)) - (1 if scene.trials == 1 else 2))
         yield scalars(path, slots[known], np.log10(np.maximum(values[known], floor)))

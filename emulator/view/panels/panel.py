@@ -1,4 +1,4 @@
-"""What a panel of the view says of itself. The recording and the layout ask each panel; neither knows a panel's paths.
+"""The base class of the panels of the view. The recording and the layout ask each panel; neither knows a panel's paths.
 
 Source: docs/your-own.md, a panel.
 """

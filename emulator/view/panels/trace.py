@@ -42,7 +42,7 @@ class TraceOfP(ViewPanel):
         return found
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """Two curves for each receiver; one if there is no theory."""
+        """Two curves for each receiver; only the first if no theory covers it."""
         for shown in self.scene.receivers:
             peer = slots.peers[shown.name]
             yield from logarithms(self.scene, f"{_BELIEVED}/{shown.name}", slots.numbers, peer.trace)

@@ -237,3 +237,21 @@ def test_an_inbox_that_is_closed_says_so(stage: Stage) -> None:
         reads.start()
     reads.join(LIMIT_SECONDS)
     assert [str(error) for error in caught] == [stage.keys.downlink("eve")]
+
+
+def test_zenoh_reconnects_no_session(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the first session of a process nor a later one: what keys mean would be confused before it is replaced."""
+    seen: list[dict[str, Any]] = []
+    honest = zenoh.open
+
+    def opened(config: zenoh.Config) -> zenoh.Session:
+        seen.append(json.loads(config.get_json("connect/retry")))
+        return honest(config)
+
+    monkeypatch.setattr(zenoh, "open", opened)
+    with Session(stage.eve) as session:
+        stage.cable.flap()
+        until(lambda: session._connection.openings > 1, "another session")
+    assert len(seen) > 1
+    day = 24 * 3600 * 1000
+    assert all(one["period_init_ms"] >= day and one["period_max_ms"] >= day for one in seen), seen

@@ -1,4 +1,4 @@
-"""The entries of a brief: each field of its dataclasses says how it is checked, read and written.
+"""The entries of briefs and news: each field of their dataclasses says how it is checked, read and written.
 
 A value is checked by itself, its type and its range, before an object is made of it.
 
@@ -153,7 +153,7 @@ SLOT = whole(0)
 
 
 def entry(check: Check, read: Callable[[Any], Any] | None = None, left_out: bool = False) -> dict[str, Any]:
-    """The metadata of a field that is an entry of a brief.
+    """The metadata of a field that is an entry.
 
     read: makes the field's value of the checked entry; by default they are the same. left_out: not written where it is None.
     """
