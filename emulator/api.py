@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
 from evedrop.names import LEGITIMATE
+from evedrop.news import Tell, silent
 from evedrop.results.folder import results_folder
 from evedrop.results.writer import Results, load_results
 from evedrop.scenario import Scenario
@@ -26,12 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["compare", "design", "load_results", "montecarlo", "run"]
 
-Tell = Callable[[Mapping[str, Any]], None]
-
-
-def _silent(news: Mapping[str, Any]) -> None:
-    del news
-
 
 def run(
     scenario: str | Path | Scenario,
@@ -39,7 +34,7 @@ def run(
     out: str | Path | None = None,
     view: str = "off",
     listen: str | None = None,
-    tell: Tell = _silent,
+    tell: Tell = silent,
     **changes: Any,
 ) -> Results:
     """Run a scenario live, with sensor, router, estimators and observer in separate processes.
@@ -59,7 +54,7 @@ def run(
 
     made = _prepared(scenario, changes)
     with results_folder(out, _name(scenario)) as folder:
-        ended = launch(made, folder, view, listen, lambda news: tell(news.plain))
+        ended = launch(made, folder, view, listen, tell)
         if ended.viewer is not None:
             ended.viewer.stop()
         return load_results(ended.folder)
@@ -71,7 +66,7 @@ def montecarlo(
     trials: int = 1000,
     out: str | Path | None = None,
     plan: Plan | None = None,
-    tell: Tell = _silent,
+    tell: Tell = silent,
     **changes: Any,
 ) -> Results:
     """Run the trials of a scenario in memory, to the same bits as a live run.
@@ -97,7 +92,7 @@ def compare(
     trials: int = 200,
     out: str | Path | None = None,
     plan: Plan | None = None,
-    tell: Tell = _silent,
+    tell: Tell = silent,
     **changes: Any,
 ) -> Comparison:
     """Compare every scheme against every adversary, on a scenario's process and links.

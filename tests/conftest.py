@@ -173,7 +173,7 @@ if largest:
 
 def tell(line, told):
     with news.open("a") as file:
-        file.write(f"{told.get('done', 0)} {told['event']}\\n")
+        file.write(f"{getattr(told, 'done', 0)} {told.event}\\n")
     show(line, told)
 
 ProgressLine.tell = tell

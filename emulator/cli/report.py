@@ -25,6 +25,7 @@ from rich.progress import (
 from rich.table import Table
 
 from evedrop.figures import columns, shown_figure, unloadable_figures
+from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import ControllerSummary, LinkSummary, Summary
 
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from evedrop.model.theory.design import Design
-
-News = Mapping[str, Any]
 
 _DIGEST_WIDTH = 100  # the least width of a terminal, in columns, to show digests
 
@@ -96,43 +95,42 @@ class ProgressLine:
 
     def tell(self, news: News) -> None:
         """Show one item of news."""
-        kind = news["event"]
-        if kind == "view" and not self._quiet:
-            if news["address"]:
-                self.console.print(
-                    f"live view, open to anybody who has this address: {news['address']}", soft_wrap=True
+        match news:
+            case Started():
+                self._progress.update(self._task, description="running")
+            case Held():
+                self._progress.update(self._task, description=f"held before slot {news.before}", rate="")
+            case RunProgress():
+                self._progress.update(
+                    self._task,
+                    description="running",
+                    total=self._total if news.total is None else news.total,
+                    completed=news.done,
+                    rate=f"{news.rate:,.0f} {news.rate_unit}",
+                    errors="  ".join(f"{name} {error:.2g}" for name, error in news.squared_errors.items()),
                 )
-            if news.get("warning"):
-                self.console.print(f"warning: {news['warning']}", soft_wrap=True)
-        elif kind == "started":
-            self._progress.update(self._task, description="running")
-        elif kind == "held":
-            self._progress.update(self._task, description=f"held before slot {news['before']}", rate="")
-        elif kind == "progress":
-            self._progress.update(
-                self._task,
-                description="running",
-                total=news.get("total", self._total),
-                completed=news["done"],
-                rate=f"{news['rate']:,.0f} {news['rate_unit']}",
-                errors="  ".join(f"{name} {error:.2g}" for name, error in news.get("squared_errors", {}).items()),
-            )
-        elif kind == "reconnected" and not self._quiet:
-            self.console.print(outage_line(news), soft_wrap=True)
-        elif kind == "moved":
-            self.moved = Path(news["folder"])
-            self.console.print(
-                f"the results folder was renamed while the run went on; it is {self.moved}", soft_wrap=True
-            )
-        elif kind == "ended" and news.get("view"):
-            self.console.print(f"the view stopped early: {news['view']}")
+            case ViewOpened() if not self._quiet:
+                if news.address:
+                    self._print(f"live view, open to anybody who has this address: {news.address}")
+                if news.warning:
+                    self._print(f"warning: {news.warning}")
+            case ConnectionOutage() if not self._quiet:
+                self._print(outage_line(news))
+            case FolderMoved():
+                self.moved = Path(news.folder)
+                self._print(f"the results folder was renamed while the run went on; it is {self.moved}")
+            case RunEnded() if news.view:
+                self._print(f"the view stopped early: {news.view}")
+
+    def _print(self, line: str) -> None:
+        self.console.print(line, soft_wrap=True)
 
 
-def outage_line(outage: News) -> str:
-    """An outage of the summary as a sentence."""
-    went = "the run did not go on" if outage["until"] is None else f"the run went on after {outage['seconds']:.1f} s"
-    where = f" of shard {outage['shard']}" if "shard" in outage else ""
-    return f"{outage['process']}{where} cut off at slot {outage['slot']}; {went}"
+def outage_line(outage: ConnectionOutage) -> str:
+    """An outage as a sentence."""
+    went = "the run did not go on" if outage.until is None else f"the run went on after {outage.seconds:.1f} s"
+    where = "" if outage.shard is None else f" of shard {outage.shard}"
+    return f"{outage.process}{where} cut off at slot {outage.slot}; {went}"
 
 
 def closing_table(summary: Summary, width: int) -> Table:

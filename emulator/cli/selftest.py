@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.memory.montecarlo import simulate
+from evedrop.news import silent
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 
@@ -62,7 +63,7 @@ class Check:
 def selftest() -> Check:
     """Compute the golden digests on this machine."""
     with tempfile.TemporaryDirectory(prefix="evedrop-") as folder:
-        simulate(Scenario.model_validate(SCENARIO), Path(folder) / "run", lambda _: None)
+        simulate(Scenario.model_validate(SCENARIO), Path(folder) / "run", silent)
         peers = load_results(Path(folder) / "run").typed_summary.peers
     packages = ("evedrop", "numpy", "cryptography", "eclipse-zenoh", "rerun-sdk", "msgpack", "pyarrow", "scipy")
     machine = {

@@ -25,6 +25,7 @@ from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes import scheme_of
+from evedrop.news import FolderMoved, RunProgress, Tell
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
@@ -41,8 +42,6 @@ from evedrop.signals import stop_on_signals
 
 _WORTH_A_PROCESS = 2_000_000  # trial-slots and receivers: below, starting workers costs more than it saves
 _TELL_SECONDS = 0.1
-
-News = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Plan:
         return len(os.sched_getaffinity(0)) if work > _WORTH_A_PROCESS else 1
 
 
-def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], plan: Plan = Plan()) -> int:
+def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) -> int:
     """Run all trials of a scenario into a results folder; returns the exit status. `tell` gets progress as it is made.
 
     Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
@@ -106,7 +105,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Callable[[News], None], pla
                 raise failure or Interrupted("interrupted before any trials were done; nothing was kept")
             write_summary(held.now, summary)
             if held.now != folder:
-                tell({"event": "moved", "folder": str(held.now)})
+                tell(FolderMoved(str(held.now)))
     if failure is not None:
         raise failure
     if not merger.complete:
@@ -193,7 +192,7 @@ def results_of(
         yield from in_processes(tasks, min(workers, len(tasks)), tell, stopped)
 
 
-def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
+def teller(tell: Tell, total: int) -> Callable[[int], None]:
     """A function that takes counts of trial-slots and reports progress and rate a few times a second."""
     started = told = time.monotonic()
     done = 0
@@ -204,15 +203,7 @@ def teller(tell: Callable[[News], None], total: int) -> Callable[[int], None]:
         now = time.monotonic()
         if now - told > _TELL_SECONDS:
             told = now
-            tell(
-                {
-                    "event": "progress",
-                    "total": total,
-                    "done": done,
-                    "rate": done / (now - started),
-                    "rate_unit": "trial-slots/s",
-                }
-            )
+            tell(RunProgress(done, done / (now - started), "trial-slots/s", {}, total))
 
     return take
 

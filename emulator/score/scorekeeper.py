@@ -17,6 +17,7 @@ from evedrop.figures.figure import ScoredSlots
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
+from evedrop.news import ConnectionOutage
 from evedrop.scenario import Scenario
 from evedrop.score.channel import link_summary_of
 from evedrop.score.closed_loop_tally import Acted
@@ -24,7 +25,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
-from evedrop.score.summary import Outage, PeerSummary, RunEvent, Summary, Surprising
+from evedrop.score.summary import PeerSummary, RunEvent, Summary, Surprising
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
@@ -102,7 +103,7 @@ class Ending:
     mode: str = "live"
     """`live`, or the mode of a run in memory."""
     events: Sequence[RunEvent] = ()
-    outages: Sequence[Outage] = ()
+    outages: Sequence[ConnectionOutage] = ()
     accused: tuple[str, ...] = ()
     """The processes whose behaviour made the run end."""
     misdelivered: Mapping[str, int] = field(default_factory=dict)

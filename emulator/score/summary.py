@@ -13,7 +13,9 @@ from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from evedrop.entries import SLOT, entry, plain, text
 from evedrop.figures.links import LinkAccount
+from evedrop.news import ConnectionOutage
 from evedrop.scenario import application
 
 if TYPE_CHECKING:
@@ -79,36 +81,15 @@ class LinkSummary(LinkAccount):
 class RunEvent:
     """An event during the run."""
 
-    slot: int
-    event: str
-    by: str
+    slot: int = field(metadata=entry(SLOT))
+    event: str = field(metadata=entry(text))
+    by: str = field(metadata=entry(text))
     """`scenario` or `operator`."""
 
     @property
     def line(self) -> str:
         """The event as a line of the view."""
         return self.event if self.by == "scenario" else f"{self.event} (by the {self.by})"
-
-
-@dataclass(frozen=True)
-class Outage:
-    """A process that was cut off from the network."""
-
-    process: str
-    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
-    slot: int
-    """The first slot that was not joined when the loss was noticed."""
-    until: int | None
-    """The first slot that was not joined when the run went on; None if it did not."""
-    seconds: float
-    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
-    shard: int | None = None
-    """None in a run without shards, whose entry lacks it."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """The entry of summary.json."""
-        entry = {name: value for name, value in asdict(self).items() if name != "shard"}
-        return entry if self.shard is None else {"shard": self.shard, **entry}
 
 
 @dataclass(frozen=True)
@@ -226,7 +207,7 @@ class Summary:
     peers: Mapping[str, PeerSummary]
     links: Mapping[str, LinkSummary]
     events: Sequence[RunEvent]
-    outages: Sequence[Outage]
+    outages: Sequence[ConnectionOutage]
     verification: Mapping[str, Verification] | None
     misdelivered: Mapping[str, int]
     secrecy: Mapping[str, SecrecySummary]
@@ -268,8 +249,10 @@ _OPEN = "applications"
 
 def _entry(value: Any) -> Any:
     """An entry, or several, in the form of summary.json."""
-    if isinstance(value, (PeerSummary, Outage, Judged)):
+    if isinstance(value, (PeerSummary, Judged)):
         return value.as_dict()
+    if isinstance(value, ConnectionOutage):
+        return plain(value)
     if isinstance(value, Mapping):
         return {name: _entry(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):

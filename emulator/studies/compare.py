@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,12 @@ import numpy as np
 from evedrop.errors import Interrupted, RunError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
-from evedrop.memory.montecarlo import Merger, News, Plan, disk_errors, results_of, teller
+from evedrop.memory.montecarlo import Merger, Plan, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE
+from evedrop.news import Tell
 from evedrop.results.comparison import Cell, Comparison, Needs, SchemeResult, SimulatedError, Theory
 from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
 from evedrop.results.resolved_scenario import resolved
@@ -43,7 +44,7 @@ _WRITE_SECONDS, _WRITE_SHARE = (
 )  # from one compare.json to the next, and as a multiple of the time to write one
 
 
-def compare_all(matchups: Matchups, folder: Path, tell: Callable[[News], None], plan: Plan) -> Comparison:
+def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Comparison:
     """Simulate all matches into a results folder: compare.json, compare.png and .pdf, and the simulated scenarios.
 
     Raises UsageError for an unusable folder or plan; Interrupted on Ctrl-C and RunError if a worker fails, with the completed

@@ -6,7 +6,7 @@ Source: docs/testing.md.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -17,6 +17,7 @@ from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.live.launch.launcher import launch
 from evedrop.loading import load, shipped
 from evedrop.memory.montecarlo import Plan, simulate
+from evedrop.news import silent
 from evedrop.results.folder import claimed, default_folder
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
@@ -121,13 +122,9 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
     """Run a scenario into a folder; returns the results folder."""
     if manner.in_memory:
-        simulate(scenario, folder, _silent, Plan(workers=manner.workers))
+        simulate(scenario, folder, silent, Plan(workers=manner.workers))
         return folder
-    return launch(scenario, folder, "off", None, lambda _: None).folder
-
-
-def _silent(news: Mapping[str, Any]) -> None:
-    del news
+    return launch(scenario, folder, "off", None, silent).folder
 
 
 def _reasons(expectations: Sequence[Judged]) -> Iterator[str]:

@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from evedrop.loading import load, value_of
 from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
+from evedrop.news import Tell
 from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
@@ -84,7 +85,7 @@ def sweep_over(
     changes: Mapping[str, Any],
     grid: Grid,
     folder: Path,
-    tell: Callable[[Mapping[str, Any]], None],
+    tell: Tell,
     plan: Plan,
 ) -> pa.Table:
     """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot.

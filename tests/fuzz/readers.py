@@ -33,6 +33,7 @@ from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.loading import load, parse, shipped, value_of
 from evedrop.memory.montecarlo import simulate
+from evedrop.news import silent
 from evedrop.plugins import named_in
 from evedrop.recordings.disturbance_file import read_disturbances
 from evedrop.recordings.link_recording import LinkRecording
@@ -223,7 +224,7 @@ def _results() -> dict[str, bytes]:
     with TemporaryDirectory() as name:
         folder = Path(name) / "run"
         scenario = load("eavesdroppers", {"slots": 12, "trials": 3, "record_trials": 2, "expect": []})
-        simulate(scenario, folder, lambda _: None)
+        simulate(scenario, folder, silent)
         return _files_in(folder)
 
 

@@ -17,7 +17,8 @@ from evedrop.errors import Interrupted
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import Children, Exit
 from evedrop.live.launch.process_set import follow_to_end
-from evedrop.live.protocol.news import ConnectionOutage, News, RunEnded, RunProgress, Started, read_news
+from evedrop.live.protocol.news import read_news
+from evedrop.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
 from tests.conftest import wait_until
@@ -108,11 +109,11 @@ def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Ben
     stop.set()
     bench.starter.lines = RunEnded(1, "complete").line
     bench.children.start(bench.briefs["observer"])
-    assert follow_to_end(bench.children, stop, lambda _: None) == 1
+    assert follow_to_end(bench.children, stop, silent) == 1
     bench.starter.lines = RunEnded(130, "interrupted").line
     bench.children.start(bench.briefs["observer"])
     with pytest.raises(Interrupted):
-        follow_to_end(bench.children, stop, lambda _: None)
+        follow_to_end(bench.children, stop, silent)
 
 
 MISSED = "evedrop: eve: legitimate, observer did not appear within 30 s, and nobody reads evedrop/r/telemetry/eve; start them\n"

@@ -11,14 +11,17 @@ from typing import Any
 
 import pytest
 
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.observer.recovery import Recovery
+from evedrop.live.observer.stall import patience_of
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ControlCommand
-from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.loading import load
+from evedrop.news import News
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
+from tests.clock import TestClock
 from tests.conftest import Evedrop, Live, wait_until
 from tests.proxy import Cable, cable
 
@@ -327,6 +330,8 @@ class Conducted:
         self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
         self.changes: dict[str, Any] = {}
         self.another_router = False
+        self.unreached: list[str] = []
+        self.clock: Clock = SYSTEM_CLOCK
 
     @property
     def missing(self) -> list[str]:
@@ -335,7 +340,7 @@ class Conducted:
 
     def lose(self, *names: str) -> None:
         """These vanish."""
-        self.lost |= dict.fromkeys(names, time.monotonic())
+        self.lost |= dict.fromkeys(names, self.clock.monotonic())
 
     def router_changed(self) -> bool:
         """As the test says."""
@@ -386,4 +391,64 @@ def test_losses_that_overlap_are_one_outage() -> None:
     recovery.look(13)
     found = [(one.process, one.slot, one.until) for one in recovery.outages]
     assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
-    assert said == [ConnectionOutage(one.process, one.slot, one.until, one.seconds) for one in recovery.outages]
+    assert said == recovery.outages
+
+
+def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, pace: float = 0.0) -> Recovery:
+    """With batches of 8 slots."""
+    conducted.clock = clock
+    return Recovery(
+        conducted,  # type: ignore[arg-type]
+        conducted,  # type: ignore[arg-type]
+        Flow(32, 8, longest_outage),
+        pace,
+        lambda _: None,
+        clock,
+    )
+
+
+def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> None:
+    """A token that is back may be faster than the subscription behind it; after some seconds the round begins all the same."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, 30.0)
+    recovery.look(10)
+    for there_after in (1.0, 9.0):
+        conducted.rounds.clear()
+        conducted.lose("router", "sensor")
+        recovery.look(10)
+        conducted.lost, conducted.unreached = {}, ["router"]
+        recovery.look(10)
+        clock.now += there_after
+        assert conducted.rounds == []
+        if there_after < 2.0:
+            recovery.look(10)
+            assert conducted.rounds == []
+            conducted.unreached = []
+        recovery.look(10)
+        assert conducted.rounds == [10]
+        conducted.unreached = []
+
+
+@pytest.mark.parametrize(("longest_outage", "pace"), [(1.0, 0.0), (8.0, 0.25), (60.0, 0.0), (60.0, 2.0)])
+@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("gap", [0.1, 7.0, 40.0])
+def test_a_round_that_is_lost_is_repeated_before_a_process_counts_as_silent(
+    longest_outage: float, pace: float, lost: bool, gap: float
+) -> None:
+    """Also in a run whose slots were joined at long intervals before; with three rounds after an outage."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, longest_outage, pace)
+    recovery.look(8)
+    clock.now += gap
+    recovery.look(16)
+    if lost:
+        conducted.lose("router")
+        recovery.look(16)
+        conducted.lost = {}
+    recovery.look(16)
+    patience, until = patience_of(longest_outage, pace, 8), clock.now
+    while clock.now - until < patience:
+        clock.now += 0.05
+        recovery.look(16)
+    assert len(conducted.rounds) >= (3 if lost else 1)
+    assert len(conducted.rounds) <= 6

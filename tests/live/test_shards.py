@@ -17,8 +17,8 @@ from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shard import shards_of
 from evedrop.live.launch.shards import OneProgress
-from evedrop.live.protocol.news import News, RunEnded, RunProgress, Started
 from evedrop.loading import load
+from evedrop.news import News, RunEnded, RunProgress, Started, silent
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results
 from tests.builders import digests_of
@@ -347,7 +347,7 @@ def test_a_secret_that_is_gone_leaves_no_folder(tmp_path: Path) -> None:
     from evedrop.live.launch.launcher import launch
 
     with pytest.raises(UsageError, match="--secret"):
-        launch(scenario, tmp_path / "run", "off", None, lambda _: None)
+        launch(scenario, tmp_path / "run", "off", None, silent)
     assert not (tmp_path / "run").exists()
 
 

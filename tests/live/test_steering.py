@@ -11,9 +11,9 @@ from evedrop.live.network.operator import Answer, Request, read_answer
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
-from evedrop.live.protocol.news import Held, News
 from evedrop.loading import checked
 from evedrop.model.slot.link import Change
+from evedrop.news import Held, News
 from evedrop.scenario import Scenario
 from tests.builders import scalar_tables
 

@@ -17,6 +17,7 @@ from evedrop.errors import UsageError
 from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.memory.simulation import Mode
+from evedrop.news import silent
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results
 from evedrop.scenario import Scenario
@@ -93,7 +94,7 @@ def scenario_of(**changes: Any) -> Scenario:
 
 def in_memory(folder: Path, plan: Plan | None = None, **changes: Any) -> Results:
     """Its results."""
-    simulate(scenario_of(**changes), folder, lambda _: None, plan or Plan(workers=1))
+    simulate(scenario_of(**changes), folder, silent, plan or Plan(workers=1))
     return load_results(folder)
 
 
@@ -231,7 +232,7 @@ def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
     assert live.end().status == 0
     results = live.results
     assert results.summary["ended"] == "complete"
-    simulate(load(live.folder), evedrop.folder / "memory", lambda _: None, Plan(workers=1))
+    simulate(load(live.folder), evedrop.folder / "memory", silent, Plan(workers=1))
     assert digests(load_results(evedrop.folder / "memory")) == digests(results)
 
 
@@ -321,7 +322,7 @@ def test_a_plant_without_inputs_needs_no_controller(tmp_path: Path) -> None:
     plant = {"disturbances": ["rain"], "disturbance_matrix": [[1.0], [0.0]], "disturbance_values": [[0.01]] * 300}
     made = tables(plant=plant)
     del made["controller"]
-    simulate(checked(made, "file"), tmp_path / "run", lambda _: None, Plan(workers=1))
+    simulate(checked(made, "file"), tmp_path / "run", silent, Plan(workers=1))
     results = load_results(tmp_path / "run")
     assert results.summary["controller"] is None
     assert results.inputs is None
@@ -336,7 +337,7 @@ def test_other_modes_say_what_they_make_of_a_loop(tmp_path: Path) -> None:
     with_loop = in_memory(tmp_path / "loop", Plan(Mode.COVARIANCE_ONLY, 1))
     made = tables()
     del made["plant"], made["controller"]
-    simulate(checked(made, "file"), tmp_path / "none", lambda _: None, Plan(Mode.COVARIANCE_ONLY, 1))
+    simulate(checked(made, "file"), tmp_path / "none", silent, Plan(Mode.COVARIANCE_ONLY, 1))
     assert with_loop.summary["peers"] == load_results(tmp_path / "none").summary["peers"]
     assert with_loop.summary["controller"] is None
 
@@ -356,6 +357,6 @@ def test_a_results_folder_runs_again_to_the_same_digests(tmp_path: Path) -> None
     first = in_memory(tmp_path / "run")
     from evedrop.loading import load
 
-    simulate(load(tmp_path / "run"), tmp_path / "again", lambda _: None, Plan(workers=1))
+    simulate(load(tmp_path / "run"), tmp_path / "again", silent, Plan(workers=1))
     assert digests(load_results(tmp_path / "again")) == digests(first)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["controller"]["strategy"] == "lqr"

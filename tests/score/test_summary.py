@@ -14,10 +14,11 @@ from evedrop.errors import UsageError
 from evedrop.figures import FIGURES, figure
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
+from evedrop.news import ConnectionOutage
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.results.writer import load_results
-from evedrop.score.summary import Outage, Summary
+from evedrop.score.summary import Summary
 
 
 @pytest.mark.parametrize(
@@ -43,11 +44,11 @@ def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario
     figures = [name for name in FIGURES if figure(name).only_in_mode in {None, mode.value}]
     order = [*figures[:5], "error_quantiles", "infinite_variance", "digest", *figures[5:]]
     assert [list(peer) for peer in results.summary["peers"].values()] == [order] * len(summary.peers)
-    outages = [Outage("smart", 3, None, 0.5), Outage("router", 4, 9, 1.0, shard=2)]
+    outages = [ConnectionOutage("smart", 3, None, 0.5), ConnectionOutage("router", 4, 9, 1.0, shard=2)]
     write_summary(tmp_path / "run", replace(summary, outages=outages))
     again = load_results(tmp_path / "run")
     assert again.typed_summary.outages == outages
-    assert list(again.summary["outages"][1]) == ["shard", "process", "slot", "until", "seconds"]
+    assert list(again.summary["outages"][1]) == ["process", "slot", "until", "seconds", "shard"]
     assert "shard" not in again.summary["outages"][0]
 
 

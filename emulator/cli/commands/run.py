@@ -32,9 +32,7 @@ def run(options: argparse.Namespace) -> int:
     with results_folder(options.out, options.scenario) as folder:
         with ProgressLine(scenario.slots, "slots", options.json) as line:
             try:
-                ended = launch(
-                    scenario, folder, options.view, options.listen, lambda news: line.tell(news.plain), options.relay
-                )
+                ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
             except (RunError, Interrupted):
                 with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
                     print_so_far(line.moved or folder, options.json)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,15 +53,13 @@ def status(options: argparse.Namespace) -> int:
     """Print the run's status."""
     from evedrop.live.network.control_file import read_controls
     from evedrop.live.network.operator import Request
+    from evedrop.live.protocol.status import status_of_shards
 
     answers = [
         _answer(options.run, control, Request("status"), "status", _PATIENCE) for control in read_controls(options.run)
     ]
-    found = _of_all([answer.status or {} for answer in answers])
-    if options.json:
-        print(json.dumps(found, ensure_ascii=False))
-    else:
-        print("\n".join(_lines(found)))
+    found = status_of_shards([answer.status for answer in answers if answer.status is not None])
+    print(json.dumps(asdict(found), ensure_ascii=False) if options.json else "\n".join(found.lines))
     return 0
 
 
@@ -137,33 +135,6 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     except TypeError:  # a date cannot be in a message, and no entry of a link is a date
         value = text
     inner[last] = value
-
-
-def _of_all(statuses: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """The status of a run from those of its shards: the slowest one's, processes present in all shards, and all packets."""
-    found = dict(min(statuses, key=lambda status: int(status["slot"])))
-    found["processes"] = {name: all(one["processes"][name] for one in statuses) for name in found["processes"]}
-    for name in found["links"]:
-        offered, delivered = (sum(one["links"][name][what] for one in statuses) for what in ("offered", "delivered"))
-        fraction = delivered / offered if offered else None
-        found["links"] = {**found["links"], name: {"offered": offered, "delivered": delivered, "fraction": fraction}}
-    return found
-
-
-def _lines(found: dict[str, Any]) -> list[str]:
-    """The status of a run as lines of text."""
-    state = found["state"] if found["state"] == "running" else f"{found['state']} before slot {found['slot']}"
-    missing = [name for name, there in found["processes"].items() if not there]
-    there = [name for name, there in found["processes"].items() if there]
-    lines = [
-        f"slot {found['slot']} of {found['slots']}, {found['slots_per_second']:,.0f} slots/s, {state}",
-        f"processes: {', '.join(there)}" + (f"; not there: {', '.join(missing)}" if missing else ""),
-    ]
-    for name, one in found["links"].items():
-        fraction = "–" if one["fraction"] is None else f"{one['fraction']:.4f}"
-        lines.append(f"link {name}: {one['delivered']} of {one['offered']} packets delivered, {fraction}")
-    lines += [f"event at slot {one['slot']}: {one['event']} (by the {one['by']})" for one in found["events"]]
-    return lines
 
 
 def _going_on(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -20,17 +20,9 @@ from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.starter import StartedProcess, Starter, start_process
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
-from evedrop.live.protocol.news import (
-    Alive,
-    Finishing,
-    News,
-    ProcessRequest,
-    RunEnded,
-    RunOver,
-    Started,
-    read_news,
-)
+from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
+from evedrop.news import News, RunEnded, Started, Tell
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
 from evedrop.signals import SHOW_STACKS, held_back
@@ -238,7 +230,7 @@ class Children:
                 self._finishing = True
         return None if isinstance(news, Alive | ProcessRequest | RunOver | Finishing) else news
 
-    def conclude(self, tell: Callable[[News], None], patience: float = 0.0) -> RunEnded | None:
+    def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `ended` news, or None if it sent none.
 
         Once it has begun to finish, it may take its time, as long as it sends heartbeats.

@@ -26,6 +26,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
 from evedrop.live.launch.shard import Shard
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
+from evedrop.news import ConnectionOutage
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
 from evedrop.results.resolved_scenario import write_resolved
@@ -34,7 +35,7 @@ from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_s
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, summary_of
-from evedrop.score.summary import Outage, RunEvent, Summary
+from evedrop.score.summary import RunEvent, Summary
 from evedrop.score.totals import Totals
 
 _RECORDING = "recording.rrd"
@@ -109,7 +110,7 @@ def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
     return sorted(found, key=lambda one: one.slot)
 
 
-def _outages(summaries: Mapping[int, Summary]) -> list[Outage]:
+def _outages(summaries: Mapping[int, Summary]) -> list[ConnectionOutage]:
     """The outages of all shards, each with its shard, in order of slots."""
     found = [replace(one, shard=shard) for shard, summary in summaries.items() for one in summary.outages]
     return sorted(found, key=lambda one: one.slot)

@@ -5,13 +5,12 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
-from evedrop.live.protocol.news import News
+from evedrop.news import Tell
 from evedrop.scenario import Scenario
 from evedrop.signals import stop_on_signals
 from evedrop.view.viewer import choose
@@ -22,7 +21,7 @@ def launch(
     folder: Path,
     view: str,
     listen: str | None,
-    tell: Callable[[News], None],
+    tell: Tell,
     relay: str | None = None,
 ) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.

@@ -10,7 +10,6 @@ import contextlib
 import shutil
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,8 +20,8 @@ from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
 from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.network.control_file import remove_control
-from evedrop.live.protocol.news import FolderMoved, News, RunEnded, ViewOpened
 from evedrop.names import OBSERVER
+from evedrop.news import FolderMoved, RunEnded, Tell, ViewOpened
 from evedrop.results.folder import make_private, new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
@@ -53,7 +52,7 @@ def launch_one(
     folder: Path,
     view: str,
     places: RouterEndpoints,
-    tell: Callable[[News], None],
+    tell: Tell,
     stop: threading.Event,
     shard: bool = False,
 ) -> Ended:
@@ -92,7 +91,7 @@ def launch_one(
     return Ended(status, viewer, now)
 
 
-def _now(held: HeldFolder, tell: Callable[[News], None]) -> Path:
+def _now(held: HeldFolder, tell: Tell) -> Path:
     """The results folder when the run is over; reports if it was renamed."""
     try:
         now = held.now
@@ -143,7 +142,7 @@ def _note(folder: Path, scenario: Scenario, how: str) -> None:
     write_summary(folder, summary)
 
 
-def follow_to_end(children: Children, stop: threading.Event, tell: Callable[[News], None]) -> int:
+def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
     """Follow the run to its end; returns the exit status that the observer gives it."""
     early: tuple[Exit, float] | None = None
     ending: RunEnded | None
@@ -182,7 +181,7 @@ def follow_to_end(children: Children, stop: threading.Event, tell: Callable[[New
     return ending.status
 
 
-def _stopped(children: Children, tell: Callable[[News], None]) -> RunEnded:
+def _stopped(children: Children, tell: Tell) -> RunEnded:
     """End the run; returns its end if it was complete before the signal came, else raises Interrupted."""
     ending = children.conclude(tell)
     if ending is None or not ending.well:

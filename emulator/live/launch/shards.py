@@ -11,7 +11,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
@@ -20,7 +20,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.ports import RouterEndpoints, loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
-from evedrop.live.protocol.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started
+from evedrop.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started, Tell
 from evedrop.results.folder import new_folder
 from evedrop.results.held_folder import HeldFolder
 from evedrop.scenario import Scenario
@@ -31,7 +31,7 @@ from evedrop.view.viewer import Viewer
 class OneProgress:
     """Merges the news of all shards into those of one run, whose progress is the slowest shard's; thread-safe."""
 
-    def __init__(self, shards: Sequence[Shard], tell: Callable[[News], None]) -> None:
+    def __init__(self, shards: Sequence[Shard], tell: Tell) -> None:
         self._trials = {shard.number: shard.scenario.trials for shard in shards}
         self._slots = shards[0].scenario.slots
         self._tell = tell
@@ -41,7 +41,7 @@ class OneProgress:
         self.started: float | None = None
         """When the first shard began, by the monotonic clock."""
 
-    def of(self, shard: Shard) -> Callable[[News], None]:
+    def of(self, shard: Shard) -> Tell:
         """The function that takes the news of one shard."""
 
         def tell(news: News) -> None:
@@ -91,9 +91,7 @@ class _Course:
     """In order of time."""
     viewer: Viewer | None = None
 
-    def launched(
-        self, shard: Shard, at: RouterEndpoints, tell: Callable[[News], None], view: str, stop: threading.Event
-    ) -> None:
+    def launched(self, shard: Shard, at: RouterEndpoints, tell: Tell, view: str, stop: threading.Event) -> None:
         """Run one shard to its end, its routers at these endpoints; if it ends early, all shards end."""
         try:
             ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, shard=True)
@@ -114,7 +112,7 @@ def launch_shards(
     scenario: Scenario,
     folder: Path,
     view: str,
-    tell: Callable[[News], None],
+    tell: Tell,
     stop: threading.Event,
 ) -> Ended:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.

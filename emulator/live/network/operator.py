@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import zenoh
 
+from evedrop.entries import expect, read, table_of
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.status import RunStatus
 from evedrop.names import OBSERVER
 
 DOES = ("link", "pause", "resume", "step", "status")
@@ -62,7 +64,7 @@ class Answer:
     """The effect, as a sentence."""
     refused: tuple[str, ...] = ()
     """The mistakes in the request, a line each; then nothing has changed."""
-    status: Mapping[str, Any] | None = None
+    status: RunStatus | None = None
     """The run's status, if the request was `status`."""
 
     def pack(self) -> bytes:
@@ -70,7 +72,7 @@ class Answer:
         if self.refused:
             return pack({"refused": list(self.refused)})
         if self.status is not None:
-            return pack({"status": self.status})
+            return pack({"status": asdict(self.status)})
         return pack({"k": self.slot, "said": self.said})
 
 
@@ -80,7 +82,12 @@ def read_answer(key: str, payload: bytes) -> Answer:
     if message.has("refused"):
         return Answer(refused=message.names("refused"))
     if message.has("status"):
-        return Answer(status=message.map("status"))
+        found = message.map("status")
+        try:
+            expect(table_of(RunStatus), "status", found)
+        except ValueError as error:
+            raise message.malformed(str(error), "the status of a run") from error
+        return Answer(status=read(RunStatus, found))
     return Answer(message.integer("k"), message.text("said"))
 
 

@@ -101,6 +101,14 @@ class Conductor:
         """Process → whether it is on the network."""
         return dict(self._present)
 
+    @property
+    def unreached(self) -> list[str]:
+        """The processes that are on the network, but whose subscription to their commands is not known yet.
+
+        Behind a relay, a process's token may be back before its subscriptions, and a command put meanwhile is lost.
+        """
+        return [name for name, there in self._present.items() if there and not self._reaches(name)]
+
     def assemble(self) -> None:
         """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
         deadline = self._clock.monotonic() + self._session.patience

@@ -13,7 +13,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self, TextIO, final
 
-from evedrop.live.protocol.news import Alive, News
+from evedrop.live.protocol.news import Alive
+from evedrop.news import News
 
 _BEAT_SECONDS = 1.0
 _LINE = threading.Lock()  # one line at a time

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
@@ -31,11 +31,13 @@ from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.commands import Where
-from evedrop.live.protocol.news import RunEnded, RunOver, RunProgress, Started, ViewOpened
+from evedrop.live.protocol.news import RunOver
+from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
+from evedrop.news import ConnectionOutage, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.rows import DigestRows, write_rows
@@ -45,7 +47,7 @@ from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, summary_of
-from evedrop.score.summary import Outage, RunEvent, Summary
+from evedrop.score.summary import RunEvent, Summary
 from evedrop.view.scored_slots import open_recording, showing_of, shown
 from evedrop.view.viewer import Viewer, WebAddress
 
@@ -98,7 +100,7 @@ class ObservedRun:
         """Processes whose misbehaviour ended the run."""
         self._recovery: Recovery
         self._stall: Stall
-        self._outages: list[Outage] = []
+        self._outages: list[ConnectionOutage] = []
         self._misdelivered: dict[str, int] = {}
         self._due: dict[str, GapDetector] = {}
         self._recent: tuple[float, int] = (self._started, 0)
@@ -228,7 +230,7 @@ class ObservedRun:
         while not conductor.questions.empty():
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
 
-    def _status(self, conductor: Conductor) -> dict[str, Any]:
+    def _status(self, conductor: Conductor) -> RunStatus:
         """The status of the run."""
         before, done = self._recent
         rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 from evedrop.live.network.declared import Question
 from evedrop.live.network.operator import Answer, Request
+from evedrop.live.protocol.status import RunStatus
 
 
 @final
@@ -26,7 +26,7 @@ class Order:
         """Answer that the request is refused, and that nothing was changed."""
         self._question.answer(Answer(refused=mistakes).pack())
 
-    def tell(self, status: Mapping[str, Any]) -> None:
+    def tell(self, status: RunStatus) -> None:
         """Answer with the run's status."""
         self._question.answer(Answer(status=status).pack())
 

@@ -9,21 +9,21 @@ Source: docs/protocol.md, lost connections.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import final
 
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.observer.conductor import Conductor
+from evedrop.live.observer.stall import patience_of
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again
-from evedrop.live.protocol.news import ConnectionOutage, News
 from evedrop.names import OBSERVER, RELAY, ROUTER
-from evedrop.score.summary import Outage
+from evedrop.news import ConnectionOutage, Tell
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
 _IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before a round is tried
 _LONGEST_SECONDS = 30.0
+_REACH_SECONDS = 2.0  # for which a round waits for processes that are back to subscribe to their commands again
 
 
 @final
@@ -36,12 +36,16 @@ class Recovery:
         steering: Steering,
         flow: Flow,
         pace: float,
-        say: Callable[[News], None],
+        say: Tell,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._clock = clock
         self._conductor, self._steering, self._flow, self._say = conductor, steering, flow, say
         self._batch_seconds = pace * flow.batch
+        self._patience = patience_of(flow.longest_outage, pace, flow.batch)
+        """Seconds for which the run may stand still; rounds come sooner."""
+        self._returned: float | None = None
+        """When the last missing process was back, if no round has begun since."""
         self._missing: dict[str, tuple[int, float]] = {}
         self._back: dict[str, tuple[int, float]] = {}
         self._done = 0
@@ -51,7 +55,7 @@ class Recovery:
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
-        self.outages: list[Outage] = []
+        self.outages: list[ConnectionOutage] = []
         """All outages so far."""
 
     def look(self, done: int) -> None:
@@ -65,7 +69,9 @@ class Recovery:
         if self._conductor.missing:
             self._miss(done, now)
         elif self._missing:
-            self._all_back(now)
+            self._returned = now if self._returned is None else self._returned
+            if now - self._returned > _REACH_SECONDS or not self._conductor.unreached:
+                self._all_back(now)
         elif self._steering.at is not None and done >= self._steering.at:
             self._moved = self._joined = now  # the run is held: no slots are expected
             self._close(done, now)
@@ -79,8 +85,9 @@ class Recovery:
             return self._wait
         usual = 3.0 * max(self._batch_seconds, self._longest)
         if self._done < self._target:
-            return max(_SOON_SECONDS, usual)
-        return max(min(_IDLE_SECONDS, max(1.0, self._flow.longest_outage / 3.0)), usual)
+            return max(_SOON_SECONDS, min(usual, self._patience / 8.0))
+        idle = min(_IDLE_SECONDS, max(1.0, self._flow.longest_outage / 3.0))
+        return min(max(idle, usual), self._patience / 2.0)
 
     def _go_on(self, done: int, now: float) -> None:
         if not self._missing and not self._wait:
@@ -91,12 +98,13 @@ class Recovery:
     def _close(self, done: int, now: float) -> None:
         """Record the outages that ended, now that the run goes on."""
         for name, (slot, since) in self._back.items():
-            outage = Outage(name, slot, done, now - since)
+            outage = ConnectionOutage(name, slot, done, now - since)
             self.outages.append(outage)
-            self._say(ConnectionOutage(outage.process, outage.slot, outage.until, outage.seconds))
+            self._say(outage)
         self._back = {}
 
     def _miss(self, done: int, now: float) -> None:
+        self._returned = None
         for name in self._conductor.missing:
             self._missing.setdefault(name, (done, min(self._joined, self._conductor.lost.get(name, now))))
         gone = [
@@ -121,7 +129,7 @@ class Recovery:
             found = {ROUTER: found[ROUTER]}
         for name, beginning in found.items():
             self._back.setdefault(name, beginning)
-        self._missing = {}
+        self._missing, self._returned = {}, None
         self._target = self._done + self._flow.window + self._flow.batch
         self._wait = 0.0
         self._round(now)
@@ -146,5 +154,5 @@ class Recovery:
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
-        self.outages += [Outage(name, slot, None, now - since) for name, (slot, since) in found.items()]
+        self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
         self._missing = {}

@@ -18,10 +18,11 @@ from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
-from evedrop.live.protocol.news import Held, News, ProcessRequest
+from evedrop.live.protocol.news import ProcessRequest
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
+from evedrop.news import Held, Tell
 from evedrop.scenario import Scenario
 from evedrop.scenario.events.effects import Leave, Return
 from evedrop.scenario.events.event import Act
@@ -40,7 +41,7 @@ class Steering:
         self,
         scenario: Scenario,
         conductor: Conductor,
-        tell: Callable[[News], None],
+        tell: Tell,
         keep: Callable[[Scenario], None],
     ) -> None:
         self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep

@@ -15,10 +15,7 @@ from typing import Any, Generic, TypeGuard, TypeVar
 
 import numpy as np
 
-from evedrop.errors import BriefError
-from evedrop.files import Unreadable, opened, why_of
-from evedrop.live.protocol.brief_parts import PARTS, Identity, Part
-from evedrop.live.protocol.entries import (
+from evedrop.entries import (
     MATRIX,
     anything,
     entry,
@@ -35,6 +32,9 @@ from evedrop.live.protocol.entries import (
     text,
     whole,
 )
+from evedrop.errors import BriefError
+from evedrop.files import Unreadable, opened, why_of
+from evedrop.live.protocol.brief_parts import PARTS, Identity, Part
 from evedrop.model.process import Process, mistakes_of
 from evedrop.streams import MOST_SLOTS, Batch
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from evedrop.live.protocol.entries import (
+from evedrop.entries import (
     LIMITS,
     MATRIX,
     NUMBERS,

@@ -9,15 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from evedrop.live.protocol.brief_closed_loop import (
-    AssignmentEntry,
-    EstimatorLoop,
-    PlantEntry,
-    SensorLoop,
-    SensorPlantEntry,
-    Wiring,
-)
-from evedrop.live.protocol.entries import (
+from evedrop.entries import (
     SLOT,
     Check,
     anything,
@@ -35,6 +27,14 @@ from evedrop.live.protocol.entries import (
     table_of,
     text,
     whole,
+)
+from evedrop.live.protocol.brief_closed_loop import (
+    AssignmentEntry,
+    EstimatorLoop,
+    PlantEntry,
+    SensorLoop,
+    SensorPlantEntry,
+    Wiring,
 )
 from evedrop.live.protocol.keys import KINDS
 from evedrop.model.acknowledgements import WayBackSpec

@@ -23,7 +23,7 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
 
         def tell(line: Any, news: Any) -> None:
             with open(f"{FOLDER}/news", "a") as file:
-                file.write(json.dumps({**news, "at": time.monotonic()}) + "\n")
+                file.write(json.dumps({**news.plain, "at": time.monotonic()}) + "\n")
             show(line, news)
 
         module.ProgressLine.tell = tell

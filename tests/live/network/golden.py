@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from evedrop.entries import read
 from evedrop.live.network import operator
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import commands, envelope, packets, telemetry
+from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.model.flag_bits import packed_flags
@@ -300,7 +303,8 @@ def decode_request(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
 def encode_answer(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the observer makes it."""
     refused = tuple(value.get("refused", ()))
-    return operator.Answer(value.get("k"), value.get("said", ""), refused, value.get("status")).pack()
+    status = read(RunStatus, value["status"]) if "status" in value else None
+    return operator.Answer(value.get("k"), value.get("said", ""), refused, status).pack()
 
 
 def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -308,7 +312,7 @@ def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
     answer = operator.read_answer(KEY, raw)
     if answer.refused:
         return {"refused": list(answer.refused)}
-    return {"k": answer.slot, "said": answer.said} if answer.status is None else {"status": answer.status}
+    return {"k": answer.slot, "said": answer.said} if answer.status is None else {"status": asdict(answer.status)}
 
 
 CODECS: dict[str, tuple[Encode, Decode]] = {

@@ -13,12 +13,14 @@ from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import commands, packets, telemetry, whereabouts
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.status import LinkStatus, RunStatus
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.link import Change
 from evedrop.model.slot.transit import Late
+from evedrop.score.summary import RunEvent
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
 SHAPE = (N, TRIALS)
@@ -53,6 +55,7 @@ READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "again": _commanded("router", ("eve", "legitimate")),
     "request": ("evedrop/r1/control/observer", lambda raw: operator.read_request("evedrop/r1/control/observer", raw)),
     "answer": ("evedrop/r1/control/observer", lambda raw: operator.read_answer("evedrop/r1/control/observer", raw)),
+    "status": ("evedrop/r1/control/observer", lambda raw: operator.read_answer("evedrop/r1/control/observer", raw)),
     "truth": _on("telemetry/sensor", lambda m: telemetry.read_truth(m, K, EXTENT)),
     "held": _on("telemetry/sensor", lambda m: telemetry.is_held(m) and m.slot(K)),
     "leaving": _on("telemetry/eve", lambda m: telemetry.read_leaving(m, EXTENT)),
@@ -96,6 +99,8 @@ EXAMPLES: Mapping[str, bytes] = {
     "again": commands.Again(1, K, {"eve": (Change(4, cut=True),)}).pack(),
     "request": operator.Request("step", slots=3).pack(),
     "answer": operator.Answer(3, "done").pack(),
+    "status": operator.Answer(status=RunStatus(
+        K, SLOTS, 9.0, "held", {"eve": True}, {"eve": LinkStatus.of(4, 2)}, [RunEvent(2, "cut eve", "scenario")])).pack(),
     "truth": telemetry.Truth(K, np.ones((2, *SHAPE)), np.ones((2, 3), bool), None, None, np.ones((2, 1, 3)),
                              np.ones((2, 3), bool), np.ones((2, *SHAPE))).pack(),
     "held": telemetry.held(K),

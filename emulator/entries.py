@@ -1,4 +1,4 @@
-"""The entries of briefs and news: each field of their dataclasses says how it is checked, read and written.
+"""The entries of briefs, news and a run's status: each field of their dataclasses says how it is checked, read and written.
 
 A value is checked by itself, its type and its range, before an object is made of it.
 
@@ -110,7 +110,10 @@ def named(check: Check) -> Check:
             yield from _wrong(path, found, "a table")
             return
         for name, one in found.items():
-            yield from check(f"{path}.{name:.{_SHOWN}}", one)
+            if isinstance(name, str):
+                yield from check(f"{path}.{name:.{_SHOWN}}", one)
+            else:
+                yield f"{path} has the name {name!r:.{_SHOWN}}, expected a string"
 
     return all_of
 
@@ -131,7 +134,7 @@ def table(needed: Mapping[str, Check], optional: Mapping[str, Check] | None = No
                 yield f"{dot}{name} is missing"
         for name in found if strict else ():
             if name not in known:
-                yield f"{dot}{name:.{_SHOWN}} is an unknown entry"
+                yield f"{dot}{name!s:.{_SHOWN}} is an unknown entry"
 
     return each
 
