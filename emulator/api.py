@@ -40,8 +40,8 @@ def run(
     """Run a scenario live, with sensor, router, estimators and observer in separate processes.
 
     scenario: a shipped name, a file, or a checked `Scenario`; out: the results folder, new or empty; view: auto, native,
-    web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; changes: entries of the scenario, dotted keys
-    with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
+    web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; tell: called with each item of news; changes: entries
+    of the scenario by dotted key, with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
 
     Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError if a
     process failed, Interrupted on Ctrl-C; after the last two the folder holds the results so far.
@@ -69,9 +69,9 @@ def montecarlo(
     tell: Tell = silent,
     **changes: Any,
 ) -> Results:
-    """Run the trials of a scenario in memory, to the same bits as a live run.
+    """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
 
-    Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: mode and workers.
+    Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: the mode and the workers.
     """
     from evedrop.memory.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
     from evedrop.memory.simulation import Mode  # noqa: PLC0415 - the same
@@ -107,7 +107,7 @@ def compare(
     >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
     >>> found.table.to_pandas()                                                        # doctest: +SKIP
     """
-    from evedrop.memory.montecarlo import Plan  # noqa: PLC0415 - the same
+    from evedrop.memory.montecarlo import Plan  # noqa: PLC0415 - a live run does not need it
     from evedrop.studies.compare import compare_all  # noqa: PLC0415 - no other call needs it
     from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
 
@@ -122,14 +122,16 @@ def design(
 ) -> Design:
     """The admissible μ_d for a scenario's process and links, and the cost and secrecy of each choice.
 
-    max_trace: Ω; the least μ_d that keeps the limiting trace below it is computed; changes: entries by dotted key.
+    max_trace: Ω, for which the least μ_d that keeps the limiting trace below it is computed, too; changes: entries by dotted
+    key.
 
-    Raises ScenarioError with every mistake, UsageError if no μ_d keeps Ω or the scheme is not one of states and innovations.
+    Raises ScenarioError with every mistake of the scenario, UsageError if the scheme does not send states and innovations, if
+    the losses of a link are not independent and alike in all slots, or if Ω is infinite or no μ_d keeps it.
     """
     from evedrop.model.theory.design import Adversary  # noqa: PLC0415 - a run does not need it
     from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - the same
 
-    made = scenario if isinstance(scenario, Scenario) else load(scenario, changes, beyond_horizon=True)
+    made = _prepared(scenario, changes or {}, beyond_horizon=True)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:

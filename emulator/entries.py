@@ -1,6 +1,6 @@
 """The entries of briefs, news and a run's status: each field of their dataclasses says how it is checked, read and written.
 
-A value is checked by itself, its type and its range, before an object is made of it.
+The type and range of each value are checked before an object is made of it.
 
 Source: docs/protocol.md, the brief.
 """
@@ -66,7 +66,7 @@ def number(path: str, found: Any) -> Iterator[str]:
 
 
 def positive(path: str, found: Any) -> Iterator[str]:
-    """Check that a value is a finite number of 0 or more."""
+    """Check that a value is a finite number, 0 or more."""
     wrong = list(number(path, found))
     yield from wrong or (_wrong(path, found, "a number of 0 or more") if found < 0 else ())
 
@@ -90,7 +90,7 @@ def listed(check: Check) -> Check:
 
 
 def row(*checks: Check) -> Check:
-    """A check for a list with one value for each of these checks."""
+    """A check for a list with exactly one value for each of these checks, in their order."""
 
     def each(path: str, found: Any) -> Iterator[str]:
         if not isinstance(found, list) or len(found) != len(checks):
@@ -103,7 +103,7 @@ def row(*checks: Check) -> Check:
 
 
 def named(check: Check) -> Check:
-    """A check for a table of any names, with values that pass another check."""
+    """A check for a table with any names, whose values pass another check."""
 
     def all_of(path: str, found: Any) -> Iterator[str]:
         if not isinstance(found, dict):
@@ -119,7 +119,7 @@ def named(check: Check) -> Check:
 
 
 def table(needed: Mapping[str, Check], optional: Mapping[str, Check] | None = None, strict: bool = True) -> Check:
-    """A check for a table of these entries; strict: other entries are mistakes."""
+    """A check for a table with these entries; strict: any other entry is a mistake."""
     known = {**needed, **(optional or {})}
 
     def each(path: str, found: Any) -> Iterator[str]:
@@ -140,7 +140,7 @@ def table(needed: Mapping[str, Check], optional: Mapping[str, Check] | None = No
 
 
 def key(path: str, found: Any) -> Iterator[str]:
-    """Check that a value is the key of a stream."""
+    """Check that a value is the key of a stream, in hexadecimal."""
     try:
         size = len(bytes.fromhex(found)) if isinstance(found, str) else 0
     except ValueError:
@@ -158,13 +158,13 @@ SLOT = whole(0)
 def entry(check: Check, read: Callable[[Any], Any] | None = None, left_out: bool = False) -> dict[str, Any]:
     """The metadata of a field that is an entry.
 
-    read: makes the field's value of the checked entry; by default they are the same. left_out: not written where it is None.
+    read: makes the field's value from the checked entry; by default they are the same. left_out: not written if it is None.
     """
     return {"check": check, "read": read or (lambda found: found), "left_out": left_out}
 
 
 def inner(kind: type[Any], or_null: bool = False) -> dict[str, Any]:
-    """The metadata of a field that is a table of entries itself: an object of this dataclass, perhaps None."""
+    """The metadata of a field that is itself a table of entries: an object of this dataclass; or_null: or None."""
     check = table_of(kind)
     if or_null:
         return entry(maybe(check), lambda found: None if found is None else read(kind, found))
@@ -172,7 +172,7 @@ def inner(kind: type[Any], or_null: bool = False) -> dict[str, Any]:
 
 
 def table_of(kind: type[Any]) -> Check:
-    """A check for the table of a dataclass of entries; an entry with a default may be missing."""
+    """A check for the table of a dataclass of entries; only entries with a default may be missing."""
     needed: dict[str, Check] = {}
     optional: dict[str, Check] = {}
     for one in fields(kind):
@@ -181,7 +181,7 @@ def table_of(kind: type[Any]) -> Check:
 
 
 def expect(check: Check, path: str, found: Any) -> None:
-    """Raise ValueError with the first mistakes in a value."""
+    """Raise ValueError with the first mistakes in a value, if it has any."""
     mistakes = list(islice(check(path, found), _MOST_TOLD))
     if mistakes:
         raise ValueError("; ".join(mistakes))
@@ -194,6 +194,6 @@ def read(kind: type[T], found: Mapping[str, Any]) -> T:
 
 
 def plain(of: Any) -> dict[str, Any]:
-    """The entries of an object of a dataclass, as they are written; for the `default` of json.dump."""
+    """The entries of an object of such a dataclass, as they are written; also serves as `default` of json.dump."""
     values = ((one, getattr(of, one.name)) for one in fields(of))
     return {one.name: value for one, value in values if value is not None or not one.metadata.get("left_out")}

@@ -1,6 +1,6 @@
-"""The names that authors of schemes, eavesdroppers, links, controllers, events, figures, panels and applications import.
+"""The names that authors of schemes, eavesdroppers, links, events, figures, panels, applications and commands import.
 
-A plug-in needs nothing else of Evedrop. Whatever is here keeps its name and its meaning within a major version.
+A plug-in needs nothing else of Evedrop. Every name here keeps its meaning within a major version.
 
 Source: docs/your-own.md.
 """
@@ -10,10 +10,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from evedrop.command import Command
 from evedrop.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ScoredSlots
 from evedrop.kernels import elementary
 from evedrop.model import update
-from evedrop.model.controllers.controller import Controller
 from evedrop.model.delays.constant import ConstantDelay
 from evedrop.model.delays.delay import DelayModel
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
@@ -60,9 +60,9 @@ __all__ = [
     "Chain",
     "Codes",
     "Column",
+    "Command",
     "ConstantDelay",
     "ControlledPlant",
-    "Controller",
     "DelayModel",
     "Eavesdropper",
     "Encoder",
@@ -152,7 +152,8 @@ _LATER = {
     "evedrop.view.scene": ("PeerSlots", "Scene", "SceneSlots", "Shown"),
 }
 _MODULES = {name: module for module, names in _LATER.items() for name in names}
-"""Imported when used: pydantic, which checks tables, and Rerun would slow down a receiver that uses a class of its own."""
+"""Name → the module it is imported from when it is first used. Pydantic and Rerun, which these modules import, are slow to load,
+and a receiver whose class is not built in does not need them."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
-"""What a run tells while it goes on: a class for each kind of news.
+"""The news of a run in progress: a class for each kind.
 
-The observer tells a launcher by lines of JSON, with `event` and the entries of the kind; docs/protocol.md.
+The observer sends it to its launcher as lines of JSON: `event`, and the entries of that kind.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class News:
 
 @dataclass(frozen=True)
 class Started(News):
-    """All processes are there, and the sensor begins."""
+    """All processes are present, and the sensor begins."""
 
     event = "started"
 
@@ -52,7 +52,7 @@ class Held(News):
 
     event = "held"
     before: int = field(metadata=entry(SLOT))
-    """Slot."""
+    """The slot before which the run is held."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ConnectionOutage(News):
 
     event = "reconnected"
     process: str = field(metadata=entry(text))
-    """The process whose connection was lost; the router, if it was restarted, since all connections are with it."""
+    """The process whose connection was lost; the router if it was restarted, because every connection goes through it."""
     slot: int = field(metadata=entry(SLOT))
     """The first slot that was not joined when the loss was noticed."""
     until: int | None = field(metadata=entry(maybe(SLOT)))
@@ -78,13 +78,15 @@ class RunProgress(News):
 
     event = "progress"
     done: int = field(metadata=entry(SLOT))
-    """Slots live; in memory slots times trials."""
+    """Slots in a live run; slots times trials in memory."""
     rate: float = field(metadata=entry(_real))
+    """Of progress, in `rate_unit`."""
     rate_unit: str = field(metadata=entry(text))
+    """`slots/s` or `trial-slots/s`."""
     squared_errors: Mapping[str, float] = field(metadata=entry(named(_real)))
-    """Estimator → its mean over the trials, in the last slots; live only."""
+    """Receiver → its squared error, mean over the trials and the latest slots; empty in memory."""
     total: int | None = field(default=None, metadata=entry(maybe(SLOT), left_out=True))
-    """What `done` will be at the end; None live, where it is the slots of the scenario."""
+    """The value of `done` at the end; None in a live run, where it is the scenario's number of slots."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class RunEnded(News):
     status: int = field(metadata=entry(whole(0, 255)))
     """Its exit status."""
     how: str = field(metadata=entry(text))
-    """`complete`, `interrupted`, or the reason of a failure."""
+    """`complete`, `interrupted`, or the reason for a failure."""
     suspects: Sequence[str] = field(default=(), metadata=entry(_TEXTS))
     """Processes that were missing."""
     accused: Sequence[str] = field(default=(), metadata=entry(_TEXTS))
@@ -111,11 +113,11 @@ class RunEnded(News):
 
 @dataclass(frozen=True)
 class ViewOpened(News):
-    """There is a live view."""
+    """A live view is open, or there is a warning about it."""
 
     event = "view"
     address: str | None = field(metadata=entry(maybe(text)))
-    """For a browser; None for a window."""
+    """The address to open in a browser; None for a window."""
     warning: str | None = field(default=None, metadata=entry(maybe(text)))
 
 
@@ -127,10 +129,25 @@ class FolderMoved(News):
     folder: str = field(metadata=entry(text))
 
 
+@dataclass(frozen=True)
+class RunEvent:
+    """An event that took place during the run."""
+
+    slot: int = field(metadata=entry(SLOT))
+    event: str = field(metadata=entry(text))
+    by: str = field(metadata=entry(text))
+    """`scenario` or `operator`."""
+
+    @property
+    def line(self) -> str:
+        """The event as a line of the view."""
+        return self.event if self.by == "scenario" else f"{self.event} (by the {self.by})"
+
+
 Tell = Callable[[News], None]
 """Takes each item of news."""
 
 
 def silent(news: News) -> None:
-    """Tell nobody."""
+    """Ignore the news."""
     del news

@@ -1,6 +1,7 @@
-"""Users' own modules: those that a scenario or a brief names, and the folder in which they are looked for.
+"""Users' own modules: finds those that a scenario or a brief names, and makes their folder importable.
 
-Processes of a run import the code of classes in such modules; only named modules are imported.
+The processes of a run import these modules for the classes in them. No other file of the folder is imported, unless a named
+module imports it.
 
 Source: docs/your-own.md.
 """
@@ -23,11 +24,11 @@ from evedrop.model.registry import is_own
 
 _TRUSTED = ("scheme", "model")
 _ENTRIES = (*_TRUSTED, "strategy", "reads_as")
-"""Entries of tables that name a class."""
+"""The entries of tables that name a class."""
 
 
 def names_in(tables: Any, entries: tuple[str, ...] = _ENTRIES) -> Iterator[str]:
-    """Every name of a class in these entries of tables, in order, known or not."""
+    """Every class name in these entries of tables, at any depth, in order; whether the class exists or not."""
     if isinstance(tables, Mapping):
         for entry, inner in tables.items():
             if entry in entries and isinstance(inner, str):
@@ -41,17 +42,17 @@ def names_in(tables: Any, entries: tuple[str, ...] = _ENTRIES) -> Iterator[str]:
 
 
 def named_in(tables: Any) -> Iterator[str]:
-    """Every name of the form PACKAGE.MODULE:CLASS in tables."""
+    """Every class name of the form PACKAGE.MODULE:CLASS in tables."""
     return (name for name in names_in(tables) if is_own(name))
 
 
 def trusted_in(tables: Any) -> Iterator[str]:
-    """Such names of schemes and links, which hold the secret or see all packets; not those of eavesdroppers."""
+    """Those names of schemes and links, whose classes hold the secret or see all packets; not those of eavesdroppers."""
     return (name for name in names_in(tables, _TRUSTED) if is_own(name))
 
 
 def sources_of(tables: Any) -> dict[str, str]:
-    """`module NAME` → the SHA-256 of its file, for every module that tables name and that is found. Imports none."""
+    """`module NAME` → `sha256 …` of its file, for every module that tables name and that can be found. Imports none of them."""
     found = {}
     folder = tables.get("modules") if isinstance(tables, Mapping) else None
     for name in named_in(tables):
@@ -74,7 +75,7 @@ def _file_of(module: str, folder: str | None) -> str | None:
 
 
 def _installed(top: str) -> ModuleSpec | None:
-    """The spec of a module on the path, or None."""
+    """The spec of a top-level module on `sys.path`, or None."""
     with suppress(ValueError):  # raised for __main__ and the like
         return find_spec(top)
     return None
@@ -82,13 +83,13 @@ def _installed(top: str) -> ModuleSpec | None:
 
 @final
 class _Folder(str):
-    """A folder that `look_in` has put on the path."""
+    """A folder that `look_in` has put on `sys.path`."""
 
     __slots__ = ()
 
 
 def look_in(folder: str) -> None:
-    """Put a folder on the path, after everything installed and before other folders put there by this function.
+    """Put a folder on `sys.path`, after everything installed and before the folders that this function put there earlier.
 
     So its modules cannot replace a module of Evedrop, of Python or of a library.
     """
@@ -99,7 +100,7 @@ def look_in(folder: str) -> None:
 
 
 def elsewhere(folder: str, tables: Any) -> Iterator[str]:
-    """A sentence for every module that tables name, that is in this folder, and that this process finds elsewhere."""
+    """A sentence for every module that tables name and that is in this folder, but that this process would find elsewhere."""
     for name in dict.fromkeys(named_in(tables)):
         top = name.partition(":")[0].partition(".")[0]
         there = PathFinder.find_spec(top, [folder])
@@ -124,14 +125,14 @@ def elsewhere(folder: str, tables: Any) -> Iterator[str]:
 
 
 def _put_there(spec: ModuleSpec) -> bool:
-    """Whether a module is in a folder that `look_in` has put on the path: it is not loaded, and a new folder precedes it."""
+    """Whether a module is in a folder that `look_in` put on `sys.path`: not loaded yet, it gives way to one in a newer folder."""
     return any(
         isinstance(place, _Folder) and _home(spec).startswith(f"{Path(place).resolve()}{os.sep}") for place in sys.path
     )
 
 
 def _home(spec: ModuleSpec) -> str:
-    """The place of a module or a package."""
+    """The file of a module, or the folders of a package without one."""
     if spec.origin is not None:
         return str(Path(spec.origin).resolve()) if Path(spec.origin).is_absolute() else spec.origin
     return ", ".join(spec.submodule_search_locations or ())

@@ -201,9 +201,10 @@ class Evedrop:
         """What the command is started with."""
         return {**os.environ, "TMPDIR": str(self.temporary), "COLUMNS": "160"}
 
-    def _start(
+    def start(
         self, command: list[str], arguments: tuple[str, ...], options: Mapping[str, Any]
     ) -> subprocess.Popen[str]:
+        """Start Python with this command."""
         return subprocess.Popen(
             [sys.executable, *command, *arguments],
             **{
@@ -250,13 +251,13 @@ class Evedrop:
 
     def begun(self, *arguments: str, **options: Any) -> Live:
         """The same, without waiting for its end."""
-        return Live(self._start(["-m", "evedrop"], arguments, options), self.temporary, self.folder)
+        return Live(self.start(["-m", "evedrop"], arguments, options), self.temporary, self.folder)
 
     def started(self, *arguments: str, out: str = "run", largest_file: int = 0, **options: Any) -> Live:
         """Start a command in a process of its own, to be followed and disturbed."""
         news = self.folder / f"{out.replace('/', '-')}.news"
         telling = ["-c", TELLING, str(news), str(largest_file)]
-        process = self._start(telling, (*arguments, "--out", out), options)
+        process = self.start(telling, (*arguments, "--out", out), options)
         return Live(process, self.temporary, self.folder / out, news)
 
     def live(self, scenario: str, *arguments: str, **options: Any) -> Live:

@@ -12,7 +12,7 @@ from tests.packages import install
 from tests.view.read_back import rows
 
 COMMAND = """
-from evedrop.cli.command import Command
+from evedrop.command import Command
 
 def greet(options):
     print("hello")

@@ -28,7 +28,7 @@ def print_results(folder: Path, as_json: bool = False) -> None:
 
 
 def print_ending(folder: Path, status: int, how: str) -> None:
-    """Print the output of `evedrop run` at its end: the closing report, and the reason of a failure; never fails itself.
+    """Print the output of `evedrop run` at its end: the closing report, and the reason for a failure; never fails itself.
 
     status: the exit status of the run; how: why it failed.
     """

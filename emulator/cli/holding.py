@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def hold(viewer: Viewer) -> None:
-    """Wait until the view is closed, or until Ctrl-C or SIGTERM ends it."""
+    """Wait until the view is closed, or end it on Ctrl-C or SIGTERM."""
     from evedrop.signals import stop_on_signals
 
     with stop_on_signals() as stop:

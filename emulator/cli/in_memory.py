@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def memory(parser: argparse.ArgumentParser) -> None:
-    """How trials are computed."""
+    """Add the options that say how trials are computed."""
     parser.add_argument(
         "--workers", type=int, metavar="N", help="number of worker processes; does not affect the results"
     )
@@ -39,7 +39,7 @@ MEMORY = (entries, output, memory)
 
 
 def plan_of(options: argparse.Namespace) -> Plan:
-    """How trials are to be computed, by the options of `memory`."""
+    """The plan, how trials are computed, from the options of `memory`."""
     from evedrop.memory.montecarlo import Plan
     from evedrop.memory.simulation import Mode
 

@@ -1,4 +1,4 @@
-"""The command line: finds the command, and handles errors. evedrop.cli.commands has the commands."""
+"""The command line: finds the command, and handles errors. The commands are in evedrop.cli.commands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.files import shown
 from evedrop.output import OUTPUT, finish, named_output, say, silence, warn
 
 if TYPE_CHECKING:
-    from evedrop.cli.command import Command
+    from evedrop.command import Command
 
 __all__ = ["is_role", "main"]
 
@@ -30,7 +30,7 @@ def is_role(arguments: Sequence[str]) -> bool:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns its exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    options = _parser(given[0] if given else "").parse_args(given)
+    options = parser_of(given[0] if given else "").parse_args(given)
     command: Callable[[argparse.Namespace], int] = options.command
     try:
         _check_names(options)
@@ -73,8 +73,8 @@ def _check_names(options: argparse.Namespace) -> None:
             )
 
 
-def _parser(first: str = "") -> argparse.ArgumentParser:
-    """The parser; first: the first argument. Of a command that is given, only the module is loaded."""
+def parser_of(first: str = "") -> argparse.ArgumentParser:
+    """The parser; first: the first argument. If it names a command, only that command's module is loaded."""
     parser = argparse.ArgumentParser(
         prog="evedrop", description="A network emulator for secrecy in remote state estimation."
     )
@@ -101,7 +101,7 @@ def _added(parsers: _Parsers, name: str, does: str) -> argparse.ArgumentParser:
 
 
 def _commands(first: str) -> Iterator[Command]:
-    """The command with this first word, or all."""
+    """The commands in the module of this first word; all commands if it is not the first word of a built-in one."""
     modules = [MODULES[first]] if first in MODULES else list(dict.fromkeys(MODULES.values()))
     found: list[Command] = []
     for name in modules:
@@ -113,14 +113,14 @@ def _commands(first: str) -> Iterator[Command]:
 
 
 def _commands_of_packages() -> Iterator[Command]:
-    """The commands of installed packages; says which cannot be loaded, or have the name of another."""
+    """The commands of installed packages; warns of those that cannot be loaded, or that have the name of another."""
     from importlib.metadata import entry_points
 
     taken = {*MODULES}
     for point in entry_points(group=GROUP):
         try:
             found: Sequence[Command] = import_module(point.value).COMMANDS
-        except Exception as error:  # of the package's author
+        except Exception as error:  # a mistake in the package
             warn(f"the commands of {point.value} cannot be loaded ({type(error).__name__}: {error})")
             continue
         for command in found:

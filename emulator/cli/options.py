@@ -1,4 +1,4 @@
-"""What several commands share: options, the scenario with its changes, and the report of a run.
+"""Shared by several commands: options, the scenario with its changes, and the report of a run.
 
 Slow imports are made only when they are needed, so that `evedrop --help` and a peer start quickly.
 """
@@ -8,23 +8,20 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from evedrop.command import Option
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
     from evedrop.scenario import Scenario
 
-Option = Callable[[argparse.ArgumentParser], None]
-"""A function that adds an option, or several, to a command's parser."""
-
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
 
 def argument(name: str, shown: str) -> Option:
-    """A path that a command takes."""
+    """An option that adds a positional argument, a path; shown: its name in the help."""
 
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(name, type=Path, metavar=shown)
@@ -33,17 +30,17 @@ def argument(name: str, shown: str) -> Option:
 
 
 def scenario(parser: argparse.ArgumentParser) -> None:
-    """The scenario."""
+    """Add the argument for the scenario."""
     parser.add_argument("scenario", metavar="SCENARIO", help="a shipped name, a file, or a results folder")
 
 
 def changes(parser: argparse.ArgumentParser) -> None:
-    """Changes of the scenario by dotted key."""
+    """Add `--set`, which changes an entry of the scenario by its dotted key."""
     parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=_SET_HELP)
 
 
 def entries(parser: argparse.ArgumentParser) -> None:
-    """Changes by dotted key, and options of their own for the entries that are changed most."""
+    """Add `--set`, and an option for each of the entries that are changed most often."""
     changes(parser)
     for name, what in (
         ("seed", "seed of all random numbers"),
@@ -58,25 +55,25 @@ def entries(parser: argparse.ArgumentParser) -> None:
 
 
 def output(parser: argparse.ArgumentParser) -> None:
-    """The results folder, and JSON."""
+    """Add the options for the results folder and for JSON."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
     parser.add_argument("--json", action="store_true", help="print only the summary, as JSON, on standard output")
 
 
 def as_json(parser: argparse.ArgumentParser) -> None:
-    """JSON instead of text."""
+    """Add `--json`, for JSON instead of text."""
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def served(parser: argparse.ArgumentParser) -> None:
-    """Where a run is shown to browsers."""
+    """Add `--serve`, the address where a run is shown to browsers."""
     parser.add_argument(
         "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
     )
 
 
 def changes_of(options: argparse.Namespace) -> dict[str, Any]:
-    """The changes of the scenario that `changes` or `entries` took. Raises UsageError for one that is none."""
+    """The changes of the scenario that `changes` or `entries` took. Raises UsageError for one that is not KEY=VALUE."""
     from evedrop.loading import value_of
 
     changes: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""The terminal output of a run: a progress line, and a closing table with a sentence on secrecy."""
+"""The terminal output of runs, sweeps and designs: a progress line, and tables with the sentences that go with them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _DIGEST_WIDTH = 100  # the least width of a terminal, in columns, to show digest
 
 
 class _Unfailing:
-    """A stream that ignores errors of writing: the terminal may be closed while the run is ended in order."""
+    """A stream that ignores write errors: the terminal may be closed while the run is being ended in order."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -62,7 +62,7 @@ def _unfailing(stream: TextIO | None) -> TextIO:
 
 @final
 class ProgressLine:
-    """Shows the observer's or the simulation's news on standard error; a context manager."""
+    """Shows the news of a run on standard error; a context manager. total: progress at the end, counted in `unit`s."""
 
     def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
         self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
@@ -134,7 +134,7 @@ def outage_line(outage: ConnectionOutage) -> str:
 
 
 def closing_table(summary: Summary, width: int) -> Table:
-    """The table of the receivers: their figures, and, if there is room, digests."""
+    """The table of the receivers: their figures and, if there is room, their digests; width: of the terminal, in columns."""
     trials = f"{summary.trials:,} trials" if summary.trials > 1 else "1 trial"
     rate = f"{summary.slots_per_second:,.0f} slots/s"
     if summary.mode != "live":
@@ -304,7 +304,7 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
 
 
 def _figure(value: float | None, how: str = ".4g") -> str:
-    """A figure of the summary as text; None means that there is none."""
+    """A figure of the summary as text; a dash for None."""
     return "–" if value is None else format(value, how)
 
 
@@ -319,7 +319,7 @@ class _Console(Console):
 
 
 def terminal() -> Console:
-    """Standard output; wide if it is not a terminal."""
+    """A console on standard output; 140 columns wide if that is not a terminal."""
     return _Console(
         highlight=False,
         markup=False,

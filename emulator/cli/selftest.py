@@ -20,7 +20,7 @@ GOLDEN: Mapping[str, str] = {
     "smart": "933cb95c2b1dfe4f43d259f43dff6f3da1343b387662780b4d99fc5aa40d2f06",
     "suspicious": "1453d70b15896b60904e59673cd5328b8db63a2960893837aecddebbbde645c6",
 }
-"""Receiver → digest of `SCENARIO`. They change only with the protocol of random numbers or the schemes themselves."""
+"""Receiver → its digest in `SCENARIO`. Digests change only if the protocol of random numbers or the schemes change."""
 
 SCENARIO = {
     "title": "selftest",

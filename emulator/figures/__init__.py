@@ -1,6 +1,6 @@
 """The figures of receivers, by their name in the summary. To add one, write a class and add it to `_BUILT_IN`.
 
-An installed package adds one by an entry point of the group `evedrop.figures`.
+An installed package adds one with an entry point in the group `evedrop.figures`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ FIGURES: Registry[Figure] = Registry(
     "evedrop.figures",
     _BUILT_IN,
 )
-"""By the name in the summary."""
+"""Name in the summary → figure."""
 
 _TAKEN = ("error_quantiles", "infinite_variance", "digest")
-"""Other entries of a receiver in the summary."""
+"""The other entries of a receiver in the summary, which no figure can be named after."""
 
 
 def figure(name: str) -> type[Figure]:
-    """A figure by its name. Raises NotRegistered if there is none, or if it cannot be loaded."""
+    """A figure by its name. Raises NotRegistered if there is none, its name cannot be used, or it cannot be loaded."""
     if name in _TAKEN or not name.isidentifier():
         wanted = "; expected a name of letters, digits and _ that no other entry of a receiver in the summary has"
         raise NotRegistered(name, wanted)
@@ -46,13 +46,13 @@ def figure(name: str) -> type[Figure]:
 
 
 def all_figures() -> dict[str, type[Figure]]:
-    """Name → every figure that can be loaded: the built-in ones in their order, then those of installed packages."""
+    """Name → figure, for all that can be loaded: the built-in ones in their order, then those of installed packages."""
     left_out = unloadable_figures()
     return {name: figure(name) for name in _names() if name not in left_out}
 
 
 def unloadable_figures() -> dict[str, str]:
-    """The figures of installed packages that cannot be loaded, with the reason, in words that follow the name."""
+    """Name → why it cannot be loaded, in words that follow the name, for figures of installed packages."""
     found = {}
     for name in _names():
         try:
@@ -63,7 +63,7 @@ def unloadable_figures() -> dict[str, str]:
 
 
 def figures_of(receiver: str) -> dict[str, type[Figure]]:
-    """Name → figure, of a receiver of this name."""
+    """Name → figure, for all that the receiver of this name has."""
     return {name: one for name, one in all_figures().items() if one.of == "receiver" or receiver != LEGITIMATE}
 
 
@@ -73,7 +73,10 @@ def expectable_figures() -> dict[str, type[Figure]]:
 
 
 def columns(where: Literal["column", "sweep_column"], mode: str | None = None) -> dict[FigureColumn, list[str]]:
-    """The columns of the closing table of a mode, or of a sweep's, in order → the figures that share each."""
+    """Column → the names of the figures that share it, in order of columns.
+
+    where: the closing table, or the printed table of a sweep; mode: leave out figures that a run in this mode does not have.
+    """
     found: dict[FigureColumn, list[str]] = {}
     for name, one in all_figures().items():
         column: FigureColumn | None = getattr(one, where)
@@ -84,7 +87,7 @@ def columns(where: Literal["column", "sweep_column"], mode: str | None = None) -
 
 
 def shown_figure(row: Mapping[str, Any], names: Sequence[str]) -> float | None:
-    """The figure that a column or a curve shows: the first that there is among those that share it."""
+    """The value that a column or a curve shows: the first of these figures that a row has; None if it has none of them."""
     return next((float(row[name]) for name in names if row.get(name) is not None), None)
 
 

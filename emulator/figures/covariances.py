@@ -13,7 +13,7 @@ from evedrop.model.process import Floats
 
 @final
 class MeanTraceCovariance(MeanFigure, TotalsFigure):
-    """The mean of tr P that the receiver believes."""
+    """The mean of tr P, where P is the covariance that the receiver believes."""
 
     meaning = "of tr P, the error covariance that the receiver believes"
     by_trial = False
@@ -28,7 +28,7 @@ class MeanTraceCovariance(MeanFigure, TotalsFigure):
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
-        """Its sum over trials, (c, 1)."""
+        """The sum of tr P over trials, (c, 1)."""
         return slots.trace[:, None]
 
 
@@ -53,7 +53,7 @@ class ExpectedTraceCovariance(TotalsFigure):
 
     @classmethod
     def tally(cls, trials: int) -> FigureTally:
-        """Traces of no slots yet."""
+        """A tally of no slots yet."""
         del trials
         return ExpectedTraces()
 
@@ -71,10 +71,10 @@ class ExpectedTraces(FigureTally):
 
     @classmethod
     def merged(cls, parts: Sequence[ExpectedTraces]) -> ExpectedTraces:
-        """Those of the first set of trials."""
+        """The traces of the first set of trials, which are those of all."""
         return parts[0]
 
     @property
     def value(self) -> float | None:
-        """Their mean."""
+        """Their mean; None without slots."""
         return float(np.mean(np.concatenate(self._traces))) if self._traces else None

@@ -9,7 +9,7 @@ from evedrop.model.process import Floats
 
 
 class MeanError(MeanFigure, TotalsFigure):
-    """The mean of the error of the mode."""
+    """The mean of the mode's error: |x − x̂|², or in a covariance-only study the trace of the actual covariance."""
 
     sweep_column = FigureColumn("mean error", 0)
     sweep_picture = "marks"

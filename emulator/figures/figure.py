@@ -1,6 +1,6 @@
 """The base classes of figures: numbers that the summary has for every receiver, or for every eavesdropper.
 
-The class of a figure says how it is added, merged, checked and shown. No other code compares its name.
+The class of a figure says how it is summed, merged, checked and shown. No other code depends on its name.
 
 Source: docs/results.md, summary.json; docs/your-own.md, a figure.
 """
@@ -20,7 +20,7 @@ from evedrop.model.receiver import Codes
 
 Late = Sequence[NDArray[np.uint16]] | NDArray[np.uint16]
 COVARIANCE_ONLY = "covariance-only"
-"""The mode without errors."""
+"""The mode that simulates covariances, and no errors."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class ScoredSlots:
     error: Floats
     """Squared error, or tr of the actual covariance in a covariance-only study, (c, R)."""
     action: Codes
-    """(c, R)."""
+    """`Action`, (c, R)."""
     trace: Floats
-    """Believed tr P, summed over trials, which is all that a live run knows, (c,)."""
+    """Believed tr P, summed over trials, (c,): a live run does not know it trial by trial."""
     expected: Floats
     """Theory: trace of the expected actual error covariance, (c,)."""
     late: Late | None = None
-    """Packets of earlier slots that arrived, and that were used, (c, R) each; None if the receiver accepts none."""
+    """Counts of packets of earlier slots that arrived, and that were used, (c, R) each; None if the receiver accepts none."""
     x: Floats | None = None
     """True states, (c, n, R); None in modes without states."""
     x_hat: Floats | None = None
@@ -50,7 +50,7 @@ class ScoredSlots:
         return int(self.error.shape[1])
 
     def part(self, start: int, stop: int) -> ScoredSlots:
-        """Some of the slots, counted from the first."""
+        """The slots from `start` to before `stop`, counted from the first of these slots."""
         rows = slice(start, stop)
         return replace(
             self,
@@ -93,10 +93,10 @@ class FigureTally(ABC):
 
 @dataclass(kw_only=True)
 class ReceiverTotals:
-    """What is counted of every receiver. Each entry is a sum over slots and trials."""
+    """The totals of one receiver. Each entry is a sum over slots and trials."""
 
     offered: int = 0
-    """Slots times trials, which is the number of packets, except those that were not sent."""
+    """Slots times trials: the packets that were sent, and the `unsent` ones."""
     unsent: int = 0
     error: float = 0.0
     trace: float = 0.0
@@ -104,21 +104,22 @@ class ReceiverTotals:
     received: int = 0
     used: int = 0
     unexplained: int = 0
-    """Packets for which journal and receiver disagree."""
+    """Packets for which the router's journal and another process disagree."""
     late: int = 0
     """Packets that arrived after their own slot, within the window; `late_used`: those of them that were used."""
     late_used: int = 0
     late_sent: int = 0
-    """Packets that the router let through, but for a later slot."""
+    """Packets that the router did not report as lost, but that arrive after their slot."""
     lost: dict[str, int] = field(default_factory=dict)
+    """Reason → packets."""
 
 
 class FigureColumn(NamedTuple):
-    """A column of a table in the terminal. Figures with the same heading share a column, for no run has both."""
+    """A column of a table in the terminal. Figures with equal columns share one, because no run has both."""
 
     heading: str
     place: int = 99
-    """Columns stand in this order."""
+    """Columns are sorted by it."""
     format: str = ".4g"
 
 
@@ -126,9 +127,9 @@ class Figure(ABC):
     """A number of a receiver. A class, never an instance, is registered; its name in the registry is that in the summary."""
 
     of: ClassVar[Literal["receiver", "eavesdropper"]] = "receiver"
-    """Whose figure it is."""
+    """Whether every receiver has it, or only every eavesdropper."""
     meaning: ClassVar[str] = ""
-    """What it is, with its unit."""
+    """Its description, with its unit."""
     by_trial: ClassVar[bool] = False
     """Whether every trial has it, so that it has quantiles over trials."""
     needs_states: ClassVar[bool] = False
@@ -140,22 +141,22 @@ class Figure(ABC):
     not_in_mode: ClassVar[str | None] = None
     """The mode in which it is null."""
     rests_on: ClassVar[Literal["observer", "recorded trials", "receiver", "theory"]] = "receiver"
-    """Who knows it in a live run: the observer for all trials, the observer for recorded trials, or the receiver alone."""
+    """Its source in a live run: the observer, for all trials or only for recorded ones; the receiver's word alone; or theory."""
     column: ClassVar[FigureColumn | None] = None
-    """Its column of the closing table."""
+    """Its column in the closing table, if it has one."""
     sweep_column: ClassVar[FigureColumn | None] = None
-    """Its column of the printed table of a sweep. The table on disk has every figure."""
+    """Its column in the printed table of a sweep, if it has one. The table on disk has every figure."""
     sweep_picture: ClassVar[Literal["marks", "lines"] | None] = None
     """How the picture of a sweep shows it, if it does."""
 
     @classmethod
     @abstractmethod
     def tally(cls, trials: int) -> FigureTally:
-        """Totals over no slots yet. Expectations over some slots use it too."""
+        """A tally of no slots yet, for this many trials. Expectations over some slots use it, too."""
 
 
 class TotalsFigure(Figure):
-    """A figure that a whole run computes from what is counted of every receiver, without a tally."""
+    """A figure that is computed from `ReceiverTotals` for a whole run, without a tally."""
 
     @classmethod
     @abstractmethod
@@ -165,10 +166,10 @@ class TotalsFigure(Figure):
 
 @final
 class MeanTally(FigureTally):
-    """Sums over slots of a value, trial by trial or of all trials together."""
+    """Sums of a value over slots, for each trial or for all trials together."""
 
     def __init__(self, values: Callable[[ScoredSlots], Floats], trials: int, by_trial: bool) -> None:
-        """values: (c, R), or sums over trials, (c, 1), unless by_trial."""
+        """values: gives the value in every slot, (c, R) if by_trial, otherwise its sum over trials, (c, 1)."""
         self._values, self._trials, self._by_trial = values, trials, by_trial
         self._sums = np.zeros(trials if by_trial else 1)
         self._slots = 0
@@ -190,12 +191,12 @@ class MeanTally(FigureTally):
 
     @property
     def of_trials(self) -> Floats:
-        """The mean over the slots, for each trial, (R,)."""
+        """The mean over the slots, for each trial, (R,); (1,), summed over trials, unless by_trial."""
         return self._sums / self._slots
 
     @property
     def value(self) -> float | None:
-        """The mean over slots and trials."""
+        """The mean over slots and trials; None without slots."""
         return float(self.of_trials.sum()) / self._trials if self._slots else None
 
 
@@ -211,5 +212,5 @@ class MeanFigure(Figure):
 
     @classmethod
     def tally(cls, trials: int) -> FigureTally:
-        """Sums over no slots yet."""
+        """Sums over no slots yet, for this many trials."""
         return MeanTally(cls.values, trials, cls.by_trial)

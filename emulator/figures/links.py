@@ -1,4 +1,4 @@
-"""The account of a link: its figures that expectations can name."""
+"""The account of a link's packets, whose entries are the link figures that expectations can name."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from evedrop.figures.figure import ReceiverTotals
 
 @dataclass(frozen=True)
 class LinkAccount:
-    """Every packet offered is delivered or lost for a reason."""
+    """The packets of one link: every packet offered is delivered, or lost for a reason."""
 
     offered: int
     """Packets that the sensor sent."""
     delivered: int
-    """The receiver's own count, late packets included."""
+    """Packets that the receiver counted itself, late ones included."""
     late: int
     lost: int
-    """The router's journal."""
+    """Packets lost according to the router's journal."""
     unexplained: int
-    """Packets for which these disagree."""
+    """Packets for which the journal and another process disagree."""
 
     @classmethod
     def of(cls, totals: ReceiverTotals) -> Self:
         """The account of a receiver's link."""
-        # In a run cut short some packets are still under way; for a whole run the router has reported which.
+        # In a run cut short, packets that are still under way count as lost; in a whole run, the router reports them itself.
         lost = sum(totals.lost.values()) + max(0, totals.late_sent - totals.late)
         delivered = totals.received + totals.late
         offered = totals.offered - totals.unsent

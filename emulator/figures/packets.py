@@ -1,4 +1,4 @@
-"""The packets that a receiver received and used, late ones included."""
+"""The fractions of packets that a receiver received and used, late ones included."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ReceivedFraction(MeanFigure, TotalsFigure):
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
-        """Packets received, (c, R)."""
+        """Counts of packets received, (c, R)."""
         received: Floats = (slots.action != Action.LOST).astype(np.float64)
         return received if slots.late is None else np.add(received, slots.late[0], out=received)
 
@@ -45,6 +45,6 @@ class UsedFraction(MeanFigure, TotalsFigure):
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
-        """Packets received and used, (c, R)."""
+        """Counts of packets received and used, (c, R)."""
         used: Floats = ((slots.action != Action.LOST) & (slots.action != Action.DISCARDED)).astype(np.float64)
         return used if slots.late is None else np.add(used, slots.late[1], out=used)

@@ -16,11 +16,12 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, opened, text_of
+from evedrop.news import RunEvent
 from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
 from evedrop.results.input_table import inputs_schema_in
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, trials_schema
-from evedrop.score.summary import RunEvent, Summary
+from evedrop.score.summary import Summary
 from evedrop.streams import MOST_SLOTS
 
 _MOST_BYTES = 2**28
@@ -177,7 +178,7 @@ def _cut_short(folder: Path) -> dict[str, Any]:
         summary = _read_summary(figures_path(folder))
     except UsageError:
         summary = _no_figures(folder)
-    ended = f"the run goes on, at {at}" if goes_on(folder) else f"cut short at {at}, for its run was killed"
+    ended = f"the run goes on, at {at}" if goes_on(folder) else f"cut short at {at}, because its run was killed"
     if summary["ended"] != at:
         ended += f" (the figures are as of {summary['ended']}; the tables have more)"
     return {**summary, "slots": found.slots, "ended": ended}

@@ -19,7 +19,7 @@ from evedrop.scenario.words import as_toml, listed
 
 
 def link_mistakes(tables: ValidTables) -> Iterator[str]:
-    """Mistakes in correlations and delays in seconds."""
+    """Mistakes in correlations, and delays in seconds without `slot_seconds`."""
     for name, link in tables.links.items():
         path = f"{LEGITIMATE}.link" if name == LEGITIMATE else f"eavesdroppers.{name}.link"
         if link.in_seconds and "slot_seconds" not in tables.given:
@@ -67,7 +67,7 @@ def acknowledgement_mistakes(tables: ValidTables) -> Iterator[str]:
 
 
 def strategy_mistakes(tables: ValidTables) -> Iterator[str]:
-    """Strategies that need something the scheme lacks, or a slot that is beyond the run or in which they are away."""
+    """Strategies that need a stream the scheme lacks, and leaks in a slot beyond the run or while the eavesdropper is away."""
     for name, table in tables.eavesdroppers.items():
         strategy, path = STRATEGIES[table.strategy], f"eavesdroppers.{name}"
         lacking = [] if tables.scheme is None else lacking_streams(strategy.streams(table.parameters), tables.scheme)
@@ -89,12 +89,12 @@ def strategy_mistakes(tables: ValidTables) -> Iterator[str]:
 
 
 def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
-    """The streams whose keys a strategy must be given but that a scheme does not have."""
+    """The streams whose keys a strategy needs and a scheme does not have; the strategy's own coin is not among them."""
     return [stream for stream in streams if stream != "coin" and stream not in scheme.secret_streams]
 
 
 def application_mistakes(tables: ValidTables) -> Iterator[str]:
-    """Mistakes of applications: no plant, names that the plant does not have, and a receiver of the same name."""
+    """Applications without plant or controller, names that plant and process lack, and eavesdroppers of the same name."""
     for name, application in tables.applications.items():
         if not {"plant", "controller"} <= {*tables.given}:
             described = "which it describes; expected both, or no such table"

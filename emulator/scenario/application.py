@@ -1,4 +1,4 @@
-"""The hook for applications: what a closed loop's plant is used for, such as the household of a microgrid.
+"""The hook for applications: uses of a closed loop's plant, such as the household of a microgrid.
 
 An application has a table of its own in a scenario, figures in the summary and in expectations, lines in the closing report,
 panels in the view and a picture of a sweep. No other room names an application: each asks those whose tables a scenario contains.
@@ -41,9 +41,9 @@ class ControlledPlant:
     around: Floats
     """The reference of the states, (n,): states and estimates are deviations from it."""
     disturbances: Floats
-    """Of every slot, (slots, q)."""
+    """The disturbances of every slot, (slots, q)."""
     states: tuple[str, ...]
-    """Names of the n states; none if the scenario gives none."""
+    """Names of the n states; empty if the scenario gives none."""
     inputs: tuple[str, ...]
     """Names of the m inputs."""
     disturbance_names: tuple[str, ...]
@@ -69,7 +69,7 @@ class ControlledPlant:
 
     @property
     def slot_seconds(self) -> float:
-        """Seconds of a slot."""
+        """The duration of a slot in seconds."""
         return self.assignment.slot_seconds
 
     @property
@@ -104,7 +104,7 @@ class ApplicationTally(ABC):
 
     @abstractmethod
     def summary(self) -> Summary:
-        """The summary's entry: every figure, a number or None, and for each receiver under `receivers` the receivers' figures."""
+        """The summary's entry: every figure, a number or None; under `receivers`, each receiver's figures by its name."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class PanelCurve:
     """One curve of a panel."""
 
     name: str
-    """The label; a receiver's name for what this receiver believes."""
+    """The label; a receiver's name for a curve of its beliefs."""
     colour: tuple[int, int, int] | None = None
     """None: the colour of the receiver of this name."""
     drawn: Literal["line", "steps", "points"] = "line"
@@ -124,13 +124,13 @@ class Panel:
     """A panel of the view. Its curves are drawn over the slots of the run."""
 
     path: str
-    """The place in the recording, one word."""
+    """Its path in the recording, one word."""
     title: str
     curves: tuple[PanelCurve, ...]
     span: tuple[float, float] | None = None
-    """Lowest and highest value shown; None: as the curves need."""
+    """Lowest and highest value shown; None: fitted to the curves."""
     beside: bool = False
-    """Whether it stands with what receivers believe, rather than with what the plant does."""
+    """Whether it is placed with the panels of the receivers' beliefs, rather than with those of the plant."""
 
 
 class PanelFeed(ABC):
@@ -140,14 +140,14 @@ class PanelFeed(ABC):
     def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
         """Add slots from `first` on: inputs within their limits, (c, m), and estimates as deviations, (c, n).
 
-        Returns PATH/CURVE → slots and values, (2, g).
+        Returns PATH/CURVE → slots and values of its g new points, (2, g).
         """
 
 
 class Application(ABC):
-    """What a plant with a controller is used for. A class, never an instance, is registered.
+    """A use of a plant with a controller. A class, never an instance, is registered.
 
-    The name of its entry point is that of its table in a scenario, and of its entry in the summary.
+    The name of its entry point is also the name of its table in a scenario, and of its entry in the summary.
     """
 
     table: ClassVar[type[Table]]
@@ -157,39 +157,39 @@ class Application(ABC):
     figures: ClassVar[tuple[str, ...]]
     """Its figures in the summary that expectations and sweeps can use."""
     receiver_figures: ClassVar[tuple[str, ...]] = ()
-    """The same for each receiver's."""
+    """Its figures for each receiver, likewise."""
 
     @classmethod
     @abstractmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ApplicationTally:
-        """Totals over no slots yet; table: an instance of `cls.table`."""
+        """New totals, of no slots yet; table: an instance of `cls.table`; trials: R."""
 
     @classmethod
     def lines(cls, summary: Summary) -> list[str]:
-        """Its lines of the closing report."""
+        """Its lines in the closing report; by default none."""
         del summary
         return []
 
     @classmethod
     def panels(cls, loop: ControlledPlant, table: Table) -> tuple[Panel, ...]:
-        """Its panels of the view."""
+        """Its panels in the view; by default none."""
         del loop, table
         return ()
 
     @classmethod
     def feed(cls, loop: ControlledPlant, table: Table) -> PanelFeed | None:
-        """What fills its panels; None if it has none."""
+        """The source of its panels' values; None if it has no panels."""
         del loop, table
         return None
 
     @classmethod
     def draw_sweep(cls, path: Path, table: pa.Table, key: str) -> None:
-        """Draw its figures of a sweep over the entry `key`, as `path`.png and `path`.pdf. By default there is no picture."""
+        """Draw its figures in a sweep over the entry `key`, as `path`.png and `path`.pdf; by default nothing."""
         del path, table, key
 
     @classmethod
     def figure(cls, summary: Summary, path: Sequence[str]) -> float | None:
-        """A figure by its name in an expectation without the application's: FIGURE, or RECEIVER and FIGURE."""
+        """A figure by its path, as in an expectation but without the application's name: FIGURE, or RECEIVER and FIGURE."""
         inner: Any = summary
         for part in (RECEIVERS, *path) if len(path) > 1 else path:
             inner = inner[part]
@@ -197,7 +197,7 @@ class Application(ABC):
 
     @classmethod
     def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:
-        """Its columns in a receiver's row of a sweep."""
+        """Its columns in a receiver's row of a sweep's table: column → value."""
         own = {name: cls.figure(summary, (name,)) for name in cls.figures}
         return own | {name: cls.figure(summary, (receiver, name)) for name in cls.receiver_figures}
 
@@ -208,11 +208,11 @@ APPLICATIONS: Registry[Application] = Registry(
     "evedrop.applications",
     {},
 )
-"""By the name of the table; all are found by entry points, those of Evedrop in its own pyproject.toml."""
+"""By the name of the table. All are found by entry points; those of Evedrop are in its own pyproject.toml."""
 
 
 def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, type[Application]]:
-    """The applications among names, such as those of a scenario's tables, as far as they can be loaded.
+    """Name → application, for those of these names that are applications and can be loaded.
 
     besides: names that cannot be applications.
     """
@@ -220,7 +220,7 @@ def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict
 
 
 def unloadable_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, str]:
-    """The applications among names that cannot be loaded, with the reason, in words that follow the name."""
+    """Name → why it cannot be loaded, in words that follow the name, for applications among these names. besides: as above."""
     found = {}
     for name in tables:
         if name not in besides and name in APPLICATIONS.names:

@@ -20,7 +20,7 @@ from evedrop.scenario.words import listed
 
 
 def loop_mistakes(tables: ValidTables) -> Iterator[str]:
-    """Mistakes in the plant, the controller and `knows_input`."""
+    """Mistakes in the plant, the controller and `legitimate.knows_input`."""
     plant, given = tables.plant, tables.given
     if "controller" in given and ("plant" not in given or (plant is not None and not plant.inputs)):
         yield (
@@ -84,7 +84,7 @@ def _rows(plant: PlantTable, slots: int | None) -> Iterator[str]:
 def _beside_plant(
     plant: PlantTable, controller: ControllerTable, process: ProcessTable, slot_seconds: float
 ) -> Iterator[str]:
-    """Wrong numbers of weights, and the strategy's objections."""
+    """Weights and limits of wrong length, and the strategy's objections."""
     n, m = len(process.A), len(plant.inputs)
     wrong = False
     for name, count, why in (
@@ -109,7 +109,7 @@ def _beside_plant(
 
 
 def _outages(tables: ValidTables, controller: ControllerTable) -> Iterator[str]:
-    """The legitimate estimator must be present while the controller waits for its estimate or it waits for the inputs."""
+    """Outages of a legitimate estimator that the loop waits for: the controller acts on its estimate, or it gets the inputs."""
     if controller.acts_on == "estimate":
         why = "the controller acts on its estimate"
     elif tables.legitimate is not None and tables.legitimate.knows_input:

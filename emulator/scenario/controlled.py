@@ -11,7 +11,7 @@ from evedrop.scenario.tables import Scenario
 
 
 def labels(names: list[str] | None, units: list[str] | None) -> tuple[str, ...]:
-    """Names with their units, where there are any."""
+    """Names with their units, if there are units; empty without names."""
     if not names:
         return ()
     return tuple(

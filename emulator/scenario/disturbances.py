@@ -19,14 +19,14 @@ from evedrop.scenario.tables import Scenario
 
 
 def disturbances_beside(tables: Mapping[str, Any], folder: Path) -> None:
-    """Replace the file's name by its path, for a scenario in this folder."""
+    """Replace the name of the disturbance file with its path, in place; folder: that of the scenario."""
     plant = tables.get("plant")
     if isinstance(plant, dict) and isinstance(plant.get("disturbance_file"), str):
         plant["disturbance_file"] = str(found_file(plant["disturbance_file"], folder))
 
 
 def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
-    """Replace the file's name by the numbers in the file. Returns the mistakes, with their paths."""
+    """Replace the name of the disturbance file with the numbers in it, in place. Returns the mistakes, with their paths."""
     plant = tables.get("plant")
     if not isinstance(plant, dict) or not isinstance(plant.get("disturbance_file"), str):
         return []

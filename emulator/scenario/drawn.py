@@ -1,6 +1,6 @@
 """The events that a nemesis draws.
 
-Each receiver draws from a stream of its own: adding, changing or removing one receiver moves no other receiver's faults.
+Each receiver has a random stream of its own: adding, changing or removing one receiver does not change the faults of the others.
 
 Source: docs/scenario.md, nemesis.
 """
@@ -31,7 +31,7 @@ from evedrop.scenario.timeline import acts_of
 from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
 
 MOST_EVENTS = 10_000
-"""The most events of a scenario, including those of the file."""
+"""The largest number of events in a scenario: those of the file and the drawn ones together."""
 _BLOCK = 256  # faults drawn at once
 
 Span = tuple[int, int]
@@ -39,12 +39,12 @@ Span = tuple[int, int]
 
 
 def with_faults(tables: Mapping[str, Any], scenario: Scenario) -> tuple[dict[str, Any], list[str]]:
-    """Replace the nemesis in the tables by its events; also returns its mistakes.
+    """The tables with the nemesis replaced by its events, and its mistakes.
 
-    scenario: the tables as a scenario, valid by themselves, with a nemesis.
+    scenario: the same tables as a scenario, which has a nemesis.
     """
     table = scenario.nemesis
-    assert table is not None  # noqa: S101 - asked by the caller
+    assert table is not None  # noqa: S101 - checked by the caller
     found = [*_mistakes(table, scenario)]
     nemesis = _Nemesis(table, scenario)
     room = MOST_EVENTS - len(scenario.event)
@@ -59,7 +59,7 @@ def with_faults(tables: Mapping[str, Any], scenario: Scenario) -> tuple[dict[str
 
 
 def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
-    """Mistakes that `set` makes on any of the links."""
+    """Mistakes that the nemesis's `set` would cause on the link of any target."""
     said = set[str]()
     for name in _targets(table, scenario) if table.set is not None else ():
         link = scenario.link(name)
@@ -82,13 +82,13 @@ def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
 
 
 def _targets(table: NemesisTable, scenario: Scenario) -> tuple[str, ...]:
-    """The receivers that it may hit, in the scenario's order."""
+    """The receivers that a nemesis may hit, in the scenario's order."""
     return tuple(name for name in scenario.receivers if table.targets is None or name in table.targets)
 
 
 @final
 class _Nemesis:
-    """A nemesis with its scenario."""
+    """Draws the events of a nemesis in its scenario."""
 
     def __init__(self, table: NemesisTable, scenario: Scenario) -> None:
         self._table, self._scenario = table, scenario
@@ -136,7 +136,7 @@ class _Nemesis:
         return spans + [(start, NEVER) for start in begun.values()]
 
     def _together(self, kind: type[EventKind]) -> Iterator[dict[str, Any]]:
-        """Events of a kind that happens to several: an independent fair coin decides for each receiver."""
+        """Events of a kind that hits several receivers at once: an independent fair coin decides for each receiver."""
         coins = {name: self._coins(kind, name) for name in self.targets}
         for start, end, _ in self._spans(kind.kind):
             heads = [name for name in self.targets if next(coins[name])]
@@ -166,7 +166,7 @@ class _Nemesis:
         return {"from": start, "to": end, str(kind.names_in): names, **own}
 
     def _free(self, name: str, start: int, end: int) -> bool:
-        """Whether at least one slot separates a span from all others of a receiver."""
+        """Whether at least one slot separates slots [start, end) from all spans that are taken on a receiver."""
         return all(end < other or until < start for other, until in self._taken[name])
 
     def _spans(self, stream: str) -> Iterator[tuple[int, int, float]]:

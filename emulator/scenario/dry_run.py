@@ -1,4 +1,4 @@
-"""A dry run of the classes that are not built in: a few slots of the scenario in memory, before any process is started.
+"""A dry run of classes that are not built in: a few slots of the scenario in memory, before any process is started.
 
 Source: docs/your-own.md.
 """
@@ -42,7 +42,10 @@ def foreign(tables: Any) -> bool:
 
 
 def dry_run(scenario: Scenario) -> list[str]:
-    """Run the classes that are not built in and report what breaks: shapes, types, keys, errors. Changes no digest."""
+    """Try the classes that are not built in; returns a mistake for each that breaks a rule on shapes, types or keys, or raises.
+
+    Does not affect the digests of the run.
+    """
     if not foreign(scenario.model_dump(exclude_unset=True)):
         return []
     batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
@@ -104,7 +107,7 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
         link = scenario.link(receiver)
         yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
     for i, event in enumerate(scenario.event):
-        # Mistakes in the models of an event show across tables and are reported there.
+        # An event's models are checked when tables are compared: mistakes are reported there, not here.
         for act in event.acts():
             settings = act.effect.entries if isinstance(act.effect, LinkSettings) else None
             if settings is not None and not _model_mistakes(settings):

@@ -57,7 +57,7 @@ def _compared(path: str, event: EventKind, surroundings: Surroundings) -> Iterat
 
 
 def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> list[str]:
-    """The mistakes that a kind finds itself; the class of a package may fail."""
+    """The mistakes that a kind finds itself, or the error that it raised: its class may come from a package."""
     try:
         return list(ask())
     except Exception as error:
@@ -65,7 +65,7 @@ def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> 
 
 
 def _acts(tables: ValidTables) -> list[Numbered]:
-    """Everything that happens, in order of slots."""
+    """All acts, each with the number of its event, in order of slots."""
     return sorted(((i, act) for i, event in tables.event for act in event.acts()), key=lambda one: one[1].at)
 
 
@@ -91,7 +91,7 @@ def _when_mistakes(path: str, event: EventKind, slots: int) -> Iterator[str]:
 
 
 def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], tables: ValidTables) -> Iterator[str]:
-    """Mistakes in changed entries of a receiver's link. Pooled links become one, with a quality or a loss model of its own."""
+    """Mistakes in the changed entries of a receiver's link. One link with a new quality or loss model replaces pooled links."""
     link = tables.links.get(name)
     if link is None:
         if name not in tables.eavesdroppers or tables.eavesdroppers[name].links is None:
@@ -116,14 +116,14 @@ def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], tables: V
 
 
 def _order_mistakes(tables: ValidTables) -> Iterator[str]:
-    """Events that end something that has not begun, or begin something during it or during another outage."""
+    """Events that end a cut or an outage that has not begun, or that begin one while another of its kind lasts."""
     acts = _acts(tables)
     for name in tables.receivers:
         yield from _order_mistakes_of(name, [(i, act) for i, act in acts if name in act.names])
 
 
 def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
-    """acts: those on this receiver."""
+    """The same for one receiver; acts: those that concern it, in order of slots."""
     cut: int | None = None
     away: tuple[int, Fate] | None = None
     ended = -1
@@ -148,5 +148,5 @@ def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
                 if away is None or away[1] != reason:
                     yield f"{path} is not {_said(reason)} at slot {act.at}; expected a {after} before"
                 elif act.at <= away[0]:
-                    yield f"{path} leaves in slot {act.at} only; expected a later slot"
+                    yield f"{path} leaves in the same slot, {act.at}; expected a later slot"
                 away, ended = None, act.at

@@ -1,4 +1,4 @@
-"""`[[expect]]`: a condition that a run must meet, on a figure, a link, secrecy, or a receiver's being in step.
+"""`[[expect]]`: a condition that a run must meet: on a figure, on a link, on secrecy, or on when a receiver is in step.
 
 Source: docs/scenario.md, expect.
 """
@@ -48,7 +48,7 @@ def _range(slots: list[int]) -> list[int]:
 
 def _quantile(value: float) -> float:
     if not 0.0 < value < 1.0:
-        raise expected("a number between 0 and 1, neither of them")
+        raise expected("a number between 0 and 1, both excluded")
     return value
 
 
@@ -79,7 +79,7 @@ class ExpectTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes unless it has exactly one subject, with all the entries that this needs and no others."""
+        """Mistakes unless the table has exactly one subject, all the entries that this subject needs, and no others."""
         given = [name for name, value in table.items() if value is not None]
         kinds = [kind for kind in _ENTRIES if kind in given]
         if not kinds:
@@ -147,7 +147,7 @@ class ExpectTable(Table):
 
 
 def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
-    """The receiver, and the place of the figure in the account of its link; None for a receiver's own figure."""
+    """The receiver of a link's figure, and the figure's path in the account of the link; None for a receiver's own figure."""
     parts = figure.split(".")
     return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
 
@@ -158,7 +158,7 @@ def _nothing(table: Mapping[str, Any]) -> list[Found]:
 
 
 def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Mistakes unless it compares with something, and has slots or a quantile only for a figure that allows them."""
+    """Mistakes unless there is a bound to compare with, and slots or a quantile only for a figure that allows them."""
     below, above, near = (table.get(name) for name in ("below", "above", "near"))
     distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
     found: list[Found] = []
@@ -298,7 +298,7 @@ class Around:
     def _quantile_mistakes(self, quantile: float | None) -> list[Found]:
         if self.trials is None or quantile is None:
             return []
-        # At least one trial is expected beyond the quantile; the tolerance is there because decimals seldom hit 1/q exactly.
+        # At least one trial is expected beyond the quantile. The tolerance is for rounding: 1/q is seldom exact in binary.
         least = math.ceil(1.0 / min(quantile, 1.0 - quantile) - 1e-9)
         if self.trials >= least:
             return []

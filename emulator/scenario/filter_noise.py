@@ -1,4 +1,4 @@
-"""A sensor that measures and filters: the process noise that its filter gives the network, and mistakes in its entries.
+"""A sensor that measures and filters: the process noise Q that results from its filter, and mistakes in its entries.
 
 Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor.
 """
@@ -22,7 +22,7 @@ FILTER = "filter"
 
 
 def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
-    """Replace `Q = "filter"` by the covariance of the filter's innovations. Returns the mistakes, with their paths."""
+    """Replace `Q = "filter"` with the covariance of the filter's innovations, in place. Returns mistakes, with their paths."""
     process = tables.get("process")
     if not isinstance(process, dict) or process.get("Q") != FILTER:
         return []
@@ -48,7 +48,7 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
 
 
 def settled_of(process: ProcessTable, plant: PlantTable) -> FilterStep:
-    """The steady state of the tables' filter. Raises ValueError if it does not exist."""
+    """The steady state of the sensor's filter. Raises ValueError if there is no filter, or if it has no steady state."""
     n = len(process.A)
     if plant.output_matrix is None or measured_mistakes(plant, n):
         raise ValueError("no filter")
@@ -62,7 +62,7 @@ def is_singular(Q: Floats) -> bool:
 
 
 def measured_mistakes(plant: PlantTable, n: int) -> list[str]:
-    """Mistakes in the sensor's measurement of n states."""
+    """Mistakes in `output_matrix` and `measurement_noise`, for n states."""
     C, V = plant.output_matrix, plant.measurement_noise
     found: list[str] = []
     if C is None or V is None:

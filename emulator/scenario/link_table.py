@@ -41,7 +41,7 @@ class LinkTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes unless there is one of quality and loss, and each model has exactly the parameters it needs."""
+        """Mistakes unless there is one of quality and loss, each model has exactly its parameters, and no entry is pointless."""
         found: list[Found] = []
         if table.get("quality") is None and table.get("loss") is None:
             found.append(("quality", "is missing; expected quality = 0.9, or a loss model"))
@@ -63,7 +63,7 @@ class LinkTable(Table):
 
     @classmethod
     def pooled(cls, links: list[LinkTable]) -> LinkTable:
-        """Several links that end at one receiver, as one link: the receiver hears what any of them delivers."""
+        """Several links that end at one receiver, as one link: the receiver gets every packet that any of them delivers."""
         return cls.model_construct(loss={"model": "pooled", "links": [link.loss_spec for link in links]})
 
     @property

@@ -20,7 +20,7 @@ NEMESIS = "nemesis"
 
 
 def fault_of(name: object) -> Fault | None:
-    """How events of this name are drawn; None if they are not."""
+    """How a nemesis draws events of this name; None if it does not draw them."""
     kind = EVENTS.get(name) if isinstance(name, str) and not is_own(name) else None
     return None if kind is None else kind.fault
 
@@ -53,7 +53,7 @@ class NemesisTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Entries that need a fault that is not drawn, a time that ends before it begins, and names that appear twice."""
+        """Entries that a fault lacks or that no fault uses, a span that ends before it begins, and names that appear twice."""
         found: list[Found] = []
         faults = table.get("faults")
         if isinstance(faults, list):

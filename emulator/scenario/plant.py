@@ -1,4 +1,4 @@
-"""`[plant]` and `[controller]`: what moves the true states, and what decides the inputs.
+"""`[plant]` and `[controller]`: the inputs and disturbances that move the true states, and the strategy that decides the inputs.
 
 Source: docs/scenario.md, plant and controller.
 """
@@ -44,7 +44,7 @@ class PlantTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Entries that do not fit each other; entries that must fit the process are checked later."""
+        """Entries that do not fit each other; whether they fit the process is checked later."""
         found: list[Found] = []
         for kind in ("input", "disturbance"):
             names, matrix, units = table.get(f"{kind}s") or [], table.get(f"{kind}_matrix"), table.get(f"{kind}_units")
@@ -84,7 +84,7 @@ class PlantTable(Table):
                 found.append(
                     ("disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values')
                 )
-            # A day has 86 400 rows: their numbers are checked elsewhere, and faster.
+            # A day has 86 400 rows: their numbers are checked elsewhere, in a faster way.
             whole = isinstance(rows, list) and {type(row) for row in rows} == {list}
             if whole and rows is not None and {*map(len, rows)} != {len(disturbances)}:
                 i = next(i for i, row in enumerate(rows) if len(row) != len(disturbances))
@@ -96,7 +96,10 @@ class PlantTable(Table):
 def limit_mistakes(
     table: Mapping[str, Any], kind: str, count: int, why: str, within: Mapping[str, Sequence[float]]
 ) -> list[Found]:
-    """Mistakes in `count` lower and upper limits, and in the values that must lie between them."""
+    """Mistakes in the lower and upper limits of `kind`, and in values outside them.
+
+    count: how many limits there must be; why: the reason for that number; within: name → values that must lie between them.
+    """
     found: list[Found] = []
     limits: dict[str, list[float]] = {}
     for name in (f"{kind}_lower", f"{kind}_upper"):
@@ -136,7 +139,7 @@ class ControllerTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Weights and limits below 0, and missing or unknown parameters of the strategy."""
+        """Weights and limits below 0, and missing, unknown or wrong parameters of the strategy."""
         found: list[Found] = []
         for name in ("state_weights", "input_weights", "rate_weights", "rate_limits"):
             values = table.get(name)
@@ -163,7 +166,7 @@ class ControllerTable(Table):
 
 
 def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:
-    """The plant that a table describes, in deviations from the reference; the table fits its process."""
+    """The plant that a table describes, in deviations from the reference; the table must fit its process."""
     around, n, m = np.array(reference), len(reference), len(table.inputs)
 
     def limits(values: Sequence[float] | None, without: float, count: int) -> Floats:
@@ -184,7 +187,7 @@ def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:
 
 
 def assignment_of(table: ControllerTable, process: Process, plant: Plant, slot_seconds: float) -> Assignment:
-    """The assignment of the controller that a table describes; the table fits its plant."""
+    """The assignment of the controller that a table describes; the table must fit its plant."""
     m = plant.inputs
     per_slot = np.full(m, np.inf) if table.rate_limits is None else np.array(table.rate_limits)
     return Assignment(

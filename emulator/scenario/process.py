@@ -34,7 +34,10 @@ class ProcessTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes in the three matrices together; one that is missing or malformed is not compared."""
+        """Matrices that are not square or do not fit each other, and lists without an entry for each state.
+
+        A matrix that is missing or malformed is not compared with the others.
+        """
         found: list[Found] = []
         matrices: dict[str, NDArray[np.float64]] = {}
         for name in _MATRICES:
@@ -65,7 +68,7 @@ class ProcessTable(Table):
 
     @property
     def around(self) -> list[float]:
-        """The public reference; states are transmitted as deviations from it. 0 unless it is given."""
+        """The public reference, (n,): states are transmitted as deviations from it. Zeros unless it is given."""
         return [0.0] * len(self.A) if self.reference is None else self.reference
 
     @property

@@ -18,7 +18,7 @@ from evedrop.scenario.words import as_toml, listed, no_entry
 
 
 class LegitimateTable(Table):
-    """`[legitimate]`."""
+    """`[legitimate]`: the legitimate estimator's link and window, and whether it knows the inputs."""
 
     link: LinkField
     window: WindowField = 0
@@ -45,14 +45,14 @@ class EavesdropperTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Missing and unknown entries of the strategy."""
+        """Missing, unknown and wrong parameters of the strategy, and a missing link."""
         strategy = STRATEGIES.get(str(table.get("strategy")))
         example = as_toml((cls.model_fields["link"].examples or [0])[0])
         strange = [name for name in table if name not in cls.model_fields]
         if strategy is None:
             lost = table.get("link") is None and table.get("links") is None
             found = [("link", f"is missing; expected link = {example}")] if lost else []
-            # The entries of a class that cannot be loaded are unknown.
+            # Nobody knows which entries a class that cannot be loaded has.
             known = strange if is_own(table.get("strategy")) else []
             return found + [(name, no_entry(name, [*cls.model_fields])) for name in strange if name not in known]
         reader = READERS.get(str(table.get("reads_as"))) if "reads_as" in strategy.parameters else None
@@ -87,7 +87,7 @@ class EavesdropperTable(Table):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The strategy's parameters, and those of the strategy it reads as."""
+        """The strategy's parameters, and those of the strategy named by `reads_as`."""
         names = [*STRATEGIES[self.strategy].parameters]
         if self.reads_as is not None:
             names += READERS[self.reads_as].parameters
@@ -95,5 +95,5 @@ class EavesdropperTable(Table):
 
     @property
     def pool(self) -> LinkTable:
-        """Its link, or its links as one."""
+        """Its link, or its pooled links as one."""
         return LinkTable.pooled(self.links or []) if self.link is None else self.link

@@ -16,18 +16,18 @@ from evedrop.model.delays.trace import MOST_DELAYS
 from evedrop.recordings.link_recording import LinkRecording
 from evedrop.scenario.words import as_toml
 
-_STAND_IN = "1"  # for a recording that cannot be read, so that it is reported only once
+_STAND_IN = "1"  # the outcomes of a recording that cannot be read: later checks then find no further mistake
 
 
 def beside(tables: Mapping[str, Any], folder: Path) -> None:
-    """Replace the name of every recording by its path, for a scenario in this folder."""
+    """Replace the name of every recording with its path, in place; folder: that of the scenario."""
     for _, trace in _traces(tables):
         if isinstance(trace.get("file"), str):
             trace["file"] = str(folder / trace["file"])
 
 
 def read_recordings(tables: Mapping[str, Any]) -> list[str]:
-    """Replace `file` and `column` of every recording by its contents. Returns the mistakes, with their paths."""
+    """Replace `file` and `column` of every trace with the recorded contents, in place. Returns the mistakes, with their paths."""
     mistakes = []
     delays = 0
     slots = tables.get("slots")
@@ -53,7 +53,7 @@ def read_recordings(tables: Mapping[str, Any]) -> list[str]:
 
 
 def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Path and table of every loss or delay model that is a trace, wherever a link may be described."""
+    """The path and table of every loss or delay model that is a trace, at any depth."""
     entries = tables.items() if isinstance(tables, dict) else enumerate(tables) if isinstance(tables, list) else ()
     for name, inner in entries:
         if not isinstance(inner, (dict, list)):
@@ -65,7 +65,7 @@ def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]
 
 
 def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
-    """Replace one recording by its outcomes or values, according to `entry`; the mistakes as (entry, description)."""
+    """Put a recording's contents into `entry`, `outcomes` or `values`; returns the mistakes, (entry, description) each."""
     file, column = trace.pop("file", None), trace.pop("column", None)
     if entry in trace:
         extra = "file" if file is not None else "column" if column is not None else None
@@ -88,7 +88,7 @@ def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
             delays = recording.delays(column)
             trace[entry] = delays[~np.isnan(delays)].tolist()
             if not trace[entry]:
-                return [("file", f"{file} has no delay in it; expected one for some packet")]
+                return [("file", f"{file} has no delays; expected one for at least one packet")]
     except TraceError as error:
         return [(error.entry, f"{file} {error.what}" if error.entry == "file" else error.what)]
     return []

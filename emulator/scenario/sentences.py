@@ -1,4 +1,4 @@
-"""The mistakes of a table in words: a line each, with path, value found, value expected and an example."""
+"""Pydantic's errors about a table, in words: a line for each mistake, with path, value found, value expected and an example."""
 
 from __future__ import annotations
 

@@ -19,14 +19,17 @@ from evedrop.streams import root_of_seed, stream_key
 
 @dataclass(frozen=True)
 class StreamKeys:
-    """The keys of all streams of a scenario: those from the seed, and the two of the secret."""
+    """The keys of all streams of a scenario: those from the seed, and those of the secret."""
 
     seed_root: bytes
     secret_root: bytes
 
     @classmethod
     def of(cls, scenario: Scenario) -> StreamKeys:
-        """From the seed; the secret from its own file if the scenario names one. Raises UsageError if it cannot be read."""
+        """The keys of a scenario: from its seed, and the secret's from a file if the scenario names one.
+
+        Raises UsageError if the file cannot be read, or is too short.
+        """
         root = root_of_seed(scenario.seed)
         if scenario.secret_file is None:
             return cls(root, stream_key(root, "secret"))
@@ -38,12 +41,12 @@ class StreamKeys:
             ) from error
         if len(secret) < SECRET_BYTES:
             raise UsageError(
-                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more, random ones"
+                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more random ones"
             )
         return cls(root, stream_key(secret, "secret"))
 
     def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
-        """The keys of the shared secret's streams."""
+        """Stream → its key, for these streams of the shared secret."""
         return {name: stream_key(self.secret_root, name) for name in names}
 
     @property
@@ -52,11 +55,11 @@ class StreamKeys:
         return stream_key(self.seed_root, "process")
 
     def link(self, receiver: str, course: LinkSchedule) -> dict[str, bytes]:
-        """The keys of all streams that a receiver's link draws from."""
+        """Stream → its key, for all streams that a receiver's link draws from."""
         return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
 
     def links(self, courses: Mapping[str, LinkSchedule]) -> dict[str, bytes]:
-        """The keys of all links."""
+        """Stream → its key, for all links."""
         return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
 
     @property

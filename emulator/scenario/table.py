@@ -26,7 +26,10 @@ NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
 def expected(what: str, hint: str = "") -> PydanticCustomError:
-    """The error of one value. The message says what was found, what was expected, and what may have been meant."""
+    """The error about one value, to be raised in a check. what: the expected value; hint: what to add, such as a similar name.
+
+    The message also says what was found.
+    """
     return PydanticCustomError("expected", "one value", {"expected": what, "hint": hint})
 
 
@@ -62,7 +65,7 @@ def registered(classes: Registry[Any]) -> Callable[[str], str]:
 
 
 def _no_class(name: Any, classes: Registry[Any]) -> str | None:
-    """Why no class has this name, in words that follow `is NAME`, or "" if it is just unknown; None if a class has it."""
+    """Why no class has this name, in words that follow `is NAME`; empty if the name is just unknown; None if a class has it."""
     try:
         classes[str(name)]
     except NotRegistered as error:
@@ -98,13 +101,13 @@ class Table(BaseModel):
 
     @classmethod
     def inner(cls, entry: str) -> type[Table] | None:
-        """The table, or the tables of a list or by name, that an entry has; None if it has no such table."""
+        """The class of the table, or of the tables in a list or by name, in an entry; None if the entry holds no table."""
         field = cls.model_fields.get(entry)
         return None if field is None else _table_in(field.annotation)
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes that need several entries to be seen. The table may contain entries with mistakes of their own."""
+        """Mistakes that only show in several entries together. The table is unchecked: any entry may be missing or malformed."""
         del table
         return []
 
@@ -135,7 +138,7 @@ def _table_in(annotation: Any) -> type[Table] | None:
 
 
 def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:
-    """An error that was reported already, made ready to be reported with others; above: the entries that contain its table."""
+    """An error of one check in the form in which it can be reported with others; above: the entries that contain its table."""
     kind, context = detail["type"], detail.get("ctx", {})
     own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
     return InitErrorDetails(type=own, loc=(*above, *detail["loc"]), input=detail["input"], ctx=context)
@@ -151,7 +154,7 @@ def _number(value: Any) -> bool:
 
 
 def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]:
-    """Mistakes in `{model = "…", …}`: an unknown model; missing, unknown or wrong parameters.
+    """Mistakes in `{model = "…", …}`: a missing or unknown model; missing, unknown or wrong parameters.
 
     models: a registry of classes with `parameters`, `optional` and `mistakes`.
     """

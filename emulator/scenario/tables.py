@@ -1,4 +1,4 @@
-"""The tables of a scenario file: their entries, checks and meaning.
+"""The scenario as a table, and the smaller tables in it: their entries, checks and meaning.
 
 Source: docs/scenario.md.
 """
@@ -92,7 +92,7 @@ class EncodingTable(Table):
 
     @property
     def mu_d(self) -> float:
-        """μ_d; 1 for a scheme that sends only states."""
+        """μ_d; 1 for a scheme without `state_probability`."""
         return float(self.parameters.get("state_probability", 1.0))
 
 
@@ -135,7 +135,7 @@ class NetworkTable(Table):
 
 
 class Scenario(Table):
-    """One scenario, with all checks passed."""
+    """A scenario whose tables are valid by themselves; `evedrop.loading` makes it, and also compares the tables."""
 
     title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
     slots: Annotated[int, Field(ge=1, le=MOST_SLOTS, strict=True, examples=[2000])]
@@ -174,12 +174,12 @@ class Scenario(Table):
 
     @classmethod
     def entries(cls) -> list[str]:
-        """All of them, applications included."""
+        """The names of its entries, those of applications included."""
         return [name for name in super().entries() if name != "made_with"] + APPLICATIONS.names
 
     @classmethod
     def inner(cls, entry: str) -> type[Table] | None:
-        """The tables of applications, and that of events of all kinds."""
+        """As in `Table`; knows the tables of applications, and that of events of all kinds, too."""
         if entry == "event":
             return event_table()
         if entry not in cls.model_fields and entry in APPLICATIONS:
@@ -194,7 +194,7 @@ class Scenario(Table):
     @model_validator(mode="wrap")
     @classmethod
     def _with_applications(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
-        """Check the tables of applications beside the fields, so that a mistake in either hides none in the other."""
+        """Check the tables of applications together with the fields, so that a mistake in one does not hide one in the other."""
         if not isinstance(found, Mapping):
             return check(found)
         applications, broken = applications_in(found, cls.model_fields), unloadable_in(found, cls.model_fields)
@@ -231,9 +231,9 @@ class Scenario(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """A mistake if the folder of modules does not exist. Modules are found in it from now on, so entries can name classes.
+        """Mistakes in the folder of modules. From now on modules are found in it, so that the other entries can name classes.
 
-        A custom scheme or link is the only reason to import one of the modules here: see `evedrop.model.answers`.
+        This process imports such modules only for schemes and links: see `evedrop.model.answers` for eavesdroppers.
         """
         folder = table.get("modules")
         if not isinstance(folder, str):
@@ -259,12 +259,12 @@ class Scenario(Table):
 
     @property
     def driven(self) -> Plant | None:
-        """The plant that drives the true states, if there is more than the process."""
+        """The plant that drives the true states; None if the process alone does."""
         return None if self.plant is None else plant_of(self.plant, self.process.around)
 
     @property
     def assignment(self) -> Assignment | None:
-        """What the controller needs to know, if there is a controller."""
+        """The controller's assignment; None without a controller."""
         if self.driven is None or self.controller is None:
             return None
         return assignment_of(self.controller, self.process.process, self.driven, self.slot_seconds or 1.0)
@@ -281,12 +281,12 @@ class Scenario(Table):
 
     @property
     def leaks(self) -> dict[str, int]:
-        """Eavesdropper → the slot whose true state is betrayed to it; only eavesdroppers to which one is betrayed."""
+        """Eavesdropper → the slot whose true state is betrayed to it, for eavesdroppers to which one is."""
         slots = {name: STRATEGIES[one.strategy].betrayed(one.parameters) for name, one in self.eavesdroppers.items()}
         return {name: slot for name, slot in slots.items() if slot is not None}
 
     def link(self, receiver: str) -> LinkTable:
-        """A receiver's link, or its links as one."""
+        """A receiver's link, or its pooled links as one."""
         return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].pool
 
     def window(self, receiver: str) -> int:
@@ -303,7 +303,7 @@ class Scenario(Table):
         return changed_link(self.link(receiver), changes).settings(self.slot_seconds)
 
     def course(self, receiver: str) -> LinkSchedule:
-        """Everything that is known of a receiver's link in advance."""
+        """The course of a receiver's link: its settings, its changes and the receiver's outages, all known in advance."""
         link = self.link(receiver)
         return LinkSchedule(
             link.settings(self.slot_seconds),
@@ -314,7 +314,7 @@ class Scenario(Table):
         )
 
     def cuts(self, receiver: str) -> list[int]:
-        """The slots in which a receiver goes away or comes back; a new block of its digest begins in each."""
+        """The slots in which a receiver goes away or comes back: each begins a new block of its digest. None for a controller."""
         if receiver == CONTROLLER:
             return []
         return sorted({slot for one in self.timeline.outages[receiver] for slot in (one.start, one.stop)})

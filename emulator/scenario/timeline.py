@@ -1,4 +1,4 @@
-"""The events of a scenario in order: the slots before which the run is held, what is done then, and the effect on each link.
+"""The events of a scenario in order: the slots before which the run is held, the acts then, and the effects on each link.
 
 Source: docs/scenario.md, events.
 """
@@ -19,10 +19,10 @@ Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Away(ReceiverOutage):
-    """An outage of a receiver, and what the receiver knows when it comes back."""
+    """An outage of a receiver, and whether the receiver keeps its state."""
 
     keeps_state: bool = True
-    """False: it restarts from the prior of the slot in which it went away."""
+    """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Timeline:
 
     @property
     def holds(self) -> dict[int, list[Act]]:
-        """Slot → what is done before it is sent."""
+        """Slot → the acts that are carried out before it is sent."""
         held: dict[int, list[Act]] = {}
         for act in self.acts:
             held.setdefault(act.at, []).append(act)
@@ -46,7 +46,7 @@ class Timeline:
 
     @property
     def jams(self) -> list[list[int]] | None:
-        """Slots [from, to) in which acknowledgements are attacked; None if no event says so: they are then always attacked."""
+        """Slots [from, to) in which acknowledgements are attacked; None without such events: an attack then lasts all run."""
         spans: list[list[int]] = []
         for act in self.acts:
             match act.effect:
@@ -68,7 +68,7 @@ class Timeline:
 
 
 def acts_of(events: Iterable[EventKind]) -> tuple[Act, ...]:
-    """Everything that events do, in order of slots."""
+    """The acts of events, in order of slots."""
     return tuple(sorted((act for event in events for act in event.acts()), key=lambda act: act.at))
 
 
@@ -88,7 +88,7 @@ def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Chang
 
 
 def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries overlaid by others; the later one of quality and loss replaces the earlier one."""
+    """Entries with some changed; a quality removes an earlier loss, and a loss an earlier quality."""
     dropped = {"quality": "loss", "loss": "quality"}
     gone = {dropped[name] for name in changes if name in dropped}
     return {**{name: value for name, value in entries.items() if name not in gone}, **changes}

@@ -47,9 +47,9 @@ class ValidTables:
     receivers: tuple[str, ...]
     """All receivers, the legitimate estimator first."""
     all_receivers: bool
-    """Whether these are all; otherwise what should be the table of eavesdroppers is none."""
+    """Whether `receivers` is complete; it is not if `eavesdroppers` is not a table."""
     links: Mapping[str, LinkTable]
-    """Receiver → its link, also if other entries of the receiver have mistakes; no links that are pooled."""
+    """Receiver → its link, even if other entries of the receiver have mistakes; without pooled links."""
     applications: Mapping[str, type[Application]]
     """Those whose tables are given, valid or not."""
     application_tables: Mapping[str, Table]
@@ -79,7 +79,7 @@ class ValidTables:
 
     @classmethod
     def of(cls, tables: Mapping[str, Any], scenario: Scenario | None) -> Self:
-        """The valid ones of some tables. scenario: all of them, if all are known to be valid."""
+        """The valid ones of these tables. scenario: the same tables as a scenario, if all are known to be valid."""
         given = tuple(name for name, value in tables.items() if value is not None)
         applications = applications_in(given, Scenario.model_fields)
         if scenario is not None:
@@ -136,7 +136,7 @@ def _numbered(check: Callable[[Any], T], tables: object) -> tuple[tuple[int, T],
 
 
 def _valid(check: Callable[[Any], T], entries: Iterable[tuple[K, object]]) -> dict[K, T]:
-    """What a check makes of each entry, without those that it refuses."""
+    """The result of a check for each entry, without the entries that it refuses."""
     made = {}
     for key, found in entries:
         with suppress(ValidationError):

@@ -1,4 +1,4 @@
-"""Values that no entry of a scenario can have, found before any other check.
+"""Values that no entry of a scenario can have: too deep, too large, or with control characters. Found before any other check.
 
 Source: docs/scenario.md, what a scenario cannot have.
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 from evedrop.scenario.words import as_toml
 
-_DEEPEST = 16  # nesting of tables and lists; scenarios use about half of that
+_DEEPEST = 16  # levels of nested tables and lists; scenarios use about half as many
 _LARGEST_BITS = 4096  # of a whole number; a seed has 256
 _LONGEST_NAME = 200
 _PLAIN = {"\n", "\t"}
@@ -20,7 +20,7 @@ MOST_EAVESDROPPERS = 64
 
 
 def unusable(tables: Any) -> Iterator[str]:
-    """A sentence with a path for each of the first unusable values."""
+    """A sentence with a path for each unusable value, up to 20 of them."""
     for number, sentence in enumerate(_unusable(tables)):
         if number == _MOST_TOLD:
             yield f"and more such mistakes: {_MOST_TOLD} are listed"

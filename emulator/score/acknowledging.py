@@ -33,7 +33,7 @@ def way_back_of(scenario: Scenario) -> WayBackSpec | None:
 def chart_of(scenario: Scenario) -> Chart | None:
     """The sensor's chart for the scenario's attack, or for an attack that blocks everything if there is none.
 
-    None where no chart separates the two rates with as few false alarms as the scenario asks.
+    None without acknowledgements, or if no chart separates the two rates with as few false alarms as the scenario asks for.
     """
     table = scenario.acknowledgements
     if table is None:
@@ -52,7 +52,7 @@ def chart_of(scenario: Scenario) -> Chart | None:
 
 @final
 class Acknowledging:
-    """The way back in memory: does the work of legitimate estimator, router and attack detector in a live run."""
+    """The way back in memory: does the work that legitimate estimator, router and sensor share in a live run."""
 
     def __init__(self, spec: WayBackSpec, chart: Chart | None, key: bytes, batch: Batch) -> None:
         self._way = AckChannel(spec.attack, spec.quality, key, batch, spec.spans)
@@ -73,7 +73,10 @@ class Acknowledging:
         return self._watch is not None
 
     def take(self, k: int, sent: Flags | None, gammas: Mapping[str, Flags]) -> Flags:
-        """The acknowledgements of slot k that reach the sensor, (R,); gammas: receiver → γ (R,)."""
+        """The acknowledgements of slot k that reach the sensor, (R,).
+
+        sent: where the sensor sent a packet, (R,); None: everywhere. gammas: receiver → γ, (R,).
+        """
         gamma = gammas[LEGITIMATE]
         gamma_e = gamma if self._jammer is None else gammas[self._jammer]
         arrived = self._way.arrived(k, sent, gamma, gamma_e)
@@ -84,15 +87,15 @@ class Acknowledging:
 
 @final
 class Detection:
-    """The slot in which the sensor of each trial detected an attack."""
+    """The slot in which the sensor first raised an alarm, for each trial."""
 
     def __init__(self, trials: int) -> None:
         self.first: NDArray[np.int64] = np.full(trials, -1, np.int64)
-        """The slot, (R,); −1 where no attack was detected."""
+        """The slot, (R,); −1 in trials without an alarm."""
 
     @classmethod
     def merged(cls, parts: Sequence[Detection]) -> Detection:
-        """The detection of several sets of trials, in order."""
+        """The detections of several sets of trials, in order."""
         whole = cls(0)
         whole.first = np.concatenate([part.first for part in parts])
         return whole

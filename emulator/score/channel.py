@@ -70,8 +70,8 @@ _ROUNDING = 1e-12
 def interval(rate: float, expected: float, variance: float) -> tuple[float, float]:
     """Clopper and Pearson's interval for a probability at 99.9 % confidence.
 
-    Assumes as many independent packets as would scatter equally: `variance` is that of the rate if it is `expected`. A
-    rate that cannot scatter is its own interval.
+    Counts as many independent packets as give the same variance: `variance` is that of a rate whose mean is `expected`. A
+    rate without variance is its own interval.
     """
     from scipy.special import betaincinv  # noqa: PLC0415 - 0.2 s that only a summary needs
 
@@ -85,7 +85,7 @@ def interval(rate: float, expected: float, variance: float) -> tuple[float, floa
 
 
 def _pieces(course: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
-    """The slots below `done` in which packets met a loss model, with that model."""
+    """The slots below `done` in which the link was not cut, in pieces, each with its loss model."""
     marks = stretches(course)
     ends = [*(start for start, _, _ in marks[1:]), done]
     return [
@@ -129,7 +129,7 @@ def _with_delays(link: LinkSummary, course: LinkSchedule, tally: Tally) -> LinkS
 
 
 def _expected_delays(course: LinkSchedule) -> list[float] | None:
-    """The same by the model, for a link whose delays never change and that has no queue."""
+    """The fractions by delay that the model predicts; None if the settings change, or if there is a queue."""
     if any(change.settings is not None for change in course.changes) or course.settings.get("rate", 1.0) < 1.0:
         return None
     model, reorder = delay_of(course.settings["delay"]), course.settings.get("reorder", 0.0)
@@ -141,6 +141,6 @@ def _expected_delays(course: LinkSchedule) -> list[float] | None:
 
 
 def _quantile(reached: np.ndarray[Any, np.dtype[np.float64]], level: float) -> int | None:
-    """The least delay that a fraction of the packets does not exceed; None if it is beyond the window."""
+    """The least delay by which this fraction of the packets arrives; None if it is beyond the window."""
     place = int(np.searchsorted(reached, level))
     return place if place < len(reached) - 1 else None

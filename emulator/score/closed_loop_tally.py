@@ -32,7 +32,7 @@ class Acted:
 
     inputs: InputSlots
     x: Floats
-    """(c, n, R)."""
+    """The states that the sensor sends, (c, n, R)."""
     estimates: Mapping[str, Floats]
     """Receiver → x̂, (c, n, R)."""
     action: Codes
@@ -50,7 +50,7 @@ class Acted:
 @final
 @dataclass
 class SolveTimes:
-    """The time that decisions take, over all trials that are simulated together."""
+    """The time that decisions take; one decision covers all trials that are simulated together."""
 
     decisions: int = 0
     seconds: float = 0.0
@@ -85,12 +85,13 @@ class LoopTally:
         self._sign = -1.0 if knows_input else 1.0
         self._offset = Offset(process, plant, trials) if comparable else None
         self.slots = 0
-        """Trial-slots."""
+        """Slots times trials so far."""
         self.failed = 0
         """Trial-slots whose inputs were held because a decision failed."""
         self.clipped = 0
         """Trial-slots in which the plant clipped an input."""
         self.other_error = 0.0
+        """Sum of squared errors of the estimator that is not in the loop."""
         self.applications: dict[str, ApplicationTally] = {}
         """Application → its totals, for those that the scenario uses."""
 
@@ -144,7 +145,7 @@ class LoopTally:
     def summary(
         self, scenario: Scenario, user: PeerSummary, times: SolveTimes, digest: str | None
     ) -> ControllerSummary:
-        """The summary's entry on the controller; user: that on the legitimate estimator."""
+        """The summary's entry on the controller; user: its entry on the legitimate estimator."""
         assert scenario.controller is not None  # noqa: S101 - else there is no tally
         knows = scenario.legitimate.knows_input
         errors = [

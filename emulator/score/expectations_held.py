@@ -24,7 +24,7 @@ _MODES = {"exact": "", "covariance-only": " --covariance-only", "error-coordinat
 
 
 def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
-    """The command that runs the contents of a results folder again, to the same bits."""
+    """The command that repeats the run in a results folder, to the same bits."""
     where = shlex.quote(str(folder.absolute()))
     if mode == "live":
         return f"evedrop run {where}"
@@ -92,7 +92,7 @@ class Evidence:
         return account.rate, account.within_interval
 
     def _secrecy(self, expect: ExpectTable) -> tuple[Found, bool | None]:
-        """Held if theory promises secrecy and the run shows it; in all other cases it is not held."""
+        """Held if theory promises secrecy and the run shows it, otherwise not; undecided in a run that was cut short."""
         verdict = self.secrecy[str(expect.against)]
         relative = expect.secrecy == "relative"
         shown = verdict.relative if relative else verdict.perfect
@@ -104,7 +104,7 @@ class Evidence:
         return found, promised is True and shown is Verdict.HELD if complete else None
 
     def _in_step(self, expect: ExpectTable) -> tuple[Found, bool | None]:
-        """The largest slot over trials; undecided if the run was cut short before that slot."""
+        """The slot by which it was in step in all trials; undecided if the run was cut short before `by`."""
         wanted = watch_of(self.scenario, expect)
         assert wanted is not None  # noqa: S101 - every such expectation has one
         tally = self.tallies[wanted[0]]

@@ -1,4 +1,4 @@
-"""A sensor that measures and filters: errors against its transmitted estimate differ from errors against the truth.
+"""Errors against the true state, for a sensor that filters: it sends an estimate, so these differ from the usual errors.
 
 Source: docs/results.md, filter.
 """
@@ -39,8 +39,10 @@ class FilterTally:
 
     def __init__(self) -> None:
         self.count = 0
+        """Slots times trials so far."""
         self.slots = 0
         self.sums: dict[str, float] = {}
+        """Sensor or receiver → sum of squared errors."""
 
     @classmethod
     def of(cls, scenario: Scenario) -> FilterTally | None:
@@ -49,7 +51,7 @@ class FilterTally:
         return None if driven is None or driven.output_matrix is None else cls()
 
     def add(self, errors: Mapping[str, Floats]) -> None:
-        """Add the next slots, (c, R) each."""
+        """Add the next slots, errors as from `true_errors`, (c, R) each."""
         self.slots += len(errors[SENSOR])
         self.count += errors[SENSOR].size
         for name, error in errors.items():

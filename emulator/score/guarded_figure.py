@@ -1,6 +1,6 @@
 """Guards a run against a figure of an installed package that raises an error or gives no number.
 
-The figure is None from then on. Everything else of the run is measured and saved; then the run fails, and names the figure.
+From then on the figure is None. Everything else is measured and saved; then the run fails, with an error that names the figure.
 
 Source: docs/your-own.md, a figure.
 """
@@ -27,7 +27,7 @@ class GuardedTally(FigureTally):
     """The tally of a package's figure, which never raises an error."""
 
     def __init__(self, name: str, trials: int) -> None:
-        """name: of the figure."""
+        """name: the figure's name."""
         self._name, self._trials = name, trials
         self.failure = ""
         """Why the figure is None, if it failed."""
@@ -54,7 +54,7 @@ class GuardedTally(FigureTally):
 
     @property
     def of_trials(self) -> Floats | None:
-        """The figure of every trial, (R,)."""
+        """The figure of every trial, (R,); None if it failed."""
         return self._asked(lambda: _numbers(self._begun.of_trials, self._trials))
 
     @property

@@ -30,7 +30,8 @@ class SlotHistograms:
         self._slots = slots
         self._stride = -(-slots // _MOST_ROWS)
         self._base = int(np.float64(scale * 2.0**-_OCTAVES_BELOW).view(np.int64)) >> _SHIFT
-        self._counts = np.zeros((-(-slots // self._stride), _BINS), np.uint32)
+        self.counts = np.zeros((-(-slots // self._stride), _BINS), np.uint32)
+        """The number of values in each histogram and bin, (histograms, 512)."""
 
     def add(self, first: int, values: Floats) -> None:
         """Add the values (c, R), none negative, of slots first … first+c−1."""
@@ -44,38 +45,38 @@ class SlotHistograms:
         bins += _BINS * np.arange(rows)[:, None]
         counts = np.bincount(bins.reshape(-1), minlength=rows * _BINS)
         start = (first + skip) // self._stride
-        self._counts[start : start + rows] += counts.reshape(rows, _BINS).astype(np.uint32)
+        self.counts[start : start + rows] += counts.reshape(rows, _BINS).astype(np.uint32)
 
     def merge(self, other: SlotHistograms) -> None:
         """Add the histograms of further trials."""
-        self._counts += other._counts
+        self.counts += other.counts
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state as a worker sends it: only the filled bins, which are a few per cent of half a million and more."""
-        filled = np.flatnonzero(self._counts).astype(np.uint32)
-        return {**self.__dict__, "_counts": (self._counts.shape, filled, self._counts.reshape(-1)[filled])}
+        """The state as a worker sends it: only the filled bins, a few per cent of up to two million."""
+        filled = np.flatnonzero(self.counts).astype(np.uint32)
+        return {**self.__dict__, "counts": (self.counts.shape, filled, self.counts.reshape(-1)[filled])}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        shape, filled, values = state["_counts"]
+        shape, filled, values = state["counts"]
         counts = np.zeros(shape, np.uint32)
         counts.reshape(-1)[filled] = values
-        self.__dict__.update(state, _counts=counts)
+        self.__dict__.update(state, counts=counts)
 
     def quantiles(self) -> Floats:
         """`LEVELS` of every slot, (slots, levels); NaN in slots that were left out or have no values."""
         edges = self._edges()
         found = np.full((self._slots, len(LEVELS)), np.nan)
-        totals = self._counts.sum(axis=1)
-        cumulative = np.cumsum(self._counts, axis=1)
+        totals = self.counts.sum(axis=1)
+        cumulative = np.cumsum(self.counts, axis=1)
         rows = np.flatnonzero(totals)
         for column, level in enumerate(LEVELS):
             wanted = level * totals[rows]
             bins = np.minimum((cumulative[rows] < wanted[:, None]).sum(axis=1), _BINS - 1)
-            count = self._counts[rows, bins]
+            count = self.counts[rows, bins]
             before = cumulative[rows, bins] - count
             part = np.clip((wanted - before) / np.maximum(count, 1), 0.0, 1.0)
             values = edges[bins] + part * (edges[bins + 1] - edges[bins])
-            # Outside the bins' range, all that is known of a value is whether it is too small or too large.
+            # In the first and the last bin, values are known only to be too small or too large.
             found[rows * self._stride, column] = np.select([bins == 0, bins == _BINS - 1], [0.0, np.inf], values)
         return found
 

@@ -17,7 +17,7 @@ from evedrop.figures.figure import ScoredSlots
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
-from evedrop.news import ConnectionOutage
+from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.scenario import Scenario
 from evedrop.score.channel import link_summary_of
 from evedrop.score.closed_loop_tally import Acted
@@ -25,7 +25,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
-from evedrop.score.summary import PeerSummary, RunEvent, Summary, Surprising
+from evedrop.score.summary import PeerSummary, Summary, Surprising
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
@@ -105,7 +105,7 @@ class Ending:
     events: Sequence[RunEvent] = ()
     outages: Sequence[ConnectionOutage] = ()
     accused: tuple[str, ...] = ()
-    """The processes whose behaviour made the run end."""
+    """The processes whose misbehaviour ended the run."""
     misdelivered: Mapping[str, int] = field(default_factory=dict)
     """Process → messages with other processes' keys, which it dropped."""
 
@@ -118,10 +118,10 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
 
 
 def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> Summary:
-    """The summary of docs/results.md; a digest is None if there is none, or if the run was cut short.
+    """The summary of a run; digests: process → its digest, None if it has none or the run was cut short.
 
-    An accused process has no digest either: what it reported is contradicted. A complete run with a package's figure that
-    failed is not `complete`: it ended with that failure.
+    An accused process has no digest either, because its reports were contradicted. A run to the end in which a package's
+    figure failed is not `complete`: it ended with that failure.
     """
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
@@ -185,7 +185,10 @@ def _quantiles(tally: Tally) -> dict[str, float] | None:
 
 
 def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising | None:
-    """The trial whose mean error, for any receiver, lies furthest from the median, in logarithms and median deviations."""
+    """The trial whose mean error, for any receiver, is furthest from the median, in logarithms and median deviations.
+
+    None without such a trial: the run was cut short, has too few trials, or has errors of 0.
+    """
     found: Surprising | None = None
     furthest = 0.0
     for name, tally in tallies.items():

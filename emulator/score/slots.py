@@ -18,9 +18,9 @@ class ReceiverSlots:
     """One receiver over c slots."""
 
     x_hat: Floats
-    """(c, n, R)."""
+    """Estimates, (c, n, R)."""
     action: Codes
-    """(c, R)."""
+    """`Action`, (c, R)."""
     P: Floats
     """Believed covariance of the recorded trials, (c, n, n, recorded)."""
     trace: Floats
@@ -30,13 +30,13 @@ class ReceiverSlots:
     lost: Mapping[str, NDArray[np.uint32]]
     """Reason → packets that the router reports as lost for it, (c,)."""
     late: NDArray[np.uint16] | None = None
-    """Packets of earlier slots that it received in each slot, (c, R); None if the receiver accepts no late packets."""
+    """Counts of packets of earlier slots that arrived in each slot, (c, R); None if the receiver accepts no late packets."""
     late_used: NDArray[np.uint16] | None = None
-    """The late packets that it used, (c, R)."""
+    """Counts of the late packets that it used, (c, R)."""
     late_delivered: NDArray[np.uint16] | None = None
-    """The late packets delivered according to the router, (c, R)."""
+    """Counts of the late packets that were delivered according to the router, (c, R)."""
     unsent: NDArray[np.uint32] | None = None
-    """Trials without a packet according to the router, (c,); None: none."""
+    """Counts of the trials without a packet according to the router, (c,); None: every trial had one."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class Slots:
 
     first: int
     x: Floats
-    """(c, n, R)."""
+    """States as the sensor sends them, (c, n, R)."""
     nu: Flags
-    """(c, R)."""
+    """ν, (c, R)."""
     receivers: Mapping[str, ReceiverSlots]
     sent: Flags | None = None
     """Whether the sensor sent a packet, (c, R); None: always."""
@@ -79,7 +79,7 @@ class Slots:
         return int(self.x.shape[2])
 
     def copied(self) -> Slots:
-        """A copy with arrays of its own."""
+        """A copy whose arrays for the view are its own: x, ν, sent, inputs, and the receivers' x̂, P and actions."""
         receivers = {
             name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
             for name, one in self.receivers.items()
@@ -90,7 +90,7 @@ class Slots:
 
 
 def concatenated(parts: Sequence[Slots]) -> Slots:
-    """Consecutive slots as one, without the reasons for losses, which are not needed any more."""
+    """Consecutive slots as one, without alarms, true states, late and unsent packets and reasons for losses."""
 
     def column(name: str, one: str) -> NDArray[Any]:
         return np.concatenate([getattr(part.receivers[name], one) for part in parts])

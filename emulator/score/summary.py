@@ -1,7 +1,7 @@
-"""The summary of a run, as summary.json has it, with types.
+"""The contents of summary.json as typed classes: `Summary`, and a class for each kind of entry in it.
 
-Each class here is one entry; its fields are the entry's keys, in their order. Entries of applications and figures of receivers
-are open: packages add to them.
+The fields of a class are the entry's keys, in their order. Entries of applications and figures of receivers are open:
+packages add to them.
 
 Source: docs/results.md, summary.json.
 """
@@ -13,24 +13,24 @@ from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from evedrop.entries import SLOT, entry, plain, text
+from evedrop.entries import plain
 from evedrop.figures.links import LinkAccount
-from evedrop.news import ConnectionOutage
+from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.scenario import application
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 Found = float | int | str | None
-"""A value that an expectation found. None: the run does not tell, or a receiver that must be in step never was."""
+"""The value found for an expectation. None: the run does not tell, or a receiver that must be in step never was."""
 
 
 @dataclass(frozen=True)
 class PeerSummary:
-    """A receiver."""
+    """The entry of a receiver."""
 
     figures: Mapping[str, float | None]
-    """By their names in `evedrop.figures`; None where there is none."""
+    """Name of the figure → its value; None if it has none."""
     error_quantiles: Mapping[str, float] | None
     infinite_variance: bool
     digest: str | None
@@ -43,7 +43,7 @@ class PeerSummary:
         return {**self.figures, **self.mode_figures}
 
     def figure(self, name: str) -> float | None:
-        """A figure by its name; None if there is none."""
+        """A figure by its name; None if it has no value, or if there is no such figure."""
         return self.all_figures.get(name)
 
     def as_dict(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ _PEER = ("error_quantiles", "infinite_variance", "digest")
 
 @dataclass(frozen=True)
 class LinkSummary(LinkAccount):
-    """A link: its account, and what its models predict. A number is None if it was not measured, or if the model has none."""
+    """The entry of a link: its account, and its models' predictions. None: not measured, or not predicted by the model."""
 
     lost_by: Mapping[str, int] = field(default_factory=dict)
     """Reason → packets."""
@@ -65,10 +65,10 @@ class LinkSummary(LinkAccount):
     """The fraction of packets that the loss model let through; `expected_rate`: the same by the model."""
     expected_rate: float | None = None
     interval: tuple[float, float] | None = None
-    """For the model's rate given the packets observed, at 99.9 % confidence."""
+    """The confidence interval, at 99.9 %, for the model's rate given the observed packets."""
     within_interval: bool | None = None
     bursts: Sequence[int] = ()
-    """Runs of consecutive losses by their length, from 1 on."""
+    """Counts of bursts of consecutive losses by length, from 1 on."""
     mean_burst: float | None = None
     expected_mean_burst: float | None = None
     delays: Sequence[float] | None = None
@@ -78,23 +78,8 @@ class LinkSummary(LinkAccount):
 
 
 @dataclass(frozen=True)
-class RunEvent:
-    """An event during the run."""
-
-    slot: int = field(metadata=entry(SLOT))
-    event: str = field(metadata=entry(text))
-    by: str = field(metadata=entry(text))
-    """`scenario` or `operator`."""
-
-    @property
-    def line(self) -> str:
-        """The event as a line of the view."""
-        return self.event if self.by == "scenario" else f"{self.event} (by the {self.by})"
-
-
-@dataclass(frozen=True)
 class Verification:
-    """What was verified of a receiver's report."""
+    """Which figures of a receiver were verified, and which rest on its own word."""
 
     recomputed_trials: int
     verified: Sequence[str]
@@ -145,7 +130,7 @@ class ControllerSummary:
 
 @dataclass(frozen=True)
 class FilterSummary:
-    """Errors against the true state, with a sensor that filters."""
+    """Errors against the true state, for a sensor that filters."""
 
     mean_trace_covariance: float | None
     mean_squared_error: float | None
@@ -154,7 +139,7 @@ class FilterSummary:
 
 @dataclass(frozen=True)
 class Surprising:
-    """The trial that is furthest off."""
+    """The most surprising trial: the one whose mean error is furthest from the median trial's."""
 
     trial: int
     receiver: str
@@ -172,7 +157,7 @@ class Judged:
     found: Found
     wanted: str
     replay: str | None = None
-    """The command that reproduces a failure; an entry without one lacks it."""
+    """The command that reproduces a failure; left out of the entry if None."""
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of summary.json."""
@@ -193,7 +178,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Summary:
-    """A run."""
+    """The summary of a run."""
 
     scenario: str
     mode: str
@@ -215,7 +200,7 @@ class Summary:
     controller: ControllerSummary | None
     filter: FilterSummary | None
     applications: Mapping[str, application.Summary]
-    """Application → its entry, which stands among the others in summary.json."""
+    """Application → its entry, which is at the top level of summary.json."""
     surprising: Surprising | None
     expectations: Sequence[Judged]
 
@@ -225,7 +210,7 @@ class Summary:
         return [one.held for one in self.expectations].count(False)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contents of summary.json; infinite and undefined numbers as they are."""
+        """The contents of summary.json, with infinite and undefined numbers as floats."""
         found: dict[str, Any] = {}
         for one in fields(self):
             value = getattr(self, one.name)
@@ -248,7 +233,7 @@ _OPEN = "applications"
 
 
 def _entry(value: Any) -> Any:
-    """An entry, or several, in the form of summary.json."""
+    """A field's value in the form of summary.json."""
     if isinstance(value, (PeerSummary, Judged)):
         return value.as_dict()
     if isinstance(value, ConnectionOutage):

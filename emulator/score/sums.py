@@ -1,4 +1,4 @@
-"""Sums over trials in every slot and over slots in every trial, from which the summary is made."""
+"""Sums over the trials of every slot, and over the slots of every trial; the summary is made from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.score.watched import Watched, WatchedSlots
 
 WINDOWS = 8
-"""The number of windows into which slots k ≥ 1 are divided for verdicts, of equal length up to one slot."""
+"""The number of windows into which slots k ≥ 1 are divided for verdicts; their lengths differ by at most one slot."""
 
 
 @final
@@ -28,7 +28,7 @@ class SlotSums:
 
     trials: Floats
     error: Floats
-    """Squared error, or tr of the actual covariance in a study that simulates only covariances."""
+    """Squared error, or in a covariance-only study the trace of the actual covariance."""
     error_squared: Floats
     trace: Floats
     """Believed tr P."""
@@ -48,7 +48,7 @@ class SlotSums:
             getattr(self, one.name)[rows] += getattr(other, one.name)
 
     def measured(self) -> SlotSums:
-        """The slots that any trial reached: in a run cut short, not the last ones."""
+        """Only the slots that some trial reached: a run that was cut short lacks the last ones."""
         rows = slice(0, int(np.count_nonzero(self.trials)))
         return SlotSums(*(getattr(self, one.name)[rows] for one in fields(self)))
 
@@ -64,7 +64,7 @@ def squared_errors(x: Floats, x_hat: Floats) -> Floats:
 def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> SlotSums:
     """The sums of some slots, from error (c, R), action (c, R), and the sums of tr P and of its square, (c, 2).
 
-    Without sums of tr P, the error is tr P itself.
+    trace: if None, the error is tr P itself.
     """
     count, trials = error.shape
     errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
@@ -95,7 +95,7 @@ class Tally(ReceiverTotals):
     """The number of slots of the whole run."""
     trials: int
     watched: Watched = field(default_factory=lambda: Watched((), 0))
-    """What its figures and expectations need besides."""
+    """Further totals that its figures and expectations need."""
     done: int = 0
     """Slots that all trials have reached."""
     window_errors: Floats = field(init=False)
@@ -111,7 +111,7 @@ class Tally(ReceiverTotals):
         self.delays = np.zeros(0, np.int64)
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
-        """Add c slots: their errors (c, R), sums, and expected trace (c,)."""
+        """Add the c slots from `first` on: their errors (c, R), sums, and expected traces (c,)."""
         count = len(error)
         self.done += count
         self.offered += count * self.trials
@@ -163,7 +163,7 @@ class Tally(ReceiverTotals):
         self.delays += account.delays
 
     def figure(self, name: str) -> float | None:
-        """A figure of the run by its name; None where there is none."""
+        """A figure of the run by its name; None if it has no value."""
         found = figure(name)
         if not issubclass(found, TotalsFigure):
             return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
@@ -189,7 +189,7 @@ _COUNTED = [one.name for one in fields(ReceiverTotals) if one.name != "lost"]
 
 
 def merged(parts: Sequence[Tally]) -> Tally:
-    """One tally of several disjoint sets of trials, in their order."""
+    """The tally of several disjoint sets of trials, in their order."""
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
     total.watched = Watched.of([part.watched for part in parts])
     total.done = min(part.done for part in parts)

@@ -1,4 +1,4 @@
-"""Everything that is kept of a set of trials as their slots come, live or in memory, to make the summary from."""
+"""The totals of a set of trials, kept as their slots come, live or in memory; the summary is made from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.score.watched import Watched, watches_of
 
 @dataclass(frozen=True)
 class Totals:
-    """The totals of some trials. Totals that do not concern receivers are None where the run or its mode has none."""
+    """The totals of some trials. Those that do not concern receivers are None if the run or its mode does not have them."""
 
     tallies: Mapping[str, Tally]
     """Receiver → its tally."""
@@ -26,13 +26,13 @@ class Totals:
 
     @classmethod
     def nothing(cls, scenario: Scenario, trials: int) -> Totals:
-        """The totals of trials that reach no slot."""
+        """Empty totals with tallies only: of trials without slots, or in a mode without states."""
         watches = watches_of(scenario)
         return cls({name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()})
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> Totals:
-        """Empty totals for trials that are about to begin, whose states are known."""
+        """Empty totals of trials that are about to begin, in a mode with states."""
         return cls(
             cls.nothing(scenario, trials).tallies,
             Detection(trials),

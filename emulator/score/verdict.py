@@ -1,4 +1,4 @@
-"""Whether secrecy held in a run, and whether theory says that it must. Too few trials to decide is a verdict of its own.
+"""Whether secrecy held in a run, and whether theory promises it. "Too few trials to tell" is a verdict of its own.
 
 Source: docs/mathematics.md, secrecy and design; docs/results.md, verdict.
 """
@@ -39,9 +39,9 @@ class Secrecy:
     relative_by_theory: bool | None
     """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where theory makes no statement."""
     relative_from: int | None
-    """The first slot k ≥ 1 from which on tr E P_k < tr E Pᵉ_k until the end of the run; None if there is none."""
+    """The first slot k ≥ 1 from which tr E P_k < tr E Pᵉ_k until the end of the run; None if there is none."""
     windows: str
-    """The slots of the windows in which relative secrecy failed or was undecided, such as "1 to 124"; empty if all."""
+    """The slots of the windows in which relative secrecy failed or was undecided, such as "1 to 124"; empty if in all."""
     perfect_by_theory: bool | None
     """J bounded and J_e not; None where theory makes no statement."""
     ratio: float
@@ -50,7 +50,7 @@ class Secrecy:
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
     unknown: str = "no theory covers these links"
-    """The sentence's ending where theory makes no claim."""
+    """The end of the sentence where theory makes no claim."""
 
     @property
     def summary(self) -> SecrecySummary:
@@ -93,6 +93,7 @@ class Secrecy:
 
 
 Bounds = Callable[[Floats], tuple[float, float]]
+"""Lower and upper bound of a quantity, from its samples (R,)."""
 
 
 def mean_bounds(samples: Floats) -> tuple[float, float]:
@@ -121,7 +122,10 @@ def median_bounds(samples: Floats) -> tuple[float, float]:
 
 
 def _relative(difference: Floats, bounds_of: Bounds, slots: int) -> tuple[Verdict, str]:
-    """The verdict from the mean error differences of each window and trial, (WINDOWS, R), and the slots that decide it."""
+    """The verdict on relative secrecy, and the slots in which it failed or is undecided, empty if in all.
+
+    difference: the eavesdropper's mean error less the legitimate one, by window and trial, (WINDOWS, R).
+    """
     bounds = {w: bounds_of(row) for w, row in enumerate(difference) if not np.isnan(row).any()}
     failed = [window for window, (_, high) in bounds.items() if high < 0.0]
     doubtful = [window for window, (low, _) in bounds.items() if not low > 0.0]
@@ -140,7 +144,7 @@ def _slots_of(windows: list[int], slots: int) -> str:
 
 
 def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: Bounds) -> Verdict:
-    """Held if the error grows from the first to the last quarter while the legitimate error stays within its bound."""
+    """Held if the eavesdropper's error grows from the first to the last quarter and the legitimate error stays within `bound`."""
     quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
         return Verdict.UNDECIDED
@@ -193,7 +197,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
 
 
 def _holds_from(gap: Floats) -> int | None:
-    """The first slot k ≥ 1 from which on the gap (slots,) is positive until its end."""
+    """The first slot k ≥ 1 from which the gap (slots,) is positive to its end; None if there is none."""
     wrong = np.flatnonzero(~(gap[1:] > 0.0)) + 1
     first = int(wrong[-1]) + 1 if wrong.size else 1
     return first if first < len(gap) else None

@@ -14,9 +14,9 @@ from evedrop.score.summary import Verification
 
 
 def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Verification]:
-    """The entry `verification` of a live run's summary: receiver → the verified figures, and those that it only reported.
+    """The entry `verification` of a live run's summary: receiver → the verified figures, and those that rest on its word.
 
-    accused: processes whose reports made the run end.
+    accused: processes whose misbehaviour ended the run.
     """
     recorded = _recorded_of(scenario)
     found = {}
@@ -30,7 +30,7 @@ def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[s
 
 
 def _resting_on(who: str, receiver: str) -> list[str]:
-    """The figures of a receiver of a live run that rest on the observer, on recorded trials, or on the receiver alone."""
+    """The figures of a receiver of a live run with this value of `rests_on`."""
     figures = figures_of(receiver).items()
     return [name for name, one in figures if one.rests_on == who and one.only_in_mode is None]
 

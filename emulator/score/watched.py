@@ -1,6 +1,6 @@
-"""What is kept of a receiver besides its totals: figures over some slots, packages' figures, and when it was in step.
+"""Quantities of a receiver that its totals do not have: figures over some slots, packages' figures, when it was in step.
 
-Memory: a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
+They take a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
 however its slots and the other trials were divided, live and in memory.
 """
 
@@ -22,16 +22,16 @@ _NEVER = -1
 
 
 class WatchedSlots(NamedTuple):
-    """A quantity to keep, and its slots from first to before end."""
+    """A quantity to keep, over the slots from `first` to before `end`."""
 
     what: str
-    """A figure, or `in_step`."""
+    """A figure's name, or `in_step`."""
     first: int
     end: int
 
 
 def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
-    """Receiver and the quantity an expectation needs; None where the summary's figures are enough."""
+    """The receiver and the quantity that an expectation needs; None if the summary's figures are enough."""
     if expect.in_step is not None:
         return expect.in_step, WatchedSlots(IN_STEP, _since(scenario, expect), scenario.slots)
     if expect.figure is None or (expect.slots is None and expect.quantile is None):
@@ -41,7 +41,7 @@ def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots
 
 
 def _since(scenario: Scenario, expect: ExpectTable) -> int:
-    """The slot from which a receiver must come into step: as given, or that of the last event on it up to slot `by`."""
+    """The slot from which a receiver must come into step: `since`, or the slot of the last event on it up to slot `by`."""
     if expect.since is not None:
         return expect.since
     by = scenario.slots if expect.by is None else expect.by
@@ -50,7 +50,7 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
 
 
 def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
-    """Receiver → everything that its figures and the scenario's expectations need of it."""
+    """Receiver → all quantities that its figures and the scenario's expectations need."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
     found = {}
     for receiver in scenario.receivers:
@@ -78,19 +78,19 @@ class FirstState(FigureTally):
 
     @classmethod
     def merged(cls, parts: Sequence[FirstState]) -> FirstState:
-        """Those of disjoint sets of trials, in their order."""
+        """The first slots of disjoint sets of trials, in their order."""
         whole = cls(0)
         whole._first = np.concatenate([part._first for part in parts])
         return whole
 
     @property
     def value(self) -> int | None:
-        """The largest over trials; None if a trial has no such slot."""
+        """The largest of them; None if a trial has no such slot."""
         return None if (self._first == _NEVER).any() else int(self._first.max())
 
 
 def _tally(what: str, trials: int) -> FigureTally:
-    """Totals of a quantity over no slots yet."""
+    """A tally of a quantity, of no slots yet."""
     if what == IN_STEP:
         return FirstState(trials)
     return GuardedTally(what, trials) if FIGURES.foreign(what) else figure(what).tally(trials)
@@ -98,7 +98,7 @@ def _tally(what: str, trials: int) -> FigureTally:
 
 @final
 class Watched:
-    """What is kept of R trials."""
+    """Keeps the tallies of these quantities over R trials."""
 
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
         self._kept = {watch: _tally(watch.what, trials) for watch in watches}
@@ -117,12 +117,12 @@ class Watched:
         return [one.failure for one in self._kept.values() if isinstance(one, GuardedTally) and one.failure]
 
     def tally(self, watch: WatchedSlots) -> FigureTally:
-        """The totals of a quantity over its slots."""
+        """The tally of a quantity over its slots."""
         return self._kept[watch]
 
     @classmethod
     def of(cls, parts: Sequence[Watched]) -> Watched:
-        """What is kept of disjoint sets of trials, in their order."""
+        """The quantities of disjoint sets of trials, in their order."""
         total = cls((), 0)
         total._kept = {
             watch: type(one).merged([part._kept[watch] for part in parts]) for watch, one in parts[0]._kept.items()

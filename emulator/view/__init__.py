@@ -1,1 +1,1 @@
-"""Recordings, their layout, and figures. Only this package uses rerun and matplotlib."""
+"""Recordings and their layout, viewers, and pictures of studies. Only this package imports rerun and matplotlib."""

@@ -1,4 +1,4 @@
-"""Values of one entity over some slots, in Rerun's form."""
+"""The unit in which panels record: values of one entity over some slots, in Rerun's form."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Column:
     values: rr.ComponentColumnList
 
     def send(self, to: rr.RecordingStream) -> None:
-        """Add it to a recording. Raises an error of Rerun's if slots and values do not have the same length."""
+        """Add it to a recording. Raises an error from Rerun if slots and values do not have the same length."""
         slots = rr.TimeColumn(TIMELINE, sequence=self.slots)
         to.send_columns(self.path, indexes=[slots], columns=self.values, strict=True)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from evedrop.results.comparison import Cell, Comparison, SchemeResult
 
-# Blue for secrecy kept and orange for secrecy broken, darker where more certain: distinct with any colour-blindness, and in grey.
+# Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
 _GROUND = {
     SecrecyKept.PERFECT: "#1f6fb2",
     SecrecyKept.RELATIVE: "#a9cdea",
@@ -41,7 +41,7 @@ _LEAST_WIDTH = 9.0
 
 
 def draw(path: Path, found: Comparison) -> None:
-    """Draw `path`.png and `path`.pdf."""
+    """Draw a comparison as `path`.png and `path`.pdf."""
     schemes, adversaries = list(found.schemes.values()), found.adversaries
     left = _FACT_WIDTH * len(_FACTS)
     right = max(float(len(adversaries)) + 1.1, _LEAST_WIDTH)  # room for the legend
@@ -117,7 +117,7 @@ def _legend(axes: Axes, found: Comparison, left: float) -> None:
 
 
 def _number(value: float) -> str:
-    """Short: 2.3, 57, 3.4e5."""
+    """A number in short form: 2.3, 57, 3.4e5."""
     if not math.isfinite(value):
         return "∞"
     if 0.01 <= value < 1e4:

@@ -1,7 +1,7 @@
 """Chooses the moments of a run that deserve a line. Does not use Rerun.
 
 Frequent events are visible in the lanes; a line reports a stretch without usable packets that is long for this receiver.
-The threshold adapts, so that a run of any length gets at most some hundreds of lines.
+The threshold adapts, so that a run of any length gets at most a few hundred lines per receiver.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Event(NamedTuple):
 
 
 def introduction(scene: Scene) -> list[Event]:
-    """The subject of the run, and its receivers."""
+    """The first lines: the title of the run, and its receivers."""
     trials = "" if scene.trials == 1 else f"; curves: mean of {scene.trials} trials"
     about = [Event(0, "INFO", f"{scene.title}{trials}")]
     for shown in scene.receivers:
@@ -40,7 +40,7 @@ def introduction(scene: Scene) -> list[Event]:
 
 @final
 class Watcher:
-    """Finds the events of one receiver, chunk by chunk, in its lane's codes.
+    """Finds the events of one receiver in its lane's codes, chunk by chunk.
 
     A good slot tells the receiver as much as the state: for the legitimate estimator any packet, for an eavesdropper a state
     that it used as such. A stretch without a good slot is reported when it has become long, and when it ends.

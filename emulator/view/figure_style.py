@@ -1,4 +1,4 @@
-"""The style of all figures, and how they are saved: as a raster image and as a vector image."""
+"""The style of all pictures drawn with matplotlib, and how they are saved: as PNG and PDF."""
 
 from __future__ import annotations
 

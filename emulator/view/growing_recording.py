@@ -1,7 +1,7 @@
 """A recording that is still being written, passed on to a viewer as it grows: through a pipe, or by HTTP to a browser.
 
-Only a reader that knows the address of a recording gets it: the address contains a secret. Nothing here can delay a run: the
-run writes a file, and threads of their own read it, each of which may wait for its viewer indefinitely.
+Over HTTP only a reader that knows the address of a recording gets it: the address contains a secret. Nothing here can delay a
+run: the run writes a file, and separate threads read it; each may wait for its viewer indefinitely.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import IO, Any, final
 
 from evedrop.errors import UsageError
 
-_LOOK_SECONDS = 0.05  # between checks whether the file has grown
+_LOOK_SECONDS = 0.05  # between two checks of whether the file has grown
 _REQUEST_SECONDS = 10.0  # for a browser to send its request
 _MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
 _PIECE = 2**18
@@ -39,13 +39,13 @@ class Followed:
             self._over.set()
 
     def complete(self) -> None:
-        """Declare the file complete: `pieces` ends with its end."""
+        """Declare the file complete: `pieces` then stops at its end."""
         with contextlib.suppress(OSError):
             self._opened()
         self._over.set()
 
     def pieces(self) -> Iterator[bytes]:
-        """The contents of the file, as they come."""
+        """The contents of the file, piece by piece as it grows; waits for more until the file is complete."""
         at = 0
         while True:
             over = self._over.is_set()  # asked before reading, so that no piece written in between is lost
@@ -72,7 +72,7 @@ class Followed:
 
 
 def feed(followed: Followed, pipe: IO[bytes]) -> None:
-    """Write a recording into a pipe, on a thread of its own, until the recording ends or the pipe's reader does."""
+    """Write a recording into a pipe, on a thread of its own, until the recording ends or the pipe has no reader."""
 
     def write() -> None:
         with contextlib.suppress(OSError), pipe:

@@ -1,15 +1,15 @@
-"""Colours of the view, distinct for the colour-blind and on dark and light grounds alike: no white or black series."""
+"""The colours of the view, distinct for the colour-blind, and on dark and light backgrounds: no curve is white or black."""
 
 from __future__ import annotations
 
 Colour = tuple[int, int, int]
 
 GROUND: Colour = (16, 18, 22)
-"""The ground of the state plane, which is dark in both themes."""
+"""The background of the state plane, which is dark in both themes."""
 TRUTH: Colour = (226, 228, 234)
-"""Used only on `GROUND`."""
+"""The truth on `GROUND`."""
 TRUTH_CURVE: Colour = (138, 144, 156)
-"""Used where the ground is the theme's."""
+"""The truth on the background of the theme."""
 
 _RECEIVERS: tuple[Colour, ...] = (
     (45, 190, 165),  # teal

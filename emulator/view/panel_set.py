@@ -1,6 +1,6 @@
-"""The panels of one recording: which ones it has, their layout, and what they record.
+"""The panels of one recording: chooses them, lays them out and records their values.
 
-A panel of a package may be broken. It is then left out, with one warning, and harms neither the run nor the other panels.
+A package's panel may be broken. It is then left out, with one warning, and harms neither the run nor the other panels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 @final
 class PanelSet:
-    """The panels that a scene has; those of packages come last."""
+    """The panels that apply to a scene; those of packages come last. warn: called with a line for each one left out."""
 
     def __init__(self, scene: Scene, warn: Callable[[str], None]) -> None:
         self._scene, self._warn = scene, warn
@@ -72,7 +72,7 @@ class PanelSet:
         return [one for name, panel in [*self._panels.items()] for one in self._tried(name, partial(ask, panel))]
 
     def _tried(self, name: str, ask: Callable[[], Sequence[T]]) -> Sequence[T]:
-        """An answer; a panel of a package that fails is left out from now on."""
+        """A panel's answer; empty if it fails: a package's panel is then left out from now on, and a built-in one raises."""
         try:
             return ask()
         except (Exception, SystemExit) as error:
@@ -85,7 +85,7 @@ class PanelSet:
 
 
 def _drawable(one: PlacedView) -> PlacedView:
-    """A view that the layout can contain. Raises an error otherwise."""
+    """The same view, if a layout can contain it. Raises an error otherwise."""
     if not isinstance(one, PlacedView) or one.side not in {"left", "right"} or not one.share > 0.0:
         raise TypeError(f"views() gave {one!r}; expected a PlacedView, left or right, with a share above 0")
     create_in_memory_blueprint(application_id="view", blueprint=rrb.Blueprint(one.view)).storage.drain_as_bytes()

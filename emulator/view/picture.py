@@ -41,9 +41,9 @@ def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int
 
 
 def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
-    """The same in a process of its own, with a network of its own if the system allows that.
+    """Draw as `picture` does, in a separate process; in a separate network, too, if the system allows that.
 
-    Anybody who finds the port of a viewer without a screen can let it draw.
+    Otherwise anybody who finds the port of the headless viewer could control it.
     """
     command = [
         sys.executable,
@@ -75,12 +75,12 @@ def main(words: Sequence[str]) -> int:
 
 
 def reports(viewer: ViewerClient) -> list[str]:
-    """The panels' complaints: "panel: complaint"."""
+    """The complaints of the panels, such as "Events: …"."""
     return [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
 
 
 def check(rrd: Path) -> None:
-    """Read a recording to its end. Raises UsageError if it is not a recording, or broken.
+    """Read a recording to its end. Raises UsageError if it does not exist, is not a recording, or is broken.
 
     The viewer itself would report nothing, and show nothing.
     """
@@ -110,7 +110,7 @@ def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterato
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder)
         try:
-            # The viewer would write into the picture that it draws without a graphics card.
+            # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
             process = spawn(port, arguments, logs, environment={"RUST_LOG": "error"})
         except UsageError as error:
             raise UsageError(_without_driver(str(error)) or str(error)) from error

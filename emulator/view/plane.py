@@ -1,6 +1,6 @@
 """The state plane as arrays: points, trails and ellipses at the frames of the view. Does not use Rerun.
 
-A run of any length gets a bounded number of frames. Trails are complete all the same: between two frames every slot is drawn.
+A run of any length gets a bounded number of frames. Trails are complete nevertheless: they pass through every slot between.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _shown(values: NDArray[Any]) -> Points:
 class Frame:
     """The part of the plane to show: a box around all recent points, with some room.
 
-    Its sides lie on a grid that is coarse compared with its size, so that the view does not tremble.
+    Its sides lie on a grid that is coarse compared with its size, so that the view does not jitter.
     """
 
     _lows: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
@@ -98,13 +98,13 @@ class Frame:
 @final
 @dataclass
 class Trail:
-    """The way of one point, cut at the frames into pieces of equal length, so that they make one array.
+    """The path of one point, cut at the frames into pieces of equal length, so that they fit into one array.
 
-    Piece i leads from the frame before to frame i through every slot between.
+    Piece i leads from the previous frame to frame i, through every slot between.
     """
 
     every: int
-    """`stride`."""
+    """Slots from one frame to the next, as by `stride`."""
     _since: Points | None = None
 
     def pieces(self, positions: Points, offsets: NDArray[np.intp]) -> Points:

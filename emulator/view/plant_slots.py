@@ -1,4 +1,4 @@
-"""The inputs and disturbances of a plant and the curves of applications, slot by slot for the view: of one trial.
+"""The plant's inputs and disturbances and the curves of applications, slot by slot, of the trial that the view shows.
 
 Source: docs/view.md.
 """
@@ -19,7 +19,7 @@ from evedrop.view.scene import Moved
 
 @final
 class Showing:
-    """Follows one trial of a closed loop, whose slots come in order."""
+    """Follows one trial of a closed loop, whose slots come in order, and gives the view its values."""
 
     def __init__(self, loop: ControlledPlant, scenario: Scenario) -> None:
         self._plant, self._disturbances = loop.plant, loop.disturbances
@@ -34,7 +34,7 @@ class Showing:
         return None if loop is None else cls(loop, scenario)
 
     def take(self, u: Floats, estimates: Mapping[str, Floats]) -> Moved:
-        """Add the next slots: inputs as decided, (c, m), and estimates as deviations, (c, n)."""
+        """The view's values of the next slots, from inputs as decided, (c, m), and estimates as deviations, (c, n)."""
         limited = self._plant.limited(u.T).T
         first, self._next = self._next, self._next + len(u)
         values = np.hstack([self._disturbances[first : self._next], limited])
@@ -45,7 +45,7 @@ class Showing:
 
 
 def driven_scene(scenario: Scenario) -> dict[str, Any]:
-    """The view's scene entries for a plant with a controller."""
+    """The entries of `Scene` for a plant with a controller; empty without."""
     plant, process, loop = scenario.plant, scenario.process, controlled_plant(scenario)
     if plant is None or loop is None:
         return {}

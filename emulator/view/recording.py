@@ -1,4 +1,4 @@
-"""The recording of a run: a file, written in such a way that it cannot delay the run.
+"""The recording of a run: a file, written so that it can delay the run by a few seconds at most.
 
 Rerun may block when a disk is slow or full. So the run only appends to a list, and a thread turns slots into columns
 and writes the file. Viewers read the file as it grows; the run does not know of them.
@@ -22,7 +22,7 @@ from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
 __all__ = ["PeerSlots", "Scene", "SceneSlots", "Shown", "ViewRecording"]
 
 _APPLICATION = "evedrop"
-_PERIOD = 0.1  # seconds between batches, so that a batch is worth its overhead
+_PERIOD = 0.1  # seconds between batches at most
 _MOST_SLOTS = 1024  # in a batch
 _MOST_WAITING = 20_000  # slots that the file may be behind before the run waits for it
 _FILE_TIMEOUT = 5.0  # seconds that the run waits for the file before it continues without one
@@ -52,7 +52,7 @@ class ViewRecording:
         self._writer.start()
 
     def add(self, slots: SceneSlots) -> None:
-        """Record the next slots. Waits only for the disk, and only if that is thousands of slots behind."""
+        """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
         if not slots.count:
             return
         with self._changed:

@@ -73,7 +73,7 @@ def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots
 
 
 def _first_trial(results: Results, name: str) -> pa.Table:
-    """The rows of a peer's first recorded trial, slot by slot."""
+    """The rows of a receiver's first recorded trial, slot by slot."""
     rows = results.trials.filter(pc.field("peer") == name)
     if rows.num_rows:
         rows = rows.filter(pc.field("trial") == pc.min(rows["trial"]))
@@ -81,7 +81,7 @@ def _first_trial(results: Results, name: str) -> pa.Table:
 
 
 def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
-    """True states, ν, and whether there was a packet."""
+    """True states, ν, and whether a packet was sent, in the first recorded trial; name: any receiver."""
     rows = _first_trial(results, name)
     words = rows["sent"].cast(pa.string()).to_pylist()
     nu = np.array([word == "innovation" for word in words], np.bool_)
@@ -89,7 +89,7 @@ def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
 
 
 def _inputs(results: Results) -> Floats:
-    """Inputs of the first recorded trial, (slots, m); none without a controller."""
+    """Inputs of the first recorded trial, (slots, m); empty without a controller."""
     rows = results.inputs
     if rows is None or not rows.num_rows:
         return np.empty((0, 0))

@@ -37,13 +37,13 @@ class Scene:
 
     title: str
     run: str
-    """Names the recording: recordings of the same run are shown as one."""
+    """The run's name, which identifies the recording: recordings of the same run are shown as one."""
     slots: int
     trials: int
     n: int
     """Number of states."""
     pace: float
-    """Seconds a slot; 0: as fast as possible."""
+    """Seconds per slot; 0: as fast as possible."""
     receivers: tuple[Shown, ...]
     """The legitimate estimator first."""
     noise: float
@@ -53,7 +53,7 @@ class Scene:
     moving: tuple[str, ...] = ()
     """Labels of a closed loop's disturbances, then inputs, such as "P_load (kW)"."""
     panels: tuple[Panel, ...] = ()
-    """Those of applications."""
+    """The panels of applications."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class PeerSlots:
     """Trace of the actual error covariance by theory, (c,); NaN where there is none."""
 
     def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> PeerSlots:
-        """The same with every array changed, such as cut."""
+        """The same with every array changed, for example cut to some slots."""
         return PeerSlots(*(change(getattr(self, one.name)) for one in fields(self)))
 
 
@@ -89,7 +89,7 @@ class Moved:
 
     @classmethod
     def joined(cls, moves: Sequence[Moved]) -> Moved:
-        """Those of consecutive slots in one."""
+        """Consecutive slots as one."""
         curves = {path: _joined([one.curves[path] for one in moves], axis=1) for path in moves[0].curves}
         return cls(_joined([one.values for one in moves]), curves)
 
@@ -107,13 +107,13 @@ class SceneSlots:
     peers: Mapping[str, PeerSlots]
     """By name, one for each receiver of the scene."""
     moved: Moved | None = None
-    """For a closed loop."""
+    """None without a closed loop."""
     sent: Flags | None = None
     """Whether the sensor sent a packet in the first recorded trial, (c,); None: in every slot."""
 
     @property
     def count(self) -> int:
-        """C."""
+        """The number of slots, c."""
         return len(self.nu)
 
     @property
@@ -123,7 +123,7 @@ class SceneSlots:
 
     @classmethod
     def joined(cls, chunks: Sequence[SceneSlots]) -> SceneSlots:
-        """Consecutive slots in one, whose arrays cannot be written to."""
+        """Consecutive slots as one, whose arrays cannot be written to."""
         first = chunks[0]
         peers = {
             name: PeerSlots(

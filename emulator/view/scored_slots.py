@@ -1,4 +1,4 @@
-"""A run in the view's form: everything known of it at the start, and its slots as they are scored."""
+"""Converts a run to the view's form: its scene at the start, and its slots as they are scored."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def showing_of(scenario: Scenario) -> Showing | None:
-    """An object that follows the shown trial of a closed loop; None without a controller."""
+    """An object that follows the trial of a closed loop that the view shows; None without a controller."""
     from evedrop.view.plant_slots import Showing  # noqa: PLC0415 - only with a view
 
     return Showing.of(scenario)
 
 
 def open_recording(scenario: Scenario, run: str, path: Path, warn: Callable[[str], None] = warn) -> ViewRecording:
-    """The run's recording, on disk; warn: as in ViewRecording."""
+    """Begin the run's recording on disk; run: its name; warn: as in ViewRecording."""
     from evedrop.view.plant_slots import driven_scene  # noqa: PLC0415 - only with a view
     from evedrop.view.recording import ViewRecording  # noqa: PLC0415 - saves 0.3 s and 100 MB in a run without a view
     from evedrop.view.scene import Scene, Shown  # noqa: PLC0415 - the same
@@ -58,7 +58,7 @@ def open_recording(scenario: Scenario, run: str, path: Path, warn: Callable[[str
 
 
 def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
-    """Some slots in the view's form: the first recorded trial, as levels, and means over all trials.
+    """Some slots as `SceneSlots`: the first recorded trial, in absolute values, and means over all trials.
 
     around: the reference from which states are deviations, (n,); showing: follows the same trial of a closed loop.
     """

@@ -1,4 +1,4 @@
-"""The plot of a sweep: the error of every peer against the first entry, a panel for each combination of the others."""
+"""The plot of a sweep: every receiver's error against the first entry, in a panel for each combination of the others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOST_PANELS = 6
 
 
 def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
-    """Draw `path`.png and `path`.pdf: simulated errors as marks, theory as lines."""
+    """Draw the table of a sweep over these keys as `path`.png and `path`.pdf: simulated errors as marks, theory as lines."""
     rows = table.to_pylist()
     marks, lines = (
         [name for name, one in all_figures().items() if one.sweep_picture == way] for way in ("marks", "lines")
@@ -60,7 +60,7 @@ def _height(row: dict[str, Any], figures: list[str]) -> float:
 
 
 def _positions(values: list[Any]) -> list[float]:
-    """Numbers unchanged; for all other values, places side by side."""
+    """Places on the axis: numbers as they are; other values side by side."""
     if all(isinstance(value, (int, float)) for value in values):
         return [float(value) for value in values]
     return [float(i) for i in range(len(values))]

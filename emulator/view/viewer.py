@@ -1,6 +1,6 @@
-"""The viewer of a run: a window, or a page for browsers; each reads the recording as it is written to disk.
+"""The viewer of a run: a window, or a page for browsers; either reads the recording as it is written to disk.
 
-A recording contains the truth, so none is sent to a port where anybody could fetch it: a window reads it from a pipe, a
+A recording contains the truth, so it is never sent to a port where anybody could fetch it: a window reads it from a pipe, a
 browser from an address that cannot be guessed. Neither Rerun nor Zenoh is imported here.
 
 Source: docs/view.md, who sees it.
@@ -53,7 +53,7 @@ def choose(mode: str) -> str:
 
 @dataclass(frozen=True)
 class WebAddress:
-    """The address of a view for browsers: the page at one port, its data at the next."""
+    """The address of a view for browsers: the page at this port, its data at the next."""
 
     host: str
     port: int
@@ -93,7 +93,7 @@ class Viewer:
     """A running viewer; made by `start` or `serve`.
 
     It listens on loopback only unless a WebAddress says otherwise, in a session of its own so that Ctrl-C in the terminal does
-    not reach it, and on Linux it dies with the thread that started it, however that ends.
+    not reach it, and on Linux it dies with the thread that started it, however that thread ends.
     """
 
     def __init__(
@@ -117,12 +117,17 @@ class Viewer:
             data = quote(f"http://{host}:{served.port}{served.path}", safe="")
             self.address = f"http://{page}/?url={data}"
 
+    @property
+    def pid(self) -> int:
+        """The id of the viewer's process."""
+        return self._process.pid
+
     @classmethod
     def start(cls, mode: str, logs: Path, recording: Path, complete: bool = False) -> Viewer | None:
         """Start a viewer and wait until it is ready; None for "off". Its output goes to viewer.log in the folder `logs`.
 
         mode: "native", "web", "off", or "auto". recording: the file to show, from its beginning on and as it grows; it need not
-        exist yet. complete: the file does not grow.
+        exist yet. complete: whether the file no longer grows.
 
         Raises UsageError if it cannot be started.
         """
@@ -192,13 +197,13 @@ class Viewer:
 
 
 def _screen_is_remote() -> bool:
-    """Whether the screen is reached over the network, as with `ssh -X`; a window with a network of its own could not use it."""
+    """Whether the screen is reached over the network, as with `ssh -X`; a window in a separate network could not use it."""
     display = os.environ.get("DISPLAY", "")
     return not os.environ.get("WAYLAND_DISPLAY") and not display.startswith((":", "/", "unix:"))
 
 
 def open_run(run: Path, mode: str, stand: WebAddress | None = None, recording: Path | None = None) -> Viewer:
-    """A viewer with the recording of a results folder, or with another recording; for browsers, at an address if given.
+    """Start a viewer of the recording of a results folder, or of another recording; with `stand`, for browsers at that address.
 
     Raises UsageError if there is no recording, or no viewer can be started.
     """

@@ -1,6 +1,6 @@
-"""Rerun's command as a child process. Neither Rerun nor Zenoh is imported here.
+"""Starts and ends Rerun's viewer as a child process. Neither Rerun nor Zenoh is imported here.
 
-Rerun's own functions start viewers that listen on every interface; its command can be told not to.
+Rerun's own functions start viewers that listen on every interface; with its command, the interface can be chosen.
 """
 
 from __future__ import annotations
@@ -114,11 +114,11 @@ def spawn(
         except BaseException:
             end(process)
             raise
-        found = f"ended with status {process.poll()}" if process.poll() is not None else "did not get ready"
+        found = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
         end(process)
         log.seek(start)
         last = log.read().decode(errors="replace").strip().splitlines()[-5:]
-    raise UsageError("\n".join([f"the viewer {found}; give --view off to do without. Its last words:", *last]))
+    raise UsageError("\n".join([f"the viewer {found}; give --view off to do without it. Its log ends:", *last]))
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

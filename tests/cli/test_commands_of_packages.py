@@ -9,7 +9,7 @@ from tests.conftest import Evedrop
 from tests.packages import install
 
 COMMAND = """
-from evedrop.cli.command import Command
+from evedrop.command import Command
 
 def greet(options):
     print(f"hello {options.name}")

@@ -36,7 +36,7 @@ def test_every_command_of_the_documents_is_one(page: str) -> None:
             assert (DOCS.parent / words[3]).is_file()
             assert f"def test_{words[-1]}_" in names, words
         elif words[1] != "FILE":
-            assert cli._parser().parse_args(words[1:]).command is not None
+            assert cli.parser_of().parse_args(words[1:]).command is not None
 
 
 def test_the_pages_that_show_commands_have_some() -> None:

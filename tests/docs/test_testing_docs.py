@@ -42,7 +42,7 @@ def test_the_ci_jobs_test_and_keep_the_report() -> None:
     ):
         install, test = commands
         assert install == "pip install evedrop"
-        options = cli._parser().parse_args(shlex.split(test)[1:])
+        options = cli.parser_of().parse_args(shlex.split(test)[1:])
         assert options.places == ["scenarios/"]
         assert kept == [str(options.junit), f"{options.out}/"]
 

@@ -155,9 +155,9 @@ def test_news_are_read_as_they_were_written(news: News) -> None:
 
 MALFORMED = {
     b"{": "Expecting",
-    b"[1]": "no object with an event",
-    b'{"event": 3}': "no object with an event",
-    b'{"event": "dance"}': "no object with an event",
+    b"[1]": "not an object with an event",
+    b'{"event": 3}': "not an object with an event",
+    b'{"event": "dance"}': "not an object with an event",
     b"[" * 100_000: "nested too deeply",
     b'{"event": "ended", "status": 0}': "how is missing",
     b'{"event": "ended", "status": "0", "how": ""}': "status is '0', expected a whole number",

@@ -228,7 +228,7 @@ def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedro
     run = steered(slots=100_000)
     run("pause")
     waiting = Live(
-        evedrop._start(["-m", "evedrop"], ("step", str(run.live.folder), "90000"), {}),
+        evedrop.start(["-m", "evedrop"], ("step", str(run.live.folder), "90000"), {}),
         evedrop.temporary,
         evedrop.folder,
     )

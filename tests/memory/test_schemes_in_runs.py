@@ -17,6 +17,7 @@ from evedrop.loading import checked
 from evedrop.memory.montecarlo import check_mode
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.numeric.detection import Chart
+from evedrop.model.schemes import scheme_of
 from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection, chart_of
 from evedrop.score.summary import DetectionSummary
@@ -103,7 +104,8 @@ def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
 def test_who_is_given_what(scheme: str) -> None:
     """Only the sensor holds what it alone needs; the router alone the way back; nobody but the sensor the leaks' states."""
     briefs = briefs_of(scenario_of(scheme), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
-    kind = Simulation(scenario_of(scheme), range(1))._scheme
+    scenario = scenario_of(scheme)
+    kind = scheme_of(scenario.process.process, scenario.encoding.spec)
     assert set(briefs["sensor"].keys) == {"process", *kind.secret_streams}
     assert set(briefs["legitimate"].keys) == set(kind.estimator_streams)
     assert briefs["naive"].keys == briefs["ref"].keys == briefs["spy"].keys == {}

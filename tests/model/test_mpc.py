@@ -118,12 +118,12 @@ def test_where_there_is_no_solution_the_inputs_are_held(monkeypatch: pytest.Monk
     x = np.array([[1.0, 2.0], [0.0, 0.0]])
     u = controller.decide(0, x, np.zeros(2))
     assert not controller.failed.any()
-    controller._solvers[1].update_settings(max_iter=1)
+    controller.solvers[1].update_settings(max_iter=1)
     again = controller.decide(PERIOD, -x, np.zeros(2))
     assert controller.failed.tolist() == [False, True]
     assert np.array_equal(again[:, 1], u[:, 1])
     assert not np.array_equal(again[:, 0], u[:, 0])
-    controller._solvers[1].update_settings(max_iter=4000)
+    controller.solvers[1].update_settings(max_iter=4000)
     assert not np.array_equal(controller.decide(2 * PERIOD, -x, np.zeros(2))[:, 1], u[:, 1])
     assert not controller.failed.any()
 

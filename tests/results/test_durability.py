@@ -65,7 +65,7 @@ def cut_short(live: Live) -> int:
     """Check that the folder of a live run that was killed opens, and says where it ends; how many slots it has."""
     results = live.results
     slots: int = results.summary["slots"]
-    assert str(results.summary["ended"]).startswith(f"cut short at slot {slots}, for its run was killed")
+    assert str(results.summary["ended"]).startswith(f"cut short at slot {slots}, because its run was killed")
     receivers = len(results.summary["peers"])
     for table in (results.slots, results.trials, results.journal):
         assert table.num_rows == slots * receivers
@@ -84,7 +84,7 @@ def test_a_run_of_which_everything_was_killed_can_be_read(evedrop: Evedrop) -> N
     slots = cut_short(live)
     done = evedrop("view", "run", "--table")
     assert done.status == 0
-    assert done.out.startswith(f"cut short at slot {slots}, for its run was killed")
+    assert done.out.startswith(f"cut short at slot {slots}, because its run was killed")
     assert "legitimate" in done.out
     assert replay(live.folder, evedrop.folder / "again.rrd").stat().st_size > 10_000
     whole = evedrop("montecarlo", "eavesdroppers", "--trials", "1", "--slots", str(slots), "--out", "memory")
@@ -209,7 +209,7 @@ def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
     results = live.results
     trials = results.summary["trials"]
     assert trials >= 500
-    assert f"cut short at {trials} of 100000 trials, for its run was killed" in results.summary["ended"]
+    assert f"cut short at {trials} of 100000 trials, because its run was killed" in results.summary["ended"]
     assert set(results.slots["trials"].to_pylist()) == {trials}
     assert results.slots.num_rows == results.trials.num_rows == 4 * 400
     assert results.digests.num_rows == 4 * 2 * trials
@@ -248,19 +248,17 @@ def sums(count: int) -> SlotSums:
 def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -> None:
     """Of a round that was being written when the writer ended nothing is read, and everything of those before."""
     with TemporaryDirectory() as name:
-        folder = Path(name)
-        writer = ResultsWriter(folder, NAMES, 2)
-        kept = [(0, sizes(folder))]
-        for count in rounds:
-            first = kept[-1][0]
-            for receiver in NAMES:
-                writer.slot_rows(first, receiver, sums(count), np.zeros(count))
-            writer._round()
-            kept.append((first + count, sizes(folder)))
-        writer._held.close()
-        writer._unfinished.close()
-        for stream in writer._streams.values():
-            stream.close()
+        written = Path(name, "written")
+        written.mkdir()
+        with ResultsWriter(written, NAMES, 2) as writer:
+            kept = [(0, sizes(written))]
+            for count in rounds:
+                first = kept[-1][0]
+                for receiver in NAMES:
+                    writer.slot_rows(first, receiver, sums(count), np.zeros(count))
+                writer.write_rows("")
+                kept.append((first + count, sizes(written)))
+            folder = shutil.copytree(written, Path(name, "stopped"))
         whole = data.draw(st.integers(0, len(rounds) - 1), label="whole rounds")
         slots, before = kept[whole]
         for file, size in kept[whole + 1][1].items():

@@ -109,13 +109,13 @@ def test_what_is_sent_is_small_and_adds_up_as_before() -> None:
     samples = np.random.default_rng(1).exponential(SCALE, (6000, 50))
     made = histograms(samples)
     sent = pickle.dumps(made)
-    assert len(sent) < 8 * samples.size + 10_000 < made._counts.nbytes
+    assert len(sent) < 8 * samples.size + 10_000 < made.counts.nbytes
     arrived = pickle.loads(sent)  # noqa: S301 - our own
     assert np.array_equal(arrived.quantiles(), made.quantiles(), equal_nan=True)
     for one in (arrived, made):
         one.add(0, samples[:, :7])
         one.merge(histograms(samples))
-    assert np.array_equal(arrived._counts, made._counts)
+    assert np.array_equal(arrived.counts, made.counts)
 
 
 def test_beyond_the_bins_only_the_side_is_known() -> None:

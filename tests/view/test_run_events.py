@@ -8,7 +8,7 @@ from typing import Any
 
 from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
-from evedrop.score.summary import RunEvent
+from evedrop.news import RunEvent
 from evedrop.view.replay import replay
 from tests.view.read_back import rows
 

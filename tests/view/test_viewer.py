@@ -85,7 +85,7 @@ def test_off_starts_nothing(tmp_path: Path) -> None:
 @LINUX
 def test_only_loopback_listens(viewer: Viewer) -> None:
     """Rerun serves its page on 127.0.0.1, and opens no other port: none that recordings could be fetched from."""
-    assert listening(viewer._process.pid) == ["0100007F"]
+    assert listening(viewer.pid) == ["0100007F"]
     assert viewer.address is not None
     with urllib.request.urlopen(viewer.address, timeout=LIMIT) as page:  # noqa: S310 - our own address
         assert b"<html" in page.read()
@@ -120,7 +120,7 @@ def test_the_recording_is_at_a_secret_address_alone(viewer: Viewer, tmp_path: Pa
 def test_nothing_that_another_user_can_read_names_the_address(viewer: Viewer, tmp_path: Path) -> None:
     """The address is neither among the viewer's arguments nor in its log."""
     token = urlsplit(data_of(viewer)).path.split("/")[1].encode()
-    assert token not in Path(f"/proc/{viewer._process.pid}/cmdline").read_bytes()
+    assert token not in Path(f"/proc/{viewer.pid}/cmdline").read_bytes()
     assert token not in (tmp_path / "logs" / "viewer.log").read_bytes()
 
 
@@ -171,9 +171,9 @@ def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
     started = window(tmp_path / "logs", tmp_path / "r.rrd")
     try:
         assert started.address is None
-        assert listening(started._process.pid) == ["0100007F"]
+        assert listening(started.pid) == ["0100007F"]
         with socket.socket() as probe:
-            found = probe.connect_ex(("127.0.0.1", port_of(started._process.pid)))
+            found = probe.connect_ex(("127.0.0.1", port_of(started.pid)))
         assert (found == errno.ECONNREFUSED) == (started.warning is None)
     finally:
         started.stop()
@@ -231,7 +231,7 @@ def test_a_viewer_is_given_the_screen_and_no_tokens(tmp_path: Path, monkeypatch:
     started = Viewer.start("web", tmp_path, tmp_path / "r.rrd")
     assert started is not None
     try:
-        given = Path(f"/proc/{started._process.pid}/environ").read_bytes()
+        given = Path(f"/proc/{started.pid}/environ").read_bytes()
     finally:
         started.stop()
     assert {name for name in (b"ACCESS_TOKEN", b"VK_EXAMPLE", b"LC_EXAMPLE") if name in given} == {
@@ -243,7 +243,7 @@ def test_a_viewer_is_given_the_screen_and_no_tokens(tmp_path: Path, monkeypatch:
 @LINUX
 def test_hung_viewer_is_stopped(viewer: Viewer) -> None:
     """A viewer that does not react is killed."""
-    os.kill(viewer._process.pid, signal.SIGSTOP)
+    os.kill(viewer.pid, signal.SIGSTOP)
     viewer.stop()
     assert not viewer.alive()
 
@@ -253,7 +253,7 @@ import sys, time
 from pathlib import Path
 from evedrop.view.viewer import Viewer
 viewer = Viewer.start("web", Path(sys.argv[1]), Path(sys.argv[1]) / "r.rrd")
-print(viewer._process.pid, flush=True)
+print(viewer.pid, flush=True)
 time.sleep(600)
 """
 
@@ -288,7 +288,7 @@ def test_faulty_viewer_changes_nothing(
     with urllib.request.urlopen(data_of(viewer), timeout=LIMIT):  # noqa: S310 - our own address
         for slots in run.chunks(100):
             if slots.first == 1000 and fault != "unread":
-                os.kill(viewer._process.pid, signal.SIGSTOP if fault == "frozen" else signal.SIGKILL)
+                os.kill(viewer.pid, signal.SIGSTOP if fault == "frozen" else signal.SIGKILL)
             begun = time.monotonic()
             recording.add(slots)
             longest = max(longest, time.monotonic() - begun)

@@ -1,6 +1,6 @@
-"""The commands, one module for each or for a few that belong together. A module has a tuple `COMMANDS`.
+"""The commands: a module for each, or for a few that belong together. Each module has a tuple `COMMANDS`.
 
-An installed package adds commands by an entry point of the group `evedrop.commands` that names such a module.
+An installed package adds commands with an entry point in the group `evedrop.commands` that names such a module.
 """
 
 from __future__ import annotations

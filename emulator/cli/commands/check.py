@@ -1,4 +1,4 @@
-"""`evedrop check`: scenarios, or classes of a user's own, held against the rules."""
+"""`evedrop check`: validates scenarios, or checks classes of a user's own against the rules."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import argparse
 import sys
 from typing import Any
 
-from evedrop.cli.command import Command
 from evedrop.cli.options import changes, changes_of
+from evedrop.command import Command
 from evedrop.errors import UsageError
 
 
 def check(options: argparse.Namespace) -> int:
-    """Validate scenarios, or classes."""
+    """Validate scenarios, or check classes against the rules."""
     from evedrop.expected.estimates import warnings_of
     from evedrop.loading import load
 

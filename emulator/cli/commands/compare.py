@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from evedrop.cli.command import Command
 from evedrop.cli.options import changes_of, entries, output, scenario
+from evedrop.command import Command
 from evedrop.errors import UsageError
 
 
 def compare(options: argparse.Namespace) -> int:
-    """Compare schemes and adversaries."""
+    """Compare every scheme against every adversary."""
     from evedrop.api import compare as compare_all
     from evedrop.cli.comparison_report import print_comparison
     from evedrop.cli.report import ProgressLine

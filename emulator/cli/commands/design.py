@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
-from evedrop.cli.command import Command
 from evedrop.cli.options import changes, changes_of, scenario
+from evedrop.command import Command
 
 
 def design(options: argparse.Namespace) -> int:

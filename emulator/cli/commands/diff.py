@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from evedrop.cli.command import Command
+from evedrop.command import Command
 
 
 def diff(options: argparse.Namespace) -> int:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from evedrop.cli.command import Command
+from evedrop.command import Command
 from evedrop.errors import UsageError
 
 

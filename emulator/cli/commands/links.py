@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
-from evedrop.cli.command import Command
 from evedrop.cli.options import argument
+from evedrop.command import Command
 
 
 def fit_link(options: argparse.Namespace) -> int:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 
-from evedrop.cli.command import Command
 from evedrop.cli.in_memory import MEMORY, plan_of
 from evedrop.cli.options import loaded, print_so_far, scenario
+from evedrop.command import Command
 from evedrop.errors import Interrupted
 
 
@@ -25,7 +25,7 @@ def montecarlo(options: argparse.Namespace) -> int:
             try:
                 status = simulate(scenario, folder, line.tell, plan)
             except Interrupted:
-                with contextlib.suppress(OSError):  # as above
+                with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
                     print_so_far(line.moved or folder, options.json)
                 raise
         print_so_far(line.moved or folder, options.json)

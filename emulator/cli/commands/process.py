@@ -1,4 +1,4 @@
-"""The commands about single processes of a run: write briefs, run one process, and ask whether it is present.
+"""The commands for single processes of a run: write briefs, run one process, and ask whether it is present.
 
 Slow imports are made only by the command that needs them, so that a peer starts quickly.
 """
@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.command import Command
 from evedrop.cli.commands import ROLES
-from evedrop.cli.options import Option, argument, entries, loaded, scenario, served
+from evedrop.cli.options import argument, entries, loaded, scenario, served
+from evedrop.command import Command, Option
 from evedrop.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by han
 
 
 def brief(options: argparse.Namespace) -> int:
-    """Write the briefs."""
+    """Write the briefs of a scenario's processes."""
     from evedrop.live.launch.briefs import write_briefs
     from evedrop.live.launch.ports import places_at
 
@@ -50,10 +50,10 @@ def process(options: argparse.Namespace) -> int:
     from evedrop.signals import leave_on_signals, show_stacks_on_request
 
     show_stacks_on_request()
-    if options.role != "observer":  # which ends in order
+    if options.role != "observer":  # the observer ends the run in order
         leave_on_signals()
     brief = read_brief(options.brief, options.role)
-    if brief.ends_with_stdin:  # started by a launcher, which writes another brief for a process that it starts again
+    if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
         continue_when_launcher_dies()
     if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
@@ -143,7 +143,7 @@ def _report(folder: Path, status: int, how: str) -> None:
 
 
 def health(options: argparse.Namespace) -> int:
-    """Print whether a process is on the network."""
+    """Print whether the process of a brief is on the network."""
     from evedrop.live.network.health import is_there
     from evedrop.live.protocol.brief import read_brief
 

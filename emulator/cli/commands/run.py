@@ -7,9 +7,9 @@ import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from evedrop.cli.command import Command
 from evedrop.cli.holding import hold
 from evedrop.cli.options import entries, loaded, output, print_so_far, scenario
+from evedrop.command import Command
 from evedrop.errors import Interrupted, RunError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def demo(options: argparse.Namespace) -> int:
-    """Run `vehicle` live."""
+    """Run the shipped scenario `vehicle` live."""
     options.scenario = "vehicle"
     return run(options)
 

@@ -1,11 +1,11 @@
-"""`evedrop list` and `evedrop new`: the shipped scenarios, and one to start from."""
+"""`evedrop list` and `evedrop new`: list the shipped scenarios, and write one to start from."""
 
 from __future__ import annotations
 
 import argparse
 
-from evedrop.cli.command import Command
 from evedrop.cli.options import argument
+from evedrop.command import Command
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
@@ -22,7 +22,7 @@ def list_scenarios(_: argparse.Namespace) -> int:
 
 
 def new(options: argparse.Namespace) -> int:
-    """Write the commented scenario."""
+    """Write a commented scenario to start from."""
     from evedrop.loading import write_new
 
     write_new(options.file)

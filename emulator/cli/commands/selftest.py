@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from evedrop.cli.command import Command
+from evedrop.command import Command
 from evedrop.errors import RunError
 
 

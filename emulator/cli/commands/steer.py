@@ -1,4 +1,4 @@
-"""The commands for a run that goes on: each asks the run's observer, prints the answer, and ends.
+"""The commands for a run in progress: each asks the run's observer, prints the answer, and ends.
 
 Slow imports are made only by the command that needs them.
 """
@@ -12,8 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.command import Command
 from evedrop.cli.options import as_json
+from evedrop.command import Command
 from evedrop.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
@@ -25,23 +25,23 @@ _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
 
 def link(options: argparse.Namespace) -> int:
-    """Change a link, cut it or heal it."""
+    """Change, cut or heal a link."""
     event = _event(options.name, options.changes)
     return _ask(options.run, "link", f"link {options.name}", event=event)
 
 
 def pause(options: argparse.Namespace) -> int:
-    """Hold the run."""
+    """Hold the run before its next slot."""
     return _ask(options.run, "pause", "pause")
 
 
 def resume(options: argparse.Namespace) -> int:
-    """Let the run go on."""
+    """Let a held run go on."""
     return _ask(options.run, "resume", "resume")
 
 
 def step(options: argparse.Namespace) -> int:
-    """Let the run go on for some slots."""
+    """Let the run go on for some slots, and hold it again."""
     from evedrop.streams import MOST_SLOTS
 
     if not 1 <= options.slots <= MOST_SLOTS:
@@ -73,7 +73,7 @@ def _ask(run: Path, do: str, what: str, patience: float = _PATIENCE, **fields: A
 
 
 def _answer(run: Path, control: Control, request: Request, what: str, patience: float) -> Answer:
-    """The answer of a run's, or a shard's, observer. Raises UsageError if it does not answer, or refuses."""
+    """The answer of the observer of a run or a shard. Raises UsageError if it does not answer, or refuses."""
     import zenoh
 
     from evedrop.live.network.control_file import no_run
@@ -120,7 +120,7 @@ def _event(name: str, words: list[str]) -> dict[str, Any]:
 
 
 def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
-    """Put a value at a dotted key; makes the tables in between."""
+    """Put a value at a dotted key in `changes`; makes the tables in between."""
     from evedrop.loading import value_of
 
     *tables, last = dotted.split(".")

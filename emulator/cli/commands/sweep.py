@@ -1,4 +1,4 @@
-"""`evedrop sweep`: Monte Carlo over a grid."""
+"""`evedrop sweep`: Monte Carlo over a grid of values of some entries."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import argparse
 import json
 from pathlib import Path
 
-from evedrop.cli.command import Command
 from evedrop.cli.in_memory import MEMORY, plan_of
 from evedrop.cli.options import changes_of, scenario
+from evedrop.command import Command
 
 
 def sweep(options: argparse.Namespace) -> int:

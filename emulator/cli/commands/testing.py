@@ -1,4 +1,4 @@
-"""`evedrop test`: scenarios as tests."""
+"""`evedrop test`: runs scenarios as tests, by their expectations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from evedrop.cli.command import Command
+from evedrop.command import Command
 from evedrop.errors import UsageError
 
 

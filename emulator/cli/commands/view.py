@@ -7,9 +7,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from evedrop.cli.command import Command
 from evedrop.cli.holding import hold
 from evedrop.cli.options import argument, served
+from evedrop.command import Command
 
 
 def view(options: argparse.Namespace) -> int:

@@ -18,12 +18,12 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from evedrop.live.protocol.brief_parts import Identity
 
-_BEFORE = datetime.timedelta(days=1)  # so that a host whose clock is late or in another zone can take part
+_BEFORE = datetime.timedelta(days=1)  # so that a host whose clock is slow or set to another time zone can take part
 _VALID = datetime.timedelta(days=30)
 
 
 def authority_name(run: str) -> str:
-    """The name of a run's authority, from which a process that rejects a certificate tells the run."""
+    """The name of a run's authority, by which a process that rejects a certificate knows which run it belongs to."""
     return f"evedrop {run}"
 
 

@@ -41,7 +41,7 @@ _LAUNCHED_PATIENCE = 30  # seconds
 
 
 def flow_of(scenario: Scenario) -> Flow:
-    """The flow control: a window of some megabytes, and four reports per window; with a pace, every 40 ms."""
+    """The flow control: a window of at most 1024 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms."""
     receivers = len(scenario.receivers)
     slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
     window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
@@ -72,8 +72,8 @@ def sizes_of(scenario: Scenario, batch: int) -> Sizes:
 def history_of(scenario: Scenario) -> int:
     """How many slots before the first that is not done a restarted router must receive again.
 
-    A packet may be under way for its link's window. Bursts of losses, which a slot without a packet ends, are counted up
-    to a maximal length.
+    Packets may be under way for the longest window of the receivers. If the scheme may be silent, the router must also see
+    the bursts of losses that are not over, which are counted up to a maximal length: a slot without a packet ends them.
     """
     window = max(scenario.window(name) for name in scenario.receivers)
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
@@ -82,7 +82,7 @@ def history_of(scenario: Scenario) -> int:
 
 @dataclass(frozen=True)
 class ObserverTask:
-    """The observer's task, in addition to the scenario."""
+    """The observer's task, in addition to the scenario: the results folder, and whether to record the run for the view."""
 
     results: Path
     recording: bool
@@ -159,7 +159,7 @@ def briefs_of(
         controller=loop.wiring,
         zid=routers.zid,
         limits=limits,
-        modules=scenario.modules,  # whatever it names: an operator can set another link model
+        modules=scenario.modules,  # even if no link names a class: an operator can set another link model
     )
     made = [brief(ROUTER, link_keys, router)]
     if places.relay is not None and routers.zid is not None:
@@ -230,7 +230,7 @@ def _answers(scenario: Scenario) -> dict[str, Any]:
 
 
 def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:
-    """A receiver's own outages only."""
+    """A receiver's outages: first slot, first slot after, and whether it keeps its state."""
     return [(one.start, one.stop, one.keeps_state) for one in scenario.timeline.outages[receiver]]
 
 

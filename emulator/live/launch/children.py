@@ -8,7 +8,6 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -20,19 +19,20 @@ from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.starter import StartedProcess, Starter, start_process
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
+from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
-from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
+from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.news import News, RunEnded, Started, Tell
 from evedrop.results.folder import private_opener
 from evedrop.results.held_folder import HeldFolder
 from evedrop.signals import SHOW_STACKS, held_back
 
 GRACE_SECONDS = 3.0  # for all processes to leave
-_STACKS_SECONDS = 0.3  # for a process that does not leave to write what its threads do into its log
-ROUTER_RESTARTS = 3  # how often a router that a signal ended is restarted: the run goes on with the new one
-SILENCE_SECONDS = 30.0  # after which a silent observer is given up: it sends a heartbeat every second
+_STACKS_SECONDS = 0.3  # for a process that does not leave to write the stacks of its threads into its log
+ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
+SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer, which sends a heartbeat every second
 _BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
-_GONE_SECONDS = 5.0  # for a process that has left the network to end, and so to say why
+_GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
@@ -40,27 +40,13 @@ _ROUTER_LOST = "has had no connection with the router"
 _NOT_THERE = re.compile(rf"evedrop: \S+: .*\b{OBSERVER}\b.* did not appear within")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
-_REFUSED = re.compile(r"(?:malformed message|gap) on evedrop/[^/\s]+/([a-z0-9_/-]+)")
-
-
-_SENDERS: Mapping[str, str] = {
-    "uplink": SENSOR,
-    "state": SENSOR,
-    "estimate": LEGITIMATE,
-    "input": CONTROLLER,
-    "journal": ROUTER,
-    "downlink": ROUTER,
-    "control": OBSERVER,
-}
+_REFUSED = re.compile(r"(?:malformed message|gap) on (evedrop/[^/\s]+/[a-z0-9_/-]+)")
 
 
 def _sender(complaint: str) -> str | None:
-    """The sender of the message that a complaint is about, from its key (docs/protocol.md, keys)."""
+    """The sender of the message that a complaint is about, by its key."""
     found = _REFUSED.search(complaint)
-    if found is None:
-        return None
-    kind, _, name = found[1].partition("/")
-    return _SENDERS.get(kind, name)
+    return None if found is None else writer_of(found[1])
 
 
 @dataclass(frozen=True)
@@ -94,7 +80,7 @@ class Children:
         self._processes: dict[str, StartedProcess] = {}
         self._news: SimpleQueue[News | Exit] = SimpleQueue()
         self.silent_seconds = 0.0
-        """For how long the observer has been silent."""
+        """How many seconds the observer has been silent for."""
         self.started = False
         """Whether the conductor has started the run."""
         self.over = False
@@ -127,7 +113,7 @@ class Children:
                 process.stdin.close()
 
     def start(self, brief: AnyBrief, again: bool = False) -> None:
-        """Start the process of a brief, or restart it. Its output goes to its log, an observer's news to the launcher.
+        """Start the process of a brief, or restart it (`again`). Its output goes to its log, an observer's news to the launcher.
 
         Raises RunError if the system cannot start it.
         """
@@ -177,7 +163,7 @@ class Children:
             log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
 
     def restart_router(self, ended: Exit) -> bool:
-        """Restart a router if a signal ended it, a few times at most; returns whether it was restarted."""
+        """Restart a router or relay if a signal ended it, a few times per run; returns whether it was restarted."""
         signalled = ended.status < 0 or ended.status == INTERRUPTED
         if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
@@ -210,7 +196,7 @@ class Children:
                 observer.flush()
 
     def news(self, seconds: float) -> News | Exit | None:
-        """The next news, or None if there are none within `seconds`."""
+        """The next news or exit that concerns the caller, or None; waits for `seconds` at most."""
         try:
             news = self._news.get(timeout=seconds)
         except Empty:
@@ -231,9 +217,9 @@ class Children:
         return None if isinstance(news, Alive | ProcessRequest | RunOver | Finishing) else news
 
     def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
-        """End the observer, at once or after `patience` seconds; returns its `ended` news, or None if it sent none.
+        """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
 
-        Once it has begun to finish, it may take its time, as long as it sends heartbeats.
+        Once it has begun to write the results, it may take any time, as long as it sends heartbeats.
         """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
@@ -266,7 +252,10 @@ class Children:
                 process.wait(max(0.0, deadline - time.monotonic()))
 
     def failure_report(self, first: Exit | None, ending: RunEnded | None) -> str:
-        """The failure in words: the process at fault, and the last lines of its log and of the complaining process's log."""
+        """The failure in words: the process at fault, and the last lines of its log and of the log that accuses it.
+
+        first: the first process that ended too early, if any; ending: the end as the observer reported it, if it did.
+        """
         suspects, accused = ([], []) if ending is None else (list(ending.suspects), list(ending.accused))
         why = ending.how if ending is not None and ending.status not in {0, 1, INTERRUPTED} else ""
         lost = None if first is None else self._lost_by_all(first.process, suspects)
@@ -295,7 +284,7 @@ class Children:
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
-        """A child that failed, or left too early; never the observer. Missing processes get a moment to end."""
+        """A child that failed or left too early, other than the observer. Waits a moment for missing processes to end."""
         deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
             ended = {
@@ -324,7 +313,7 @@ class Children:
         return any(_ROUTER_LOST in line for line in self._log(name))
 
     def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
-        """The router that a process gave up, if the observer or all its other users miss it, too; else None."""
+        """The router that a process gave up on, if the observer or all its other users miss it, too; otherwise None."""
         if not self._lost_router(name):
             return None
         if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):

@@ -1,4 +1,4 @@
-"""A closed loop's parts of the briefs: what each process knows of plant, inputs and disturbances.
+"""A closed loop's parts of the briefs: the knowledge of each process about plant, inputs and disturbances.
 
 Source: docs/protocol.md, the brief.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @final
 class LoopBriefs:
-    """A closed loop's parts of a scenario's briefs; None if there is no plant, or no controller."""
+    """A closed loop's parts of a scenario's briefs; each is None if the scenario lacks the plant or controller for it."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -40,7 +40,7 @@ class LoopBriefs:
         """The plant with its disturbances, for the sensor."""
 
     def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
-        """The keys of the sensor's own streams, without the secret's."""
+        """Stream → key, for the sensor's own streams, without those of the secret."""
         driven = self._scenario.driven
         measures = driven is not None and driven.output_matrix is not None
         return {"process": keys.process, **({"measurement": keys.measurement} if measures else {})}

@@ -28,10 +28,10 @@ _ROWS = 65_536
 
 
 class Gathered(ABC):
-    """Merges the rows of all shards into those of the run. Abstract."""
+    """Merges a table of all shards into that of the run: the base class."""
 
     def __init__(self, receivers: Sequence[str], row_bytes: float) -> None:
-        """receivers: empty for a table without a column of receivers; row_bytes: approximate size of a row of the table."""
+        """receivers: empty for a table without a column of receivers; row_bytes: approximate size of a row."""
         self.receivers = pa.array(receivers)
         self.by = "peer"
         """Name of the column of the receivers."""
@@ -111,7 +111,7 @@ class _Rows:
 class Statistics(Gathered):
     """Merges statistics of slots: means are weighted by the number of trials, and standard errors pooled."""
 
-    # Theory, which is the same in all shards, and quantiles, which a live run does not have.
+    # Taken from any shard: theory, which is the same in all, and quantiles, which a live run does not have.
     _TAKEN = ("expected", "error_quantile", "trace_quantile")
 
     def __init__(self, receivers: Sequence[str]) -> None:
@@ -183,7 +183,7 @@ class Recorded(Gathered):
     """Merges the recorded trials, each in full."""
 
     def __init__(self, receivers: Sequence[str], trials: range, numbers: int) -> None:
-        """trials: the recorded ones; numbers: how many a row of one of them has."""
+        """trials: the recorded ones; numbers: how many numbers a row has."""
         super().__init__(receivers, len(trials) * 8.0 * numbers)
         self._trials = trials
 

@@ -3,7 +3,7 @@
 Trials are concatenated and counts added. Means over all trials are computed from the shards' means, so they agree with an
 unsharded run's within rounding; digests, fates, recorded trials and everything else kept by trial are the same to the bit.
 
-Source: docs/results.md, shards.
+Source: docs/scale.md, shards.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
 from evedrop.live.launch.shard import Shard
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
-from evedrop.news import ConnectionOutage
+from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
 from evedrop.results.resolved_scenario import write_resolved
@@ -35,7 +35,7 @@ from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_s
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, summary_of
-from evedrop.score.summary import RunEvent, Summary
+from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals
 
 _RECORDING = "recording.rrd"
@@ -66,7 +66,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
 
 
 def _tables(scenario: Scenario, shards: Sequence[Shard]) -> dict[str, Gathered]:
-    """Table → how it is merged."""
+    """Table → the object that merges it."""
     n, receivers, first = len(scenario.process.A), scenario.receivers, scenario.first_trial
     recorded = range(first, first + scenario.record_trials)
     tables: dict[str, Gathered] = {
@@ -96,7 +96,7 @@ def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: Resu
 
 
 def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
-    """Block → digests of the shard's trials, (R, 32), of one peer."""
+    """First slot of a block → digests of the shard's trials, (R, 32), of one peer."""
     batches = parquet_or_stream(shard.folder, "digests")
     table = pa.Table.from_batches(batches, DIGESTS).filter(pc.field("peer") == name)
     starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())

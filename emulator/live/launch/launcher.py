@@ -26,7 +26,7 @@ def launch(
 ) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
 
-    listen, relay: the endpoints of router and, if there is one, relay; free ports by default.
+    view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; free ports by default.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases the results so far are in the folder and no process is left.

@@ -25,7 +25,7 @@ class RouterEndpoint:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The hosts that the router is known by."""
+        """The host names and addresses by which the router is known."""
         found = (self.connect.host, *(() if self.listen.everywhere else (self.listen.host,)))
         return tuple(dict.fromkeys(found))
 
@@ -36,7 +36,7 @@ class RouterEndpoints:
 
     router: RouterEndpoint
     relay: RouterEndpoint | None = None
-    """In a run with two routers, the endpoint of all processes but the sensor."""
+    """The relay's endpoint, in a run with two routers."""
 
     @property
     def far(self) -> RouterEndpoint:
@@ -121,7 +121,7 @@ def _endpoint(option: str, text: str) -> Endpoint:
 def loopback_places(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
     """The endpoints of a run whose processes are all on this host: the requested ones, or free ports.
 
-    Two routers take certificates by default: without, a router is recognised by its id alone, which is not a secret.
+    Two routers take certificates by default: without them, a router is recognised by its id alone, which is not a secret.
     Raises UsageError unless they are on loopback and a router can listen there.
     """
     asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls" if relayed else "tcp")

@@ -1,8 +1,8 @@
 """The folder for the briefs of a run, which hold keys and passwords; it is removed even if the launcher is killed.
 
 A shell that holds the other end of a pipe to the launcher removes the folder when the launcher is dead. The launcher also
-holds a lock in the folder, which the system releases when the launcher dies: if the shell was killed, too, the next run finds
-the folder unlocked, and removes it.
+holds a lock in the folder, which the system releases when the launcher dies: if the shell was killed, too, the next run
+finds the folder unlocked, and removes it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from evedrop.errors import UsageError
 _PREFIX = "evedrop-"
 _LOCK = "lock"
 _GUARD_SECONDS = 5.0
-# A process that is still starting may write into the folder during the removal: so try again.
+# A process that is still starting may write into the folder while it is being removed, so try again.
 _GUARD = (
     "while read -r _; do :; done; tries=0; "
     'while [ -e "$1" ] && [ $tries -lt 50 ]; do rm -rf -- "$1" 2>/dev/null || sleep 0.2; tries=$((tries + 1)); done'

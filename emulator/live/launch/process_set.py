@@ -92,7 +92,7 @@ def launch_one(
 
 
 def _now(held: HeldFolder, tell: Tell) -> Path:
-    """The results folder when the run is over; reports if it was renamed."""
+    """The results folder at the end of a run; removes the control file, and tells the user if the folder was renamed."""
     try:
         now = held.now
     except FileNotFoundError:
@@ -113,7 +113,7 @@ def _forget(folder: Path) -> None:
 
 
 def _note(folder: Path, scenario: Scenario, how: str) -> None:
-    """Write the reason of the run's end into its summary, and finish the tables that the observer could not finish.
+    """Write the reason for the run's end into its summary, and finish the tables that the observer could not finish.
 
     Raises OSError if the folder cannot be written.
     """
@@ -182,7 +182,7 @@ def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
 
 
 def _stopped(children: Children, tell: Tell) -> RunEnded:
-    """End the run; returns its end if it was complete before the signal came, else raises Interrupted."""
+    """End the run after a signal; returns its end if it was complete before. Raises Interrupted otherwise."""
     ending = children.conclude(tell)
     if ending is None or not ending.well:
         raise Interrupted(_INTERRUPTED)
@@ -190,5 +190,5 @@ def _stopped(children: Children, tell: Tell) -> RunEnded:
 
 
 def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
-    """Whether the signal that ended a child reaches the launcher, too, within a moment: a closing terminal hangs up on all."""
+    """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
     return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)

@@ -37,7 +37,7 @@ class Shard:
         return range(first, first + self.scenario.trials)
 
     def of_run(self, said: object) -> str:
-        """A message of the shard as a message of the run: names the shard, and its logs by their place in the run's folder."""
+        """A message of the shard as one of the run: names the shard, and its logs by their path in the run's folder."""
         trials = self.trials
         which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
         return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(said))

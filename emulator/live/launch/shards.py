@@ -42,7 +42,7 @@ class OneProgress:
         """When the first shard began, by the monotonic clock."""
 
     def of(self, shard: Shard) -> Tell:
-        """The function that takes the news of one shard."""
+        """A function that takes the news of one shard."""
 
         def tell(news: News) -> None:
             with self._lock:
@@ -103,7 +103,7 @@ class _Course:
 
     @property
     def fault(self) -> tuple[Shard, BaseException] | None:
-        """The first shard that failed, and so interrupted the others; None if all ended well, or by the user."""
+        """The first shard that failed, and its error, which ended the others; None if all ended well or the user ended them."""
         found = (one for one in self.failures if not isinstance(one[1], Interrupted))
         return next(found, None)
 
@@ -127,7 +127,7 @@ def launch_shards(
     threads = [threading.Thread(target=course.launched, args=(*one, "off", stop)) for one in others]
     for thread in threads:
         thread.start()
-    # Here, not on another thread: a viewer ends with the thread that has started it.
+    # On this thread, not on another one: a viewer ends with the thread that started it.
     course.launched(*first, view, stop)
     for thread in threads:
         thread.join()

@@ -16,21 +16,21 @@ class StartedProcess(Protocol):
 
     @property
     def pid(self) -> int:
-        """Its id."""
+        """Its process id."""
 
     @property
     def stdin(self) -> IO[bytes] | None:
-        """The pipe whose other end it holds."""
+        """The launcher's end of the pipe to its standard input."""
 
     @property
     def stdout(self) -> IO[bytes] | None:
         """An observer's news; None for others."""
 
     def poll(self) -> int | None:
-        """Its status; None while it runs."""
+        """Its exit status; None while it runs."""
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
+        """Wait for its end; returns its exit status. Raises subprocess.TimeoutExpired."""
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it."""
@@ -46,7 +46,7 @@ class Starter(Protocol):
     """Starts the process of a role with the file of its brief; an observer's news come on `stdout`."""
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        """Start it. Raises OSError."""
+        """Start it. Raises OSError if the system cannot."""
 
 
 def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:

@@ -43,6 +43,10 @@ class Mailbox:
                 self._waiting[sender] = waiting
         self._queue.put((sender, news))
 
+    def __len__(self) -> int:
+        """How many messages wait."""
+        return self._queue.qsize()
+
     def get(self, timeout: float | None = None) -> tuple[str, bytes | bool]:
         """Wait for the next message. Raises Empty after `timeout` seconds, MalformedMessage if a sender has sent too much."""
         if self._flooded is not None:

@@ -174,9 +174,9 @@ class Session:
             door = _once(door_of(brief))
             once = zenoh.Config.from_json5(json.dumps(door.config))
             first = connected(door, self.patience, meanwhile, clock)
-            self._connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
+            self.connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
         else:
-            self._connection = Connection(_listening(listen, brief.identity, config), None)
+            self.connection = Connection(_listening(listen, brief.identity, config), None)
         self._outlets: dict[str, Outlet] = {}
         self._kept: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
@@ -199,7 +199,7 @@ class Session:
         if self._lifeline is not None:
             self._lifeline.release()
         self._heartbeat.stop()
-        self._connection.close()
+        self.connection.close()
 
     def _complain(self, error: MalformedMessage | Gap) -> None:
         """Tell the observer which message cannot be read, and why; wait a moment for it to end the run."""
@@ -223,7 +223,7 @@ class Session:
 
     def _mistaken(self) -> None:
         """Handle a message that arrived under another key: the connection confuses the two keys."""
-        self._connection.renew()
+        self.connection.renew()
 
     @property
     def dropped(self) -> int:
@@ -232,15 +232,15 @@ class Session:
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key; read its messages in order with `recv`."""
-        return self._connection.add(Inbox(key, self._dropped, self.place, self._room))
+        return self.connection.add(Inbox(key, self._dropped, self.place, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
-        self._connection.add(Funnel(key, self._dropped, receive))
+        self.connection.add(Funnel(key, self._dropped, receive))
 
     def outlet(self, key: str) -> Callable[[bytes], None]:
         """A publisher for one exact key."""
-        self._outlets[key] = self._connection.add(Outlet(key))
+        self._outlets[key] = self.connection.add(Outlet(key))
         return self._outlets[key]
 
     def kept(
@@ -261,16 +261,16 @@ class Session:
 
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Answer questions at one exact key; a thread of Zenoh's calls `receive`, which must only hand the question on."""
-        self._connection.add(Questions(key, self._dropped, receive))
+        self.connection.add(Questions(key, self._dropped, receive))
 
     def watch(self, process: str, changed: Callable[[bool], None]) -> None:
         """Call `changed` with true when a process appears, with false when it leaves; it must only hand that on."""
-        self._connection.add(Watch(self.keys.alive(process), changed))
+        self.connection.add(Watch(self.keys.alive(process), changed))
 
     @property
     def router_id(self) -> str | None:
         """Zenoh id of the connected router; a restarted router has another id."""
-        return next((str(found) for found in self._connection.session.info.routers_zid()), None)
+        return next((str(found) for found in self.connection.session.info.routers_zid()), None)
 
     def attendance(self, processes: Iterable[str]) -> dict[str, bool]:
         """Process → whether it is present, kept up to date by a thread of Zenoh's."""
@@ -321,7 +321,7 @@ class Session:
             self.place.answer(outlet)
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
-        self._connection.appear(self.keys.alive(self._process))
+        self.connection.appear(self.keys.alive(self._process))
         self._heartbeat.start()
 
     def conclude(self) -> None:
@@ -333,7 +333,7 @@ class Session:
         if outlet is not None:
             outlet(over(self.dropped))
         else:
-            self._connection.disappear()
+            self.connection.disappear()
 
     def _unread(self) -> list[str]:
         """The keys that have no reader."""

@@ -1,4 +1,4 @@
-"""The conductor, a part of the observer: waits for all processes, starts the run, reports its progress, ends it."""
+"""The conductor, a part of the observer: waits for all processes, starts the run, passes on their reports, and ends it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from evedrop.live.protocol.commands import Abandon, ControlCommand, End, Start
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 
 _AFTERTHOUGHT_SECONDS = 0.5  # the user who ended a process may be about to end the observer: then the run did not fail
-_ABANDON_SECONDS = 2.0  # for processes to leave when told
+_ABANDON_SECONDS = 2.0  # for processes to leave when told to
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 _END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
-_RETURN_SECONDS = 3.0  # for a process to return that vanished when told to end, without confirming it
+_RETURN_SECONDS = 3.0  # within which a process may return that was told to end and vanished without confirming it
 _ROUTERS_SECONDS = 5.0  # for a router to confirm
 
 
@@ -45,7 +45,7 @@ class Stop:
 
 @final
 class Conductor:
-    """Conducts a run; hands on telemetry and journal as (source, payload), and handles all other messages itself."""
+    """Conducts a run; passes on telemetry and journal as (source, payload), and handles all other messages itself."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class Conductor:
         self._router = self._session.router_id
 
     def start(self) -> None:
-        """Let the sensor begin."""
+        """Tell the sensor to begin."""
         self.command(SENSOR, Start())
 
     def news(self) -> tuple[str, bytes] | None:
@@ -141,7 +141,7 @@ class Conductor:
         return news[0], news[1]
 
     def despair(self, names: Collection[str], patience: float) -> NoReturn:
-        """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if just told to end."""
+        """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if told to end now."""
         self._stop.check(_AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
@@ -150,7 +150,7 @@ class Conductor:
         self._commands[name](command.pack())
 
     def ask(self, command: ControlCommand) -> None:
-        """Send a command to every process that is present and reports."""
+        """Send a command to every process that reports and is present."""
         for name in self.keys:
             if self._present[name]:
                 self.command(name, command)
@@ -160,9 +160,9 @@ class Conductor:
         self._progress(progress(done))
 
     def end(self, patience: float) -> None:
-        """Tell all processes that the run is over, again if they were cut off meanwhile; the routers when the others have left.
+        """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.
 
-        patience: how many seconds to wait for a process that is missing just now.
+        patience: how many seconds to wait for the others: some may be cut off just now.
         """
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
@@ -204,7 +204,7 @@ class Conductor:
             self._hear_out(self._next())
 
     def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
-        """Note which processes are present, and which confirm that the run is over; no other message is due any more."""
+        """Note which processes are present, and which confirm that the run is over; ignore all other messages."""
         if news is not None and isinstance(news[1], bytes):
             message = Reader(self.keys[news[0]], news[1])
             if is_over(message):

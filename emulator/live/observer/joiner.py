@@ -1,4 +1,4 @@
-"""Joins the reports of all processes: slots are complete when every process has reported them."""
+"""Joins the reports of all processes into slots: a slot is complete when every process has reported it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Joiner:
         period: int | None = None,
         check: Callable[[str, Report], None] = lambda _name, _report: None,
     ) -> None:
-        """windows: receiver → slots by which a packet may be late for it; blocks: of the digests of receivers and controller.
+        """windows: receiver → slots by which a packet may be late for it; blocks: receiver or controller → its digests' blocks.
 
         period: the controller's period; None without a controller. check: called with every receiver's report before use.
         """
@@ -46,7 +46,7 @@ class Joiner:
         self._reports = {name: _Column[Report]() for name in windows}
         self._done = 0
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
-        """Receiver, or controller → block, by its first slot → digests."""
+        """Receiver or controller → first slot of a block → its digests, (R, 32)."""
         if period is not None:
             self.digests[CONTROLLER] = {}
 
@@ -74,11 +74,11 @@ class Joiner:
         return {SENSOR: self.sent, ROUTER: self.journaled, **{name: self.reported(name) for name in reporters}}
 
     def complete(self, slots: int) -> bool:
-        """Whether this many slots have been returned, and the controller, if any, has reported them."""
+        """Whether this many slots have been returned and, if there is a controller, it has reported them, too."""
         return self._done == slots and (self._period is None or self._decided == slots)
 
     def decisions(self, telemetry: Reader) -> Floats:
-        """Take the controller's telemetry; returns the seconds that its decisions took."""
+        """Take the controller's telemetry; returns the seconds that each decision took."""
         message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
         self._decided += message.count
         self.digests[CONTROLLER].update(message.digests)
@@ -151,7 +151,7 @@ class Joiner:
 
 
 def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:
-    """Counts of some slots, from parts with their lengths and rows; None if there are none."""
+    """Counts for some slots, from parts with their lengths and rows; 0 for parts without counts; None if no part has any."""
     if all(counts is None for counts, _, _ in parts):
         return None
     return np.concatenate(

@@ -1,6 +1,6 @@
-"""The observer's news to its launcher, including its heartbeat.
+"""Sends the observer's news, including its heartbeat, to the launcher.
 
-The launcher gives up an observer that is silent for half a minute. So the heartbeat has a thread of its own: it goes on
+The launcher gives up on an observer that is silent for half a minute. So the heartbeat has its own thread: it continues
 while the observer imports, computes or writes, however long that takes on a busy machine.
 """
 
@@ -21,13 +21,13 @@ _LINE = threading.Lock()  # one line at a time
 
 
 _TO: list[TextIO] = []
-"""Where the news of a launched observer go; empty before `set_news_apart`, and by hand."""
+"""The stream for a launched observer's news; empty before `set_news_apart`, and if the observer was started by hand."""
 
 
 def set_news_apart(launched: bool) -> None:
     """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the news.
 
-    launched: by a launcher, which reads nothing else. What a package's class prints then goes to the log, too.
+    launched: whether a launcher reads the news, from the former standard output; `print` then writes to the log.
     """
     sys.stdout.flush()
     apart = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -39,7 +39,7 @@ def set_news_apart(launched: bool) -> None:
 
 
 def tell(news: News) -> None:
-    """Write a line to standard output for the launcher; works also without a reader."""
+    """Send an item of news to the launcher, or to standard output if there is none; harmless if nobody reads it."""
     left = memoryview(news.line)
     with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
         to = _TO[0] if _TO else sys.stdout

@@ -37,7 +37,7 @@ from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
-from evedrop.news import ConnectionOutage, RunEnded, RunProgress, Started, ViewOpened
+from evedrop.news import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
 from evedrop.results.held_folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.rows import DigestRows, write_rows
@@ -47,7 +47,7 @@ from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, summary_of
-from evedrop.score.summary import RunEvent, Summary
+from evedrop.score.summary import Summary
 from evedrop.view.scored_slots import open_recording, showing_of, shown
 from evedrop.view.viewer import Viewer, WebAddress
 
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from evedrop.view.recording import ViewRecording
 
 Report = Callable[[Path, int, str], None]
-"""Prints the end of a run from its results folder, its exit status, and the reason of a failure."""
+"""Prints the end of a run, from its results folder, its exit status, and the reason for a failure."""
 _PROGRESS_SECONDS = 0.25
 
 
@@ -111,11 +111,11 @@ class ObservedRun:
         return self._place if self._held is None else self._held.now
 
     def hold(self) -> None:
-        """Open the results folder, to find it again if it is renamed. Raises OSError if it does not exist."""
+        """Open the results folder, so that it is found even if it is renamed. Raises OSError if it does not exist."""
         self._held = HeldFolder(self._place)
 
     def show(self, stand: WebAddress) -> Viewer:
-        """Start a viewer for browsers, and stream the run to it."""
+        """Start a viewer for browsers at this address, which follows the recording of the run."""
         viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
         tell(ViewOpened(viewer.address))
         return viewer
@@ -178,7 +178,7 @@ class ObservedRun:
                     self._misdelivered[OBSERVER] = session.dropped
 
     def _look(self, conductor: Conductor) -> None:
-        """Check whether a process that is present keeps the run waiting."""
+        """Check whether the run stands still because of a process that is present. Raises Silence."""
         done, at = self._joiner.done, self._steering.at
         held = at is not None and done >= at
         present = set(self._scenario.digested) - conductor.absent
@@ -192,12 +192,12 @@ class ObservedRun:
         return Control(self._brief.run, self._brief.router, OPERATOR, part.operator, part.operator_identity)
 
     def _keep(self, scenario: Scenario) -> None:
-        """Replace the scenario; the slots so far satisfy it, too."""
+        """Replace the scenario with one that the operator has amended; it is the same for the slots so far."""
         self._scenario = scenario
         write_resolved(self.folder, scenario)
 
     def _steer(self, conductor: Conductor) -> None:
-        """Handle confirmations of the launcher and questions of the operator, and carry out due events."""
+        """Handle confirmations from the launcher and questions from the operator, and carry out due events."""
         while not self._confirmations.empty():
             self._steering.done(int(self._confirmations.get()))
         while not conductor.questions.empty():
@@ -209,7 +209,7 @@ class ObservedRun:
                 self._recording.note(event.slot, "INFO", event.line)
 
     def _answer(self, conductor: Conductor, question: Question) -> None:
-        """Take a question of the operator; a malformed one is refused and does not harm the run."""
+        """Take a question from the operator; a malformed one is refused and does not harm the run."""
         try:
             order = Order(read_request(OPERATOR, question.payload), question)
         except MalformedMessage as error:
@@ -280,7 +280,7 @@ class ObservedRun:
                 del self._stand_ins[name]
 
     def _news(self, source: str, message: Reader) -> bool:
-        """Whether a message is the due one; after losses, earlier and later ones arrive, too."""
+        """Whether a message is the next one from its source; after losses, earlier and later ones arrive, too."""
         found = message.integer("k")
         if source not in (ROUTER, SENSOR) and is_leaving(message):  # comes before the reports of the slots before it
             return not self._steering.has_left(source, found)
@@ -362,7 +362,7 @@ class ObservedRun:
         return summary_of(self._scenario, self._keeper.totals, digests, ending)
 
     def settle(self, how: str) -> None:
-        """Save all results and the summary to disk. Raises OSError if they cannot be written."""
+        """Compute the summary, and save it and all rows to disk. Raises OSError if they cannot be written."""
         self._digest_rows.write(self._writer)
         self._final = self._summary(how)
         self._writer.settle(self._at, self._final)

@@ -1,6 +1,6 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
-Its news go to standard output, a JSON object a line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
+Its news goes to standard output, one JSON object per line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
 times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
 and `{"event": "ended", "status": …}`. However the run ends, the results folder is complete. An observer started by hand
 then prints the same table and verdict as `evedrop run`.
@@ -39,7 +39,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
     """Run the observer of a brief; returns the exit status of the run.
 
     report: prints the end of a run that was started by hand. serve: HOST:PORT where browsers may see the run, if anywhere.
-    Raises UsageError, BriefError, RunError or Interrupted, if started by hand, as long as the run has not begun.
+    Raises UsageError, BriefError, RunError or Interrupted only before the run has begun, and if started by hand.
     """
     stand = None if serve is None else WebAddress.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
@@ -50,7 +50,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
-    ANSWERS.learn(brief.part.classes)  # so that the observer need not run the classes themselves
+    ANSWERS.learn(brief.part.classes)  # so that the observer need not import the classes themselves
     scenario = Scenario.model_validate(brief.part.scenario)
     observation = ObservedRun(brief, scenario, confirmations, by_hand)
     if by_hand:

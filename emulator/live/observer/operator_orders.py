@@ -1,4 +1,4 @@
-"""Requests of the operator that await an answer, and steps: a held run goes on for some slots."""
+"""The operator's requests that await an answer, and steps, in which a held run goes on for some slots."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Order:
     _question: Question
 
     def done(self, slot: int, said: str) -> None:
-        """Answer that the request takes effect from this slot on."""
+        """Answer that the request takes effect from this slot on; said: what was done, in words."""
         self._question.answer(Answer(slot, said).pack())
 
     def refuse(self, *mistakes: str) -> None:
@@ -33,7 +33,7 @@ class Order:
 
 @dataclass(frozen=True)
 class OperatorStep:
-    """Slots for which the run goes on: from `first`, before which it was held, to before `until`."""
+    """A step: the run goes on from `first`, before which it was held, and is held again before `until`."""
 
     order: Order
     first: int

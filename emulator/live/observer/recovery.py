@@ -1,4 +1,4 @@
-"""Lost connections: which processes were cut off, for how long, and the commands to send the lost messages again.
+"""Recovers from lost connections: notes which processes were cut off and for how long, and has lost messages sent again.
 
 The run waits for a process that vanishes from the network. When all are back, the conductor begins a round: the sensor sends
 its packets again from the first slot that is not joined, the router routes them again, and every process sends its reports
@@ -20,8 +20,8 @@ from evedrop.live.protocol.commands import Again
 from evedrop.names import OBSERVER, RELAY, ROUTER
 from evedrop.news import ConnectionOutage, Tell
 
-_SOON_SECONDS = 0.5  # after which a round without effect is repeated, and twice as long each time
-_IDLE_SECONDS = 10.0  # for which a run may stand still without a reason before a round is tried
+_SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time
+_IDLE_SECONDS = 10.0  # for which a run may stand still without a known reason before a round is tried
 _LONGEST_SECONDS = 30.0
 _REACH_SECONDS = 2.0  # for which a round waits for processes that are back to subscribe to their commands again
 
@@ -47,10 +47,12 @@ class Recovery:
         self._returned: float | None = None
         """When the last missing process was back, if no round has begun since."""
         self._missing: dict[str, tuple[int, float]] = {}
+        """Missing process → the first slot not joined when that was noticed, and the time from which its outage counts."""
         self._back: dict[str, tuple[int, float]] = {}
+        """The same for processes that are back while the run has not gone on yet."""
         self._done = 0
         self._target = 0
-        """Slots below this were under way when a connection was lost."""
+        """Slots below this may have been under way when a connection was lost."""
         self._moved = self._joined = self._clock.monotonic()
         self._longest = 0.0
         self._wait = 0.0
@@ -149,7 +151,7 @@ class Recovery:
         self._conductor.report(self._done)
 
     def give_up(self, done: int) -> None:
-        """Record the outages that are open when the run ends with slot `done`."""
+        """Record the outages that are open when the run ends; all slots below `done` are joined."""
         now = self._clock.monotonic()
         self._close(done, now)
         found = self._missing

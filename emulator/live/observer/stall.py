@@ -1,4 +1,4 @@
-"""Finds the silent process when a run stands still although all processes are on the network.
+"""Finds the process at fault when a run stands still although all processes are on the network.
 
     observer ── waits for reports of the process furthest behind ── waits for a message of … ── waits for no process
 
@@ -27,7 +27,7 @@ _STEP_SECONDS = (
 
 
 def patience_of(longest_outage: float, pace: float, batch: int) -> float:
-    """Seconds for which a process may do nothing while the run waits for it; with a pace, it may have nothing to do."""
+    """Seconds for which a process may do nothing while the run waits for it; longer with a pace, when it may have no work."""
     return max(_LEAST_SECONDS, longest_outage) + 2.0 * pace * batch
 
 
@@ -60,7 +60,7 @@ class Stall:
         held: bool,
         missing: bool,
     ) -> None:
-        """Check whether the run goes on; all slots below `done` are joined. Raises Silence.
+        """Check whether the run goes on; all slots below `done` are joined. Raises Silence if a process has held it up too long.
 
         reported: process → the first slot that it has not reported; beside: processes whose reports are not needed to join
         slots. held: the run is held, and no process has anything to do; missing: some process is not on the network, which

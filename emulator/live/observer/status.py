@@ -1,4 +1,4 @@
-"""The status of a run that goes on, for its operator.
+"""Makes the status of a run in progress, for its operator.
 
 Source: docs/protocol.md.
 """
@@ -16,7 +16,7 @@ from evedrop.score.totals import Totals
 def status_of(
     scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, totals: Totals
 ) -> RunStatus:
-    """The status of a run; done: how many slots are done; rate: slots per second."""
+    """The status of a run; done: how many slots are scored; rate: slots per second."""
     accounts = {name: LinkAccount.of(tally) for name, tally in totals.tallies.items()}
     return RunStatus(
         slot=done,

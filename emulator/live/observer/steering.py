@@ -1,4 +1,4 @@
-"""Holds the run before a slot: when every process has reported all earlier slots, carries out due events, and lets it go on.
+"""Steers a run: when it is held and every process has reported all earlier slots, carries out due events, and lets it go on.
 
 So an event takes effect exactly between two slots, whether it is the scenario's or the operator's. While the sensor holds,
 only packets delayed by links are under way.
@@ -22,11 +22,10 @@ from evedrop.live.protocol.news import ProcessRequest
 from evedrop.loading.amended import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
-from evedrop.news import Held, Tell
+from evedrop.news import Held, RunEvent, Tell
 from evedrop.scenario import Scenario
 from evedrop.scenario.events.effects import Leave, Return
 from evedrop.scenario.events.event import Act
-from evedrop.score.summary import RunEvent
 
 
 @final
@@ -59,14 +58,14 @@ class Steering:
         self._last = -1
         self._changed: set[str] = set()
         self._gone: Go | None = None
-        """The last go, as the sensor was told it."""
+        """The last `Go` that was sent to the sensor."""
         self.paused = False
         """Whether the run stays held until the operator resumes it."""
         self.events: list[RunEvent] = []
         """The events so far."""
 
     def held(self, k: int) -> None:
-        """The sensor holds before slot k. It may report this more than once."""
+        """Take the sensor's report that it holds before slot k, which may come more than once."""
         if k <= self._last:
             return
         self.at, self._last, self._asked = k, k, False
@@ -74,7 +73,7 @@ class Steering:
         self._since = time.monotonic()
 
     def left(self, name: str, k: int) -> None:
-        """A receiver has left before slot k, the first slot of its absence."""
+        """Take the news that a receiver has left before slot k, the first slot of its absence."""
         self._left[name] = k
 
     def has_left(self, name: str, k: int) -> bool:
@@ -82,11 +81,11 @@ class Steering:
         return self._left.get(name) == k
 
     def done(self, number: int) -> None:
-        """The launcher confirms an act on a process; number: of the event."""
+        """Take the launcher's confirmation of an act on a process; number: that of the event, from 1 on."""
         self._confirmed = self._confirmed or number == len(self.events)
 
     def take(self, order: Order, reported: int) -> None:
-        """Take a request of the operator, which is carried out at the next hold; ask the sensor to hold.
+        """Take a request from the operator, which is carried out at the next hold; ask the sensor to hold.
 
         reported: all slots below it are joined.
         """
@@ -102,7 +101,7 @@ class Steering:
     def carry_on(self, reported: int) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
 
-        Raises RunError if the processes do not get there in time.
+        Raises RunError if they do not become possible in time.
         """
         if self.at is None:
             return
@@ -125,7 +124,10 @@ class Steering:
                 return
 
     def over(self, reported: int, *, complete: bool) -> None:
-        """The run has ended: answer all open requests."""
+        """Answer all open requests, because the run has ended.
+
+        reported: all slots below it are joined; complete: whether these are all slots of the run.
+        """
         if self._step is not None:
             said = self._step.passed(reported)
             if complete:
@@ -158,7 +160,7 @@ class Steering:
             )
 
     def _may(self, act: Act) -> bool:
-        """Whether an act may begin: a receiver that is to go must have left, since it may not have seen the hold yet."""
+        """Whether an act may begin: a receiver is ended or stopped only once it has left: it may not have seen the hold yet."""
         return not isinstance(act.effect, Leave) or all(self._left.get(name) == act.at for name in act.names)
 
     def _do(self, k: int, act: Act) -> None:
@@ -224,7 +226,7 @@ class Steering:
         step.order.done(k, f"{step.passed(k)}; held before slot {k}")
 
     def _forget_step(self, k: int, why: str) -> None:
-        """Answer the request for the present step, which will not be completed."""
+        """Answer the request for the present step, if any, which will not be completed."""
         if self._step is not None:
             self._step.order.done(k, f"{self._step.passed(k)}; {why} before the step was over")
         self._step = None
@@ -252,7 +254,7 @@ class Steering:
     def remind(self) -> None:
         """Send the last commands again, which may have been lost with a connection; restart the time limit of the hold.
 
-        The last go is sent also while the sensor holds again: a router that was restarted may still wait at the hold before.
+        The last `Go` is sent even if the sensor holds again: a router that was restarted may still wait at the previous hold.
         """
         self._since = time.monotonic()
         self._go()

@@ -1,4 +1,4 @@
-"""Verifies the receivers' claims against their own reports and against the router's journal.
+"""Verifies the claims of receivers and sensor against the receivers' own reports and the router's journal.
 
 For the recorded trials a receiver reports everything that enters its digests, so the observer computes the digests again.
 For all trials it reports whether it received a packet in each slot, and so does the router. Claims that can be checked
@@ -110,7 +110,7 @@ class Verifier:
                 )
 
     def joined(self, slots: Slots) -> None:
-        """Check joined slots against the journal. Raises Contradiction."""
+        """Check joined slots against the journal. Raises Contradiction if they disagree."""
         for name, receiver in slots.receivers.items():
             self._check_received(name, slots.first, receiver)
             if slots.sent is not None:
@@ -159,7 +159,7 @@ class Verifier:
 
 
 def extent_of(scenario: Scenario, batch: int) -> Extent:
-    """The sizes that messages of a run must have."""
+    """The dimensions of a run, which its messages must have; batch: slots of a report."""
     plant = scenario.driven
     return Extent(
         scenario.slots,

@@ -1,4 +1,4 @@
-"""Briefs: everything that one process may know, written by the launcher and read by the process as its only argument.
+"""Briefs: a brief has everything that one process may know; the launcher writes it, and its path is the only argument.
 
 A brief is `<process>.json`, mode 0600. It holds the keys of the streams that the process owns; only the observer's brief
 holds the scenario's seed.
@@ -48,7 +48,7 @@ class Flow:
     """End-to-end flow control, both in slots."""
 
     window: int = field(metadata=entry(whole(1)))
-    """The sensor stays at most this far ahead of the slowest receiver and of the observer."""
+    """The sensor is at most this far ahead of the slowest receiver and of the observer."""
     batch: int = field(metadata=entry(whole(1)))
     """Telemetry, journal and progress are sent at least this often."""
     longest_outage: float = field(default=30.0, metadata=entry(positive))
@@ -104,17 +104,17 @@ class Brief(Generic[P_co]):
     part: P_co = field(metadata=entry(named(anything)))
     """The role's part of the scenario."""
     first: int = field(default=0, metadata=entry(whole(0, MOST_SLOTS)))
-    """The first slot that this process handles: for a restarted process, where it goes on."""
+    """The first slot that this process handles; above 0 for a restarted receiver."""
     ends_with_stdin: bool = field(metadata=entry(flag))
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
     patience: int = field(default=30, metadata=entry(whole(1)))
-    """Seconds for which it waits for the other processes."""
+    """Seconds for which it waits for the other processes to appear."""
     identity: Identity | None = field(default=None, metadata=inner(Identity, or_null=True))
     """Its identity, if the run's router takes certificates."""
 
     @property
     def batch(self) -> Batch:
-        """Slots and trials."""
+        """The slots and trials of the run."""
         return Batch(self.slots, self.trials, self.first_trial)
 
     @property
@@ -139,12 +139,12 @@ AnyBrief = Brief[Part]
 
 
 def has_part(brief: AnyBrief, kind: type[P]) -> TypeGuard[Brief[P]]:
-    """Whether a brief has this part: whether it is for this role."""
+    """Whether a brief has this kind of part, which says its role."""
     return isinstance(brief.part, kind)
 
 
 def read_brief(path: Path, role: str | None = None) -> AnyBrief:
-    """Read a brief. Raises BriefError if it cannot be read, is readable by others, or is another role's."""
+    """Read and check a brief. Raises BriefError if it is unreadable, readable by others, malformed, or another role's."""
     try:
         with opened(path) as file:
             if os.fstat(file.fileno()).st_mode & 0o077:

@@ -35,12 +35,12 @@ Limits = Sequence[float | None]
 
 
 def encoded(disturbances: Floats) -> str:
-    """Disturbances (slots, q) as a brief has them."""
+    """Disturbances (slots, q) as text for a brief: little-endian float64 in base64."""
     return b64encode(disturbances.astype("<f8").tobytes()).decode()
 
 
 def decoded(disturbances: str, slots: int) -> Floats:
-    """The disturbances of a brief, (slots, q). Raises ValueError if there are not as many in each slot."""
+    """The disturbances of a brief, (slots, q). Raises ValueError if the slots do not all have equally many."""
     return np.frombuffer(b64decode(disturbances), "<f8").reshape(slots, -1)
 
 
@@ -147,11 +147,11 @@ class Wiring:
     acts_on: str = field(metadata=entry(text))
     """`estimate` or `truth`."""
     knows_input: bool = field(metadata=entry(flag))
-    """Whether the legitimate estimator is told the inputs."""
+    """Whether the legitimate estimator receives the inputs."""
 
     @property
     def on_truth(self) -> bool:
-        """Whether the controller is told the true state."""
+        """Whether the controller receives the true state."""
         return self.acts_on == "truth"
 
 

@@ -1,4 +1,4 @@
-"""The part of a brief that belongs to a role: what a process of this role may know of the scenario.
+"""The part of a brief that depends on the role: everything that a process of this role may know of the scenario.
 
 Source: docs/protocol.md, the brief.
 """
@@ -75,11 +75,11 @@ class LinkEntry:
     window: int = field(metadata=entry(_WINDOW))
     changes: Sequence[Change] = field(metadata=entry(_CHANGES, lambda found: [Change(**one) for one in found]))
     outages: Sequence[Sequence[int]] = field(metadata=entry(listed(row(SLOT, SLOT, SLOT))))
-    """[first slot, first slot after, `Fate` of packets] each."""
+    """For each: first slot, first slot after, and the `Fate` of its packets."""
     correlation: tuple[str, float] | None = field(
         metadata=entry(maybe(row(text, number)), lambda found: None if found is None else tuple(found))
     )
-    """[receiver, strength]."""
+    """The receiver whose link's losses these are tied to, and the strength; None if they are independent."""
 
     @classmethod
     def of(cls, schedule: LinkSchedule) -> LinkEntry:
@@ -96,7 +96,7 @@ class LinkEntry:
 
 @dataclass(frozen=True)
 class RouterPart:
-    """What the router knows: all links."""
+    """The router's part: all links, and the credentials of all users."""
 
     role: ClassVar[str] = "router"
     links: Mapping[str, LinkEntry] = field(
@@ -106,7 +106,7 @@ class RouterPart:
     )
     """Receiver → the course of its link."""
     pace: float = field(metadata=entry(positive))
-    """Seconds a slot; 0: as fast as possible."""
+    """Seconds per slot; 0: as fast as possible."""
     users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
     """User → password."""
     leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
@@ -120,12 +120,12 @@ class RouterPart:
     limits: Mapping[str, int] = field(metadata=entry(_SIZES))
     """Kind of key → bytes of its largest message."""
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
-    """The folder in which modules of own classes are looked for first."""
+    """The folder in which modules of classes that are not built in are looked for, after everything installed."""
 
 
 @dataclass(frozen=True)
 class RelayPart:
-    """What the relay knows."""
+    """The relay's part."""
 
     role: ClassVar[str] = "relay"
     users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
@@ -142,7 +142,7 @@ class RelayPart:
 
 @dataclass(frozen=True)
 class SensorPart:
-    """What the sensor knows."""
+    """The sensor's part."""
 
     role: ClassVar[str] = "sensor"
     scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
@@ -153,11 +153,11 @@ class SensorPart:
     holds: Sequence[int] = field(metadata=entry(listed(SLOT)))
     """Slots before which it holds."""
     history: int = field(metadata=entry(_WINDOW))
-    """Slots before the first that is not done which a restarted router must receive again."""
+    """How many slots before the first that is not done a restarted router must receive again."""
     leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
     """As the router's."""
     chart: Chart | None = field(metadata=entry(_CHART, lambda found: None if found is None else Chart(**found)))
-    """Of its watch for attacks on acknowledgements."""
+    """The chart with which it detects attacks on acknowledgements; None if it does not."""
     plant: SensorPlantEntry | None = field(metadata=inner(SensorPlantEntry, or_null=True))
     controller: SensorLoop | None = field(metadata=inner(SensorLoop, or_null=True))
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
@@ -166,7 +166,7 @@ class SensorPart:
 
 @dataclass(frozen=True)
 class LegitimatePart:
-    """What the legitimate estimator knows."""
+    """The legitimate estimator's part."""
 
     role: ClassVar[str] = "legitimate"
     scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
@@ -174,7 +174,7 @@ class LegitimatePart:
     window: int = field(metadata=entry(_WINDOW))
     """Slots by which a packet may be late."""
     outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
-    """First slot, first slot after, and whether it keeps its state."""
+    """For each: first slot, first slot after, and whether it keeps its state."""
     controller: EstimatorLoop | None = field(metadata=inner(EstimatorLoop, or_null=True))
     """None if it has no part in the loop."""
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
@@ -185,12 +185,12 @@ class LegitimatePart:
 
 @dataclass(frozen=True)
 class EavesdropperPart:
-    """What an eavesdropper knows."""
+    """An eavesdropper's part."""
 
     role: ClassVar[str] = "eavesdropper"
     strategy: str = field(metadata=entry(text))
     parameters: Mapping[str, Any] = field(metadata=entry(named(anything)))
-    """Of the strategy."""
+    """The strategy's parameters."""
     window: int = field(metadata=entry(_WINDOW))
     """As the legitimate estimator's."""
     outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
@@ -203,7 +203,7 @@ class EavesdropperPart:
 
 @dataclass(frozen=True)
 class ControllerPart:
-    """What the controller knows."""
+    """The controller's part."""
 
     role: ClassVar[str] = "controller"
     strategy: str = field(metadata=entry(text))
@@ -217,7 +217,7 @@ class ControllerPart:
 
 @dataclass(frozen=True)
 class ObserverPart:
-    """What the observer knows: everything."""
+    """The observer's part: everything about the run."""
 
     role: ClassVar[str] = "observer"
     scenario: Mapping[str, Any] = field(repr=False, metadata=entry(named(anything)))
@@ -232,13 +232,13 @@ class ObserverPart:
     """Whether the run is a shard of a larger one."""
     operator_identity: Identity | None = field(metadata=inner(Identity, or_null=True))
     classes: Mapping[str, Mapping[str, Any]] = field(metadata=entry(named(named(anything))))
-    """The answers of eavesdroppers' own classes, question → answer."""
+    """Question → answer, of eavesdroppers' classes that are not built in."""
 
 
 RoutingPart = RouterPart | RelayPart
 ReceiverPart = LegitimatePart | EavesdropperPart
 ImportingPart = RouterPart | SensorPart | LegitimatePart | EavesdropperPart
-"""Of roles that may import own classes."""
+"""Parts of roles that may import classes that are not built in."""
 Part = RouterPart | RelayPart | SensorPart | LegitimatePart | EavesdropperPart | ControllerPart | ObserverPart
 PARTS: Mapping[str, type[Part]] = {
     kind.role: kind

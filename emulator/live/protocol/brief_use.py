@@ -1,4 +1,4 @@
-"""Checks that a brief can be used, by making the objects of its process once before the process takes part in a run.
+"""Checks that a brief can be used: makes the objects that its process needs once before the process takes part in a run.
 
 Source: docs/protocol.md, the brief.
 """

@@ -17,12 +17,12 @@ from evedrop.model.receiver import Flags
 
 
 def known(name: str, k: int, x: Floats) -> bytes:
-    """Encode what the controller acts on in slot k, (n, R); name: `x_hat` for an estimate, `x` for the true state."""
+    """Encode the state that the controller acts on in slot k, (n, R); name: `x_hat` for an estimate, `x` for the true state."""
     return pack({"k": k, name: x.tobytes()})
 
 
 def read_known(message: Reader, name: str, k: int, shape: tuple[int, int]) -> Floats:
-    """Decode what the controller acts on, which must be of slot k."""
+    """Decode the state that the controller acts on, (n, R), which must be that of slot k."""
     message.slot(k)
     return message.finite(name, shape)
 
@@ -48,7 +48,7 @@ class Decisions:
     first: int
     count: int
     seconds: Floats
-    """Duration of each decision."""
+    """The seconds that each decision took."""
     digests: Mapping[int, Digests]
     """As in `Report`."""
 

@@ -1,4 +1,4 @@
-"""Messages: msgpack maps whose arrays are little-endian bytes. The error for a malformed message names its sender.
+"""Encodes and reads messages: msgpack maps whose arrays are little-endian bytes. Errors name the sender of a malformed message.
 
 Source: docs/protocol.md, messages.
 """
@@ -33,10 +33,10 @@ def pack(fields: Mapping[str, Any]) -> bytes:
 
 @final
 class Reader:
-    """Reads the fields of one message, and checks their types, sizes and ranges."""
+    """Reads the fields of one message. Raises MalformedMessage for a field of another type, size or range."""
 
     def __init__(self, key: str, payload: bytes, fields: Mapping[Any, Any] | None = None, parts: int = _PARTS) -> None:
-        """parts: how many lists and maps a large message may have."""
+        """key: on which it came; fields: if it is unpacked already; parts: how many lists and maps a large message may have."""
         self.key = key
         self._parts = parts
         self._payload = payload
@@ -99,7 +99,7 @@ class Reader:
         return tuple(value)
 
     def array(self, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """A binary field as an array of the shape (read-only)."""
+        """A binary field as a read-only array of this type and shape."""
         value = self._fields.get(name)
         kind = np.dtype(dtype)
         expected = kind.itemsize
@@ -198,12 +198,12 @@ def read_progress(key: str, payload: bytes, sent: int) -> int:
 
 
 def over(dropped: int) -> bytes:
-    """Encode a process's last message: it ends on command. dropped: how many messages it dropped that named another key."""
+    """Encode the last message of a process that ends on command; dropped: how many messages it dropped that named another key."""
     return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
 
 
 def refusal(key: str, why: str) -> bytes:
-    """Encode the message that a process ends because it cannot read a message on a key, with the reason."""
+    """Encode the last message of a process that ends because it cannot read a message on a key; why: the reason."""
     return pack({"refuses": key, "why": why[:_WHY_CHARACTERS]})
 
 

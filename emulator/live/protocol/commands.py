@@ -17,12 +17,12 @@ from evedrop.names import ROUTER, SENSOR
 
 @dataclass(frozen=True)
 class Bounds:
-    """The limits of what a command may name."""
+    """The slots and receivers that a command may name."""
 
     slots: int
     """Of the run."""
     receivers: Collection[str] | None = None
-    """The receivers that it may name, and the observer, to the sensor; None: any."""
+    """The names that it may have: of receivers, and to the sensor also the observer; None: any."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ControlCommand:
 
 @dataclass(frozen=True)
 class Start(ControlCommand):
-    """To the sensor: all processes are there; begin."""
+    """To the sensor: all processes are present; begin."""
 
     do = "start"
 

@@ -50,7 +50,7 @@ def named_in(message: bytes) -> str | None:
 class Dropped:
     """Counts the messages that a process dropped because they name another key than they arrived on; thread-safe.
 
-    mistaken: called when a message names another key: then the connection confuses keys.
+    mistaken: called when a message names another key, which means that the connection confuses keys.
     """
 
     def __init__(self, process: str, mistaken: Callable[[], None] = lambda: None) -> None:

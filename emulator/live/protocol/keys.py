@@ -79,7 +79,7 @@ class RunKeys:
 
 
 def reader_of(key: str) -> str:
-    """The process that reads a key; for inputs, which the legitimate estimator may read, too, the sensor."""
+    """The process that reads a key; the sensor for inputs, which the legitimate estimator may read, too."""
     kind, _, name = "/".join(key.split("/")[2:]).partition("/")
     if kind == "ack":
         return ROUTER if name == "sent" else SENSOR

@@ -1,4 +1,4 @@
-"""The largest sizes of a run's messages, by kind: a router drops larger ones, and no process accepts them.
+"""The size limits of a run's messages, by kind: a router drops larger messages, and no process accepts them.
 
 Source: docs/protocol.md, limits.
 """
@@ -29,7 +29,7 @@ class Sizes:
     trials: int
     recorded: int
     batch: int
-    """The most slots of a report."""
+    """The largest number of slots in a report."""
     window: int
     """The longest window of the receivers, in slots."""
     receivers: int
@@ -67,7 +67,7 @@ class Sizes:
 
 
 def low_pass(run: str, kinds: Mapping[str, int]) -> list[ZenohConfig]:
-    """The `low_pass_filter` section of a router's Zenoh configuration, which drops larger messages."""
+    """The `low_pass_filter` section of a router's Zenoh configuration, which drops larger messages; kinds: `Sizes.of_kinds`."""
 
     def rule(name: str, keys: list[str], size: int, messages: list[str]) -> ZenohConfig:
         return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": keys, "size_limit": size}

@@ -1,6 +1,6 @@
 """The lines that an observer writes for its launcher: JSON objects with `event` and the entries of that kind of news.
 
-Kinds that only the launcher needs are defined here; the others, `evedrop.news`, are handed on to be shown.
+Kinds that only the launcher needs are defined here; it passes the others, which are in `evedrop.news`, on to be shown.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class ProcessRequest(News):
     first: int = field(metadata=entry(SLOT))
     """The first slot that a restarted process handles."""
     number: int = field(metadata=entry(SLOT))
-    """By which the launcher confirms it."""
+    """The number with which the launcher confirms it."""
 
 
 @dataclass(frozen=True)
 class RunOver(News):
-    """All slots are done, and the processes are told to leave."""
+    """All slots are done, and the processes will be told to leave."""
 
     event = "over"
 
@@ -78,7 +78,7 @@ def read_news(line: bytes) -> News:
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     if not isinstance(found, dict) or not isinstance(event := found.pop("event", None), str) or event not in _KINDS:
-        raise ValueError(f"it is no object with an event of {', '.join(_KINDS)}")
+        raise ValueError(f"it is not an object with an event of {', '.join(_KINDS)}")
     kind = _KINDS[event]
     expect(table_of(kind), "", found)
     return read(kind, found)

@@ -1,4 +1,4 @@
-"""The status of a run in progress, which its observer tells an operator.
+"""The status of a run in progress, which its observer sends to an operator on request.
 
 Source: docs/protocol.md, request and answer.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 from evedrop.entries import SLOT, entry, flag, listed, maybe, named, positive, read, table_of, text
-from evedrop.score.summary import RunEvent
+from evedrop.news import RunEvent
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class LinkStatus:
     offered: int = field(metadata=entry(SLOT))
     delivered: int = field(metadata=entry(SLOT))
     fraction: float | None = field(metadata=entry(maybe(positive)))
-    """Of the offered packets, those that were delivered; None if none was offered."""
+    """The fraction of the offered packets that was delivered; None if none was offered."""
 
     @classmethod
     def of(cls, offered: int, delivered: int) -> Self:
@@ -42,12 +42,12 @@ def _events(found: Sequence[Mapping[str, Any]]) -> list[RunEvent]:
 
 @dataclass(frozen=True)
 class RunStatus:
-    """How a run is going."""
+    """The state of a run in progress."""
 
     slot: int = field(metadata=entry(SLOT))
     """The first slot that is not scored."""
     slots: int = field(metadata=entry(SLOT))
-    """Of the run."""
+    """The number of slots of the run."""
     slots_per_second: float = field(metadata=entry(positive))
     state: str = field(metadata=entry(text))
     """`running`, `held` or `paused`."""
@@ -64,13 +64,13 @@ class RunStatus:
         yield f"slot {self.slot} of {self.slots}, {self.slots_per_second:,.0f} slots/s, {state}"
         there = ", ".join(name for name, is_there in self.processes.items() if is_there)
         missing = ", ".join(name for name, is_there in self.processes.items() if not is_there)
-        yield f"processes: {there}" + (f"; not there: {missing}" if missing else "")
+        yield f"processes: {there}" + (f"; not on the network: {missing}" if missing else "")
         yield from (f"link {name}: {link}" for name, link in self.links.items())
         yield from (f"event at slot {one.slot}: {one.event} (by the {one.by})" for one in self.events)
 
 
 def status_of_shards(statuses: Sequence[RunStatus]) -> RunStatus:
-    """The status of a run in shards: the slowest one's; processes that are present in all shards; and all packets."""
+    """The status of a run in shards: the slowest one's slot; processes present if they are in all shards; and all packets."""
     slowest = min(statuses, key=lambda status: status.slot)
     processes = {name: all(one.processes[name] for one in statuses) for name in slowest.processes}
     links = {

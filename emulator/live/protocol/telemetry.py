@@ -59,9 +59,9 @@ class Truth:
 
     first: int
     x: Floats
-    """(c, n, R)."""
+    """States as they are sent, (c, n, R)."""
     nu: Flags
-    """(c, R)."""
+    """ν, (c, R)."""
     sent: Flags | None = None
     """Whether a packet was sent, (c, R); None if the scheme sends in every slot."""
     alarms: Flags | None = None
@@ -140,9 +140,9 @@ class Report:
 
     first: int
     x_hat: Floats
-    """(c, n, R)."""
+    """Estimates, (c, n, R)."""
     action: Codes
-    """(c, R)."""
+    """`Action`, (c, R)."""
     P: Floats
     """Believed covariance of the recorded trials, (c, n, n, recorded)."""
     trace: Floats

@@ -1,6 +1,6 @@
-"""The slot that a process is at and the keys on which it waits for messages, reported when the observer asks.
+"""A process's report, on request, of the slot that it is at and of the keys on which it waits for messages.
 
-Only by asking all processes can a connected process that does nothing be told from processes that wait for it.
+Only by asking all processes can the observer tell a connected process that does nothing from those that wait for it.
 
 Source: docs/protocol.md, silence.
 """
@@ -67,11 +67,11 @@ class Place:
             self.waits = ()
 
     def ask(self) -> None:
-        """Take a question of the observer."""
+        """Take a question from the observer."""
         self._asked.put(None)
 
     def answer(self, put: Callable[[bytes], None]) -> None:
-        """Start to answer questions, on a thread of its own."""
+        """Start a thread that answers the questions; put: sends an answer."""
 
         def go_on() -> None:
             while True:

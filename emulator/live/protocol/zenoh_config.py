@@ -5,4 +5,4 @@ from __future__ import annotations
 from typing import Any
 
 ZenohConfig = dict[str, Any]
-"""A JSON object, whose entries only Zenoh knows."""
+"""A JSON object whose entries Zenoh defines."""

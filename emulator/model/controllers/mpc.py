@@ -57,13 +57,14 @@ class Mpc(Controller):
         import osqp  # noqa: PLC0415 - an optional dependency, and a tenth of a second for those that do not need it
 
         self._programme = programme = _Programme(assignment)
-        self._solvers = []
+        self.solvers: list[osqp.OSQP] = []
+        """One per trial."""
         for _ in range(trials):
             solver = osqp.OSQP()
             solver.setup(
                 programme.weights, programme.linear, programme.rows, programme.lower, programme.upper, **_SETTINGS
             )
-            self._solvers.append(solver)
+            self.solvers.append(solver)
         self._solved = int(osqp.SolverStatus.OSQP_SOLVED)
         self._u = np.zeros((assignment.plant.inputs, trials))
 
@@ -99,7 +100,7 @@ class Mpc(Controller):
         """The first of the best inputs of the horizon, for each trial by its own solver."""
         programme = self._programme
         decided = self._u.copy()
-        for r, solver in enumerate(self._solvers):
+        for r, solver in enumerate(self.solvers):
             linear, lower, upper = programme.at(x_hat[:, r], d if d.ndim == 1 else d[:, r], self._u[:, r])
             solver.update(q=linear, l=lower, u=upper)
             found = solver.solve(raise_error=False)

@@ -32,9 +32,9 @@ class Fate(IntEnum):
     LATE = 5
     """Delayed by more slots than the receiver accepts."""
     DOWN = 6
-    """Its receiver was down when it arrived."""
+    """Its receiver was down in a slot from its sending to its arrival."""
     PAUSED = 7
-    """Its receiver was paused when it arrived."""
+    """Its receiver was paused in such a slot."""
     UNDERWAY = 8
     """Still under way when the run ended."""
     UNSENT = 9

@@ -12,7 +12,7 @@ from evedrop.scenario.events.event import Act, EventKind, Fault, Names, spoken
 
 
 def cut_off(event: EventKind) -> Iterator[Act]:
-    """The receivers of an event are cut off, and healed when it ends."""
+    """The acts of an event that cuts off its receivers, and heals their links when it ends."""
     names = spoken(event.names)
     yield Act(event.first, Cut.kind, event.names, f"{Cut.kind} {names}", LinkCut())
     if event.to is not None:

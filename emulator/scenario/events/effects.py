@@ -1,4 +1,6 @@
-"""The effects that an event can have on links, receivers and processes. Code that carries them out knows no kinds of event.
+"""The effects that an event can have on links, receivers and processes.
+
+The code that carries them out does not know the kinds of event.
 
 Source: docs/architecture.md, events.
 """
@@ -15,7 +17,7 @@ from evedrop.names import ProcessAction
 
 @dataclass(frozen=True)
 class Nothing:
-    """Only a line in the journal."""
+    """No effect but the event's line."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class LinkSettings:
     """A link has other settings from now on."""
 
     entries: Mapping[str, Any] | None
-    """The changed entries of the link's table, on top of earlier ones; None restores the link as it was at first."""
+    """The changed entries of the link's table, in addition to earlier changes; None restores the link as it was at first."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Leave:
     """Why its packets are lost."""
     action: ProcessAction
     keeps_state: bool = False
-    """Whether it follows the slots while it is away, as a process does that is stopped."""
+    """Whether its belief continues from its last one while it is away, as for a paused process; otherwise from the prior."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,12 @@ class Return:
     """A receiver is back."""
 
     reason: Fate
-    """Of the absence that ends."""
+    """The reason of the absence that ends."""
     action: ProcessAction
     after: str
     """The entry of the event that must have begun the absence."""
     keeps_state: bool = False
-    """False: it restarts from the prior of the slot in which it went away."""
+    """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
 Effect = Nothing | LinkSettings | LinkCut | LinkHealed | Jamming | Leave | Return

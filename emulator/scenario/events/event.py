@@ -1,4 +1,4 @@
-"""The base class of the kinds of event: when an event happens, and what a kind says about itself.
+"""The base class of the kinds of event: the time of an event, and the properties of its kind.
 
 Source: docs/scenario.md, events; docs/your-own.md, an event.
 """
@@ -30,11 +30,11 @@ class Act:
 
     at: int
     entry: str
-    """The entry of the event that mistakes about it name."""
+    """The entry of the event that messages about a mistake in this act name."""
     names: tuple[str, ...]
-    """The receivers it is done to."""
+    """The receivers it concerns."""
     said: str
-    """The line of a journal."""
+    """Its line in the list of events."""
     effect: Effect
 
 
@@ -43,13 +43,13 @@ class Fault:
     """How a nemesis draws events of a kind."""
 
     place: int
-    """Among the kinds that a draw chooses from: another place changes the faults of every seed."""
+    """Its place among the kinds that a draw chooses from; another place would change the faults of every seed."""
     together: bool = False
-    """Whether one event happens to several receivers, for each of which a coin decides."""
+    """Whether one event hits several receivers; a coin decides for each of them."""
     needs: Mapping[str, str] = field(default_factory=dict)
-    """Entries of `[nemesis]` that the event needs → what they are."""
+    """Entry of `[nemesis]` that the event needs → a description for the message if it is missing."""
     may_have: tuple[str, ...] = ()
-    """Entries of `[nemesis]` that the event has if they are given."""
+    """Entries of `[nemesis]` that the event takes over if they are given."""
 
     @property
     def entries(self) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ class Surroundings:
     scheme: type[Scheme] | None
     scheme_name: str
     attack: str | None
-    """On acknowledgements; `none` if there is none."""
+    """The attack on acknowledgements; `none` if there is none."""
 
 
 class When(Table):
@@ -91,7 +91,7 @@ class EventKind(When):
     fault: ClassVar[Fault | None] = None
     """How a nemesis draws it; None if it does not."""
     alone: ClassVar[Mapping[str, str]] = {}
-    """Entries besides `kind` → the mistake where such an entry is given without any kind that has it."""
+    """Entry besides `kind` → the mistake if it is given without a kind that has it."""
 
     @abstractmethod
     def acts(self) -> Iterator[Act]:
@@ -99,7 +99,7 @@ class EventKind(When):
 
     @model_validator(mode="after")
     def _acts_are_usable(self) -> Self:
-        """Report what is wrong with the acts of a package's class before anybody carries them out."""
+        """Refuse an event whose acts cannot be carried out: its class may come from a package."""
         try:
             _expect_acts(list(self.acts()))
         except Exception as error:
@@ -109,13 +109,13 @@ class EventKind(When):
         return self
 
     def compared(self, surroundings: Surroundings) -> Iterator[Found]:
-        """Mistakes that show only with other tables. Slots, receivers and changes of links are checked for every kind."""
+        """Mistakes that only show with other tables. Slots, receivers and changed links are checked elsewhere, for every kind."""
         del surroundings
         yield from ()
 
     @classmethod
     def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
-        """Mistakes that show only among all events of this kind; events: each with its number."""
+        """Mistakes that only show when all events of this kind are compared; events: each with its number."""
         del events
         yield from ()
 
@@ -138,12 +138,12 @@ class EventKind(When):
         return slot
 
     def begin(self, said: str, effect: Effect) -> Act:
-        """Its beginning."""
+        """The act with which it begins."""
         return Act(self.first, self.kind, self.names, said, effect)
 
 
 def _expect_acts(acts: Sequence[object]) -> None:
-    """Raise NoAnswer unless these are acts, and those that concern receivers name them."""
+    """Raise NoAnswer unless these are acts, at least one, and each names as many receivers as its effect needs."""
     if not acts:
         raise NoAnswer("acts() gave none; expected an Act, or several")
     for act in acts:
@@ -156,5 +156,5 @@ def _expect_acts(acts: Sequence[object]) -> None:
 
 
 def spoken(names: Sequence[str]) -> str:
-    """Receivers in a line of a journal."""
+    """Receivers in the line of an act."""
     return ", ".join(names)

@@ -17,7 +17,7 @@ _JAMMED = "acknowledgements"
 
 
 class Jam(EventKind):
-    """`jam`: the attack goes on only during such events."""
+    """`jam`: the attack lasts only during such events."""
 
     jam: Annotated[str, Field(examples=[_JAMMED])]
 
@@ -32,7 +32,7 @@ class Jam(EventKind):
             yield Act(self.to, self.kind, (), "acknowledgements are no longer attacked", Jamming(on=False))
 
     def compared(self, surroundings: Surroundings) -> Iterator[Found]:
-        """There must be acknowledgements and an attack on them."""
+        """Mistakes unless there are acknowledgements and an attack on them."""
         scheme = surroundings.scheme
         if self.jam != _JAMMED:
             yield "jam", f"is {as_toml(self.jam)}; expected {as_toml(_JAMMED)}"
@@ -44,7 +44,7 @@ class Jam(EventKind):
 
     @classmethod
     def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
-        """An attack must end before the next one begins."""
+        """Mistakes where an attack begins before the previous one has ended."""
         jams = sorted(((event.first, event.to, i) for i, event in events), key=lambda one: one[0])
         for (_, to, _), (first, _, i) in pairwise(jams):
             if to is None or to > first:

@@ -23,7 +23,7 @@ def _restart(event: EventKind, at: int, state: str | None) -> Act:
 
 
 class Kill(EventKind):
-    """`kill`: the receiver's process is ended. Without an end or a restart it does not come back."""
+    """`kill`: the receiver's process is ended. It comes back at the end of the event, or with a restart."""
 
     kill: Annotated[str, Field(examples=["legitimate"])]
     state: State = None

@@ -1,4 +1,4 @@
-"""`note`: a line in the journal."""
+"""`note`: a line in the list of events."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evedrop.scenario.events.event import Act, EventKind
 
 
 class Note(EventKind):
-    """`note`: nothing happens; the text appears in the journal."""
+    """`note`: nothing happens; the text appears in the list of events."""
 
     note: Annotated[str, Field(examples=["the door is opened"])]
 

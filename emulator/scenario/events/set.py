@@ -14,7 +14,7 @@ from evedrop.scenario.words import as_toml
 
 
 class Set(EventKind):
-    """`link` and `set`: the link's entries change. At the end, all changes that events have made to the link are undone."""
+    """`link` and `set`: entries of the links change. At the end, all changes that events have made to them are undone."""
 
     link: Annotated[Names, Field(examples=["legitimate"])]
     set: Annotated[dict[str, Any], Field(examples=[{"quality": 0.2}])]
@@ -31,7 +31,7 @@ class Set(EventKind):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """No link, and no changes."""
+        """A missing link, and an empty set of changes."""
         found: list[Found] = []
         if table.get("link") is None:
             found.append(("link", 'is missing; expected the link that is changed, such as link = "legitimate"'))

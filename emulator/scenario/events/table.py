@@ -1,6 +1,6 @@
-"""`[[event]]` as a table with the entries of all kinds: checked as a whole, then made an event of its kind.
+"""`[[event]]` as a table with the entries of all kinds: checked as a whole, then turned into an event of its kind.
 
-So an entry of a wrong kind or type, two kinds at once and a wrong time are all reported together.
+So an unknown entry, a value of the wrong type, two kinds at once and a wrong time are all reported together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from evedrop.scenario.words import listed
 
 
 class EventTable(When):
-    """The entries of some kinds of event; all of them may be missing."""
+    """A table with the entries of these kinds of event; any entry may be missing."""
 
     kinds: ClassVar[Mapping[str, type[EventKind]]]
     broken: ClassVar[Mapping[str, str]]
@@ -28,7 +28,7 @@ class EventTable(When):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes unless exactly one thing happens, at a time that is stated in one way."""
+        """Mistakes unless there is exactly one kind, with its time stated in one way."""
         return [*cls._what_mistakes(table), *cls._when_mistakes(table)]
 
     @classmethod
@@ -69,7 +69,7 @@ class EventTable(When):
 
 
 def event_table(entries: Iterable[str] | None = None) -> type[EventTable]:
-    """The table of the built-in kinds; of packages' kinds too if some of these entries are not built in, or for None."""
+    """The table of the built-in kinds; also of packages' kinds, if any of these entries is not built in, or for None."""
     built_in = _table_of(tuple(EVENTS.items()), ())
     if entries is not None and set(entries) <= set(built_in.entries()):
         return built_in
@@ -84,7 +84,7 @@ def event_table(entries: Iterable[str] | None = None) -> type[EventTable]:
             if getattr(kind, "kind", None) == name and name in kind.own_entries():
                 kinds[name] = kind
             else:
-                broken[name] = f", whose class {kind.__name__} has not that kind and entry; expected both"
+                broken[name] = f", whose class {kind.__name__} does not have that kind and that entry; expected both"
     return _table_of(tuple(kinds.items()), tuple(broken.items()))
 
 

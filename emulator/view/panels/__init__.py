@@ -1,4 +1,4 @@
-"""The panels of the view, one file for each. An installed package adds panels by entry points of the group `evedrop.panels`."""
+"""The panels of the view, one file each. An installed package adds panels with entry points in the group `evedrop.panels`."""
 
 from __future__ import annotations
 

@@ -22,18 +22,18 @@ class ApplicationPanels(ViewPanel):
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
-        """For a closed loop with an application that has panels."""
+        """Only for a closed loop with an application that has panels."""
         return bool(scene.panels)
 
     def views(self) -> Iterator[PlacedView]:
-        """Those of the plant on the left, those of what receivers believe on the right."""
+        """Panels of the plant on the left, panels of the receivers' beliefs on the right."""
         for panel in self.scene.panels:
             span = None if panel.span is None else rrb.ScalarAxis(range=panel.span, zoom_lock=True)
             view = curves_view(panel.title, panel.path, whole_run(self.scene), span)
             yield PlacedView(view, "right", 1.2) if panel.beside else PlacedView(view, "left")
 
     def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
-        """As the application describes; a receiver's colour where it gives none."""
+        """The styles that the application describes; a receiver's own colour if it gives none."""
         colours = {shown.name: colour(i) for i, shown in enumerate(self.scene.receivers)}
         found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
         for panel in self.scene.panels:
@@ -47,7 +47,7 @@ class ApplicationPanels(ViewPanel):
         return found
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """Every curve; points in all their slots."""
+        """A column for every curve: lines are thinned, points are not."""
         if slots.moved is None:
             return
         for panel in self.scene.panels:

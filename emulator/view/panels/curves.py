@@ -1,4 +1,4 @@
-"""What panels with curves have in common: axes, views, styles, logarithms."""
+"""Shared by panels with curves: axes, views, styles, logarithms."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from evedrop.view.column import Column, scalars
 from evedrop.view.palette import Colour
 from evedrop.view.scene import Scene
 
-_WINDOW = 105  # slots; with a slot below four pixels, Rerun merges it with its neighbours to grey
+_WINDOW = 105  # slots; below four pixels a slot, Rerun merges neighbouring slots into grey
 _ROOM = 25  # slots to the right of the present, kept free for the legend
 _MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
 
-# Where slots share a pixel: the mean of logarithms would be far below the logarithm of the mean.
+# For slots that share a pixel: the mean of their logarithms would be far below the logarithm of their mean.
 LARGEST = rr.components.AggregationPolicy.Max
 
 
@@ -41,7 +41,7 @@ def whole_run(scene: Scene) -> rrb.TimeAxis:
 
 
 def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis, *, legend: bool) -> rrb.TimeSeriesView:
-    """The curves below some paths, with or without the legend of receivers.
+    """A view of the curves below some paths, with or without the legend of receivers.
 
     One legend serves all panels: a receiver has the same colour in each.
     """
@@ -55,7 +55,7 @@ def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis, *, legend: 
 
 
 def curves_view(title: str, path: str, axis: rrb.TimeAxis, values: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
-    """The curves below a path, with a legend; values: the vertical axis."""
+    """A view of the curves below a path, with a legend; axis: horizontal; values: the vertical axis, by default automatic."""
     legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
     return rrb.TimeSeriesView(name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=legend)
 
@@ -67,15 +67,15 @@ def line_style(label: str, bright: Colour, width: float, *, steps: bool = False)
 
 
 def thinned(scene: Scene, slots: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Offsets of the slots that a curve over the whole run is drawn at."""
+    """The offsets of those slots at which a curve over the whole run is drawn."""
     return np.flatnonzero(slots % math.ceil(scene.slots / _MOST_POINTS) == 0)
 
 
 def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats) -> Iterator[Column]:
-    """log10 of squared errors or traces (c,), without those that are NaN.
+    """log10 of squared errors or traces (c,), without NaNs.
 
-    Everything below a floor is raised to it, because a state that was received is known exactly. The floor is a decade below one
-    step's noise, or two for a mean over trials with and without errors.
+    Smaller values are raised to a floor: after a state was received, the error is 0. The floor is one decade below one step's
+    noise; two decades for a mean over several trials, since some trials may have no error.
     """
     known = ~np.isnan(values)  # no theory covers some links
     if known.any():

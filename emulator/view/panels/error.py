@@ -1,4 +1,4 @@
-"""The squared error of each receiver, mean over trials."""
+"""The panel of the squared error of each receiver, mean over trials."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _PATH = "error"
 
 @final
 class SquaredError(ViewPanel):
-    """|x − x̂|², logarithmic: of recent slots, or of the whole run of a closed loop."""
+    """|x − x̂|² on a logarithmic scale: in recent slots, or in the whole run of a closed loop."""
 
     def views(self) -> Iterator[PlacedView]:
-        """With the legend of receivers, unless an application's panel above has one."""
+        """One view, with the legend of receivers unless an application's panel above it has one."""
         title = "Squared error |x − x̂|²   log10"
         if self.scene.moving:
             legend = not any(panel.beside for panel in self.scene.panels)
@@ -31,7 +31,7 @@ class SquaredError(ViewPanel):
             yield PlacedView(receivers_view(title, [_PATH], recent_slots(self.scene), legend=True), "left")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
-        """A receiver's colour."""
+        """Each curve in its receiver's colour."""
         return {
             f"{_PATH}/{shown.name}": rr.SeriesLines(
                 names=shown.name, colors=colour(i), widths=1.5, aggregation_policy=LARGEST

@@ -1,4 +1,4 @@
-"""Lines: what was done to the run, and long stretches in which a receiver had no usable packet."""
+"""The panel of events: those of the scenario and the operator, and long stretches without a usable packet."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Events(ViewPanel):
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
 
     def views(self) -> Iterator[PlacedView]:
-        """At the bottom of the right."""
+        """One view, at the bottom of the right side."""
         view = rrb.TextLogView(
             name="Events",
             origin=_PATH,
@@ -42,12 +42,12 @@ class Events(ViewPanel):
         yield PlacedView(view, "right", 0.7 if self.scene.moving else 1.0)
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """What a watcher noticed, for each receiver."""
+        """The events that the watcher of each receiver noticed."""
         for shown, watcher in self._watchers:
             yield from _lines(shown.name, watcher.watch(slots.first, received(shown, slots)))
 
     def notes(self, notes: Sequence[Event]) -> Iterator[Column]:
-        """All of them."""
+        """A line for each note."""
         yield from _lines(_RUN, notes)
 
 

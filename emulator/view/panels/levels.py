@@ -1,4 +1,4 @@
-"""The states of a closed loop: the true ones, and what receivers believe."""
+"""The panels of a closed loop's states: the truth, and every receiver's estimate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evedrop.view.panels.panel import PlacedView, ViewPanel
 from evedrop.view.scene import TRUTH, Scene, SceneSlots
 
 _PATH = "levels"
-_VIEWS = 2  # of the first states; the others are recorded, and not shown
+_VIEWS = 2  # the first states have views; the others are recorded, but not shown
 
 
 @final
@@ -23,18 +23,18 @@ class Levels(ViewPanel):
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
-        """For a closed loop."""
+        """Only for a closed loop."""
         return bool(scene.moving)
 
     def views(self) -> Iterator[PlacedView]:
-        """On the left."""
+        """A view for each of the first two states, on the left side."""
         for i in range(min(self.scene.n, _VIEWS)):
             label = self.scene.states[i] if self.scene.states else f"state {i}"
             title = f"{label}   grey: truth · others coloured as their curves: what they believe"
             yield PlacedView(curves_view(title, f"{_PATH}/{i}", whole_run(self.scene)), "left")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
-        """A receiver's colour; the truth is grey and broad."""
+        """Each estimate in its receiver's colour; the truth grey and wide."""
         found = {}
         for i in range(self.scene.n):
             found[f"{_PATH}/{i}/{TRUTH}"] = line_style("truth", TRUTH_CURVE, 1.8)

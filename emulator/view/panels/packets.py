@@ -1,4 +1,4 @@
-"""What happened to each packet: a lane for the sensor, and one for each receiver."""
+"""The panel of packets: a lane for the sensor, which shows their types, and one for each receiver, which shows their fates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LANES_OF_A_SCREEN = 23.0  # lanes that would fill the usual window from top to 
 
 @final
 class Packets(ViewPanel):
-    """Lanes, which record only changes."""
+    """The lanes of sensor and receivers; only changes are recorded."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -33,7 +33,7 @@ class Packets(ViewPanel):
         self._last = [-1] * len(names)
 
     def views(self) -> Iterator[PlacedView]:
-        """As high as the lanes need; on the left, where two curves stand above it, at most half of the window."""
+        """One view, as high as the lanes need; on the left side, below two views of curves, at most half of the window."""
         view = rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=_PATH, time_view=recent_slots(self.scene))
         receivers = len(self.scene.receivers)
         if self.scene.moving:

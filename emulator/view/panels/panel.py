@@ -20,7 +20,7 @@ from evedrop.view.scene import Scene, SceneSlots
 
 @dataclass(frozen=True)
 class PlacedView:
-    """A view of Rerun's and its place. On each side, views are one above the other."""
+    """A Rerun view and its place. The views of each side are stacked."""
 
     view: rrb.View
     side: Literal["left", "right"]
@@ -29,9 +29,9 @@ class PlacedView:
 
 
 class ViewPanel(ABC):
-    """A panel of the view. A class is registered; each recording makes an instance before the first slot.
+    """A panel of the view. The class is registered; each recording makes an instance of it before the first slot.
 
-    Paths in the recording begin with a word that no other panel uses. Views show entity names, so these are short.
+    Its paths in the recording begin with a word that no other panel uses. Views show entity names, so keep these short.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -39,13 +39,13 @@ class ViewPanel(ABC):
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
-        """Whether the recording of this run has the panel; by default every recording has."""
+        """Whether the recording of this run has the panel; by default always."""
         del scene
         return True
 
     @abstractmethod
     def views(self) -> Iterable[PlacedView]:
-        """Its views; none if it is recorded, and not shown."""
+        """Its views; none if it is recorded but not shown."""
 
     def styles(self) -> Mapping[str, rr.AsComponents]:
         """Path → name, colour and the like, recorded once; by default none, so that Rerun chooses."""
@@ -56,6 +56,6 @@ class ViewPanel(ABC):
         """Its values in the next slots. Calls are in order of slot; the arrays cannot be written to."""
 
     def notes(self, notes: Sequence[Event]) -> Iterable[Column]:
-        """What it shows of lines about the run, such as "cut smart"; by default nothing."""
+        """Its values for lines about the run, such as "cut smart"; by default none."""
         del notes
         return ()

@@ -1,4 +1,4 @@
-"""What moves the plant of a closed loop: its disturbances and inputs."""
+"""The panel of the disturbances and inputs that move the plant of a closed loop."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ _COLOURS: tuple[Colour, ...] = (
 
 @final
 class WhatMovesThePlant(ViewPanel):
-    """Disturbances and inputs within their limits, over the whole run."""
+    """Disturbances, and inputs as the plant's limits clip them, over the whole run."""
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
-        """For a closed loop."""
+        """Only for a closed loop."""
         return bool(scene.moving)
 
     def views(self) -> Iterator[PlacedView]:
-        """At the top of the left."""
+        """One view, at the top of the left side."""
         title = "What moves the plant: " + ", ".join(self.scene.moving)
         yield PlacedView(curves_view(title, _PATH, whole_run(self.scene)), "left", 1.3)
 
     def styles(self) -> dict[str, rr.SeriesLines]:
-        """Steps, because a value holds for its slot."""
+        """Steps, because a value holds for its whole slot."""
         return {
             _curve(label): line_style(label, _COLOURS[i % len(_COLOURS)], 1.4, steps=True)
             for i, label in enumerate(self.scene.moving)
         }
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """A curve for each."""
+        """A curve for each disturbance and input."""
         at = thinned(self.scene, slots.numbers)
         if slots.moved is not None and len(at):
             for label, values in zip(self.scene.moving, slots.moved.values.T, strict=True):

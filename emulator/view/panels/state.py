@@ -1,4 +1,4 @@
-"""The state and its estimates over time, for a process with one state."""
+"""The panel of the state and its estimates over time, for a process with one state."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _PATH = "plane"
 
 @final
 class StateOverTime(ViewPanel):
-    """In place of the state plane. A closed loop has no view of it."""
+    """The state and every estimate, in place of the state plane. Recorded but not shown for a closed loop."""
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
-        """For one state."""
+        """Only for one state."""
         return scene.n == 1
 
     def views(self) -> Iterator[PlacedView]:
-        """At the top of the right."""
+        """One view, at the top of the right side."""
         if not self.scene.moving:
             view = rrb.TimeSeriesView(
                 name="State and estimates",
@@ -38,7 +38,7 @@ class StateOverTime(ViewPanel):
             yield PlacedView(view, "right", 1.75)
 
     def styles(self) -> dict[str, rr.SeriesLines]:
-        """A receiver's colour; the truth is grey and broad."""
+        """Each estimate in its receiver's colour; the truth grey and wide."""
         found = {f"{_PATH}/{TRUTH}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
         for i, shown in enumerate(self.scene.receivers):
             found[f"{_PATH}/{shown.name}"] = rr.SeriesLines(names=shown.name, colors=colour(i), widths=1.5)

@@ -1,4 +1,4 @@
-"""The first two states: the truth, estimates with their recent path, and the ellipses that receivers believe."""
+"""The panel of the first two states: the truth and every estimate with its recent path, and the covariance ellipses believed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TRUTH_TRAIL = 130
 
 @final
 class StatePlane(ViewPanel):
-    """Recorded at the frames of the view only. A closed loop has no view of it."""
+    """The plane of the first two states, recorded only at the view's frames. Recorded but not shown for a closed loop."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -34,11 +34,11 @@ class StatePlane(ViewPanel):
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
-        """For two states or more."""
+        """Only for two states or more."""
         return scene.n > 1
 
     def views(self) -> Iterator[PlacedView]:
-        """At the top of the right."""
+        """One view, at the top of the right side."""
         if self.scene.moving:
             return
         trails: dict[str, rrb.VisibleTimeRanges] = {
@@ -54,7 +54,7 @@ class StatePlane(ViewPanel):
         yield PlacedView(view, "right", 1.75)
 
     def _past(self, slots: int) -> rrb.VisibleTimeRanges:
-        # A trail's piece is recorded at its end, so the oldest piece shown begins a frame earlier.
+        # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.
         reach = max(slots, 4 * plane.stride(self.scene))
         return rrb.VisibleTimeRanges(
             [
@@ -67,11 +67,11 @@ class StatePlane(ViewPanel):
         )
 
     def styles(self) -> dict[str, rr.AsComponents]:
-        """A receiver's colour; the truth is white, and drawn last."""
+        """Each estimate in its receiver's colour; the truth white, on top of the others."""
         found = _point_styles(TRUTH, WHITE, radius=3.5, order=40.0)
         for i, shown in enumerate(self.scene.receivers):
             found |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
-        # Invisible: it is there for the panel to fit to.
+        # Invisible: the view fits its range to it.
         found[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
         return found
 

@@ -1,4 +1,4 @@
-"""The trace of the covariance that each receiver believes, and that theory expects of its error."""
+"""The panel of tr P: of the covariance that each receiver believes, and of the one that theory expects of its error."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _BELIEVED, _THEORY = "trace", "theory"
 
 @final
 class TraceOfP(ViewPanel):
-    """tr P, logarithmic. A closed loop has no view of it."""
+    """tr P on a logarithmic scale. Recorded but not shown for a closed loop."""
 
     def views(self) -> Iterator[PlacedView]:
-        """Below the squared error, whose legend serves."""
+        """One view, below the squared error, whose legend serves both."""
         if not self.scene.moving:
             title = "tr P   log10, bright: believed · dim: theory · bottom: 0"
             yield PlacedView(
@@ -29,7 +29,7 @@ class TraceOfP(ViewPanel):
             )
 
     def styles(self) -> dict[str, rr.SeriesLines]:
-        """A receiver's colour, bright and dim."""
+        """Each receiver's colour: bright for its belief, dim for theory."""
         found = {}
         for i, shown in enumerate(self.scene.receivers):
             bright, label = colour(i), shown.name

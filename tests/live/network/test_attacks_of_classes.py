@@ -147,7 +147,7 @@ def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) 
     written(evedrop.folder)
     command = ["-P", "-m", "evedrop"]  # as the script `evedrop` does, not looking for modules where it was typed
     typed = ("run", "spy.toml", "--view", "off", "--pace", "0.005", "--out", "run")
-    live = Live(evedrop._start(command, typed, {}), evedrop.temporary, evedrop.folder / "run")
+    live = Live(evedrop.start(command, typed, {}), evedrop.temporary, evedrop.folder / "run")
     children = wait_until(lambda: len(found := live.children()) == 5 and found, "five processes")
     assert live.end().status == 0
     reports = spied(evedrop.folder)

@@ -185,14 +185,14 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(1))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(0))])
         assert funnelled.get(timeout=LIMIT_SECONDS) == progress(0)  # so the one before it has arrived too
-        ids = {str(session._connection.session.zid())}
+        ids = {str(session.connection.session.zid())}
         for _ in range(3):
             stage.cable.flap()
             assert [tokens.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
             assert [watched.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
             # One flap may cost two sessions; the news of the second then come early at the next flap.
-            until(lambda: str(session._connection.session.zid()) not in ids, "another session")
-            ids.add(str(session._connection.session.zid()))
+            until(lambda: str(session.connection.session.zid()) not in ids, "another session")
+            ids.add(str(session.connection.session.zid()))
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
         assert [inbox.recv(), inbox.recv()] == [progress(1), progress(2)]
@@ -212,7 +212,7 @@ def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -
 
         def renewed() -> bool:
             stage.router.put(key, enclosed(other, GOOD))
-            return session._connection.openings > 1
+            return session.connection.openings > 1
 
         reads = threading.Thread(target=lambda: list(inbox))
         reads.start()
@@ -251,7 +251,7 @@ def test_zenoh_reconnects_no_session(stage: Stage, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(zenoh, "open", opened)
     with Session(stage.eve) as session:
         stage.cable.flap()
-        until(lambda: session._connection.openings > 1, "another session")
+        until(lambda: session.connection.openings > 1, "another session")
     assert len(seen) > 1
     day = 24 * 3600 * 1000
     assert all(one["period_init_ms"] >= day and one["period_max_ms"] >= day for one in seen), seen

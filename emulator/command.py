@@ -1,4 +1,4 @@
-"""A command of the command line."""
+"""The class of commands of the command line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from evedrop.cli.options import Option
+Option = Callable[[argparse.ArgumentParser], None]
+"""A function that adds an option, or several, to a command's parser."""
 
 
 @dataclass(frozen=True)
@@ -15,9 +16,9 @@ class Command:
 
     name: str
     run: Callable[[argparse.Namespace], int]
-    """Takes the options, and returns the exit status. Slow imports belong into it: all commands are loaded for `--help`."""
+    """Takes the options, and returns the exit status. Slow imports belong inside: all commands are loaded for `--help`."""
     does: str
     """In a few words, for `--help`."""
     options: tuple[Option, ...] = ()
     group: str | None = None
-    """The word before its name, if it is one of several commands about the same thing."""
+    """The word before its name, such as `links` in `links fit`; None if there is none."""
