@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 
 from evedrop.cli.commands import MODULES
 from tests.conftest import Evedrop
 from tests.packages import install
 
-COMMAND = """
-from evedrop.command import Command
-
-def greet(options):
-    print(f"hello {options.name}")
-    return 1
-
-COMMANDS = (Command("greet", greet, "say hello", (lambda parser: parser.add_argument("name"),)),)
-"""
+DOCS = Path(__file__).parents[2] / "docs"
+COMMAND = (DOCS / "your-own.md").read_text(encoding="utf-8").partition("# greeting.py\n")[2].partition("```")[0]
+"""The module of docs/your-own.md."""
 
 
 def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
@@ -25,7 +20,7 @@ def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     assert "greet       say hello" in evedrop.process("--help", env=environment).out
     done = evedrop.process("greet", "you", env=environment)
-    assert (done.status, done.out, done.err) == (1, "hello you\n", "")
+    assert (done.status, done.out, done.err) == (0, "hello you\n", "")
 
 
 def test_a_package_that_is_broken_breaks_no_help(evedrop: Evedrop) -> None:

@@ -23,7 +23,16 @@ pytestmark = pytest.mark.usefixtures("imports_forgotten")
 def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
     """Each is complete in less than 40 lines; a figure with its tally, and an application, in less than 50."""
     blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
-    modules = {"flipped.py", "tracker.py", "shifts.py", "platooning.py", "ratio.py", "dimming.py", "largest.py"}
+    modules = {
+        "flipped.py",
+        "tracker.py",
+        "shifts.py",
+        "platooning.py",
+        "ratio.py",
+        "dimming.py",
+        "largest.py",
+        "greeting.py",
+    }
     assert set(blocks) == modules | {"three.toml", "pyproject.toml"}
     assert all(blocks.pop(name).count("\n") < 49 for name in ("platooning.py", "largest.py"))
     assert all(text.count("\n") < 39 for text in blocks.values())

@@ -241,7 +241,7 @@ def _cut_short() -> dict[str, bytes]:
                 for receiver in scenario.receivers:
                     ones = SlotSums(*(np.ones(1) for _ in fields(SlotSums)))
                     writer.slot_rows(first, receiver, ones, np.zeros(1))
-                writer.write_rows("")
+                writer.write_rows(f"slot {first + 1}")
             found = _files_in(folder)
             raise _Killed
         return found

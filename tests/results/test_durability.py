@@ -256,7 +256,7 @@ def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -
                 first = kept[-1][0]
                 for receiver in NAMES:
                     writer.slot_rows(first, receiver, sums(count), np.zeros(count))
-                writer.write_rows("")
+                writer.write_rows(f"slot {first + count}")
                 kept.append((first + count, sizes(written)))
             folder = shutil.copytree(written, Path(name, "stopped"))
         whole = data.draw(st.integers(0, len(rounds) - 1), label="whole rounds")
