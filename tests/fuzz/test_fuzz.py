@@ -1,6 +1,6 @@
 """Bytes that somebody else made are read or refused in our words: by every reader, whatever they are.
 
-Source: docs/testing.md, changed at random.
+Source: docs/architecture.md, the trust boundary.
 """
 
 from __future__ import annotations

@@ -1,0 +1,74 @@
+"""The status of a run in progress: read, merged over shards, and shown."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import pytest
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.network.operator import Answer, read_answer
+from evedrop.live.protocol.codec import pack
+from evedrop.live.protocol.status import LinkStatus, RunStatus, status_of_shards
+from evedrop.news import RunEvent
+
+KEY = "evedrop/r1/control/observer"
+STATUS = RunStatus(
+    40,
+    80,
+    1234.5,
+    "held",
+    {"sensor": True, "smart": False},
+    {"smart": LinkStatus.of(40, 30), "naive": LinkStatus.of(0, 0)},
+    [RunEvent(9, "cut smart", "operator")],
+)
+
+
+def test_a_status_is_read_as_it_was_sent() -> None:
+    """With links and events as objects."""
+    assert read_answer(KEY, Answer(status=STATUS).pack()).status == STATUS
+
+
+@pytest.mark.parametrize(
+    ("entry", "value", "said"),
+    [
+        ("slot", -1, "status.slot is -1, expected a whole number"),
+        ("slots", "80", "status.slots is '80', expected a whole number"),
+        ("slots_per_second", float("nan"), "status.slots_per_second is nan, expected a finite number"),
+        ("state", 3, "status.state is 3, expected a string"),
+        ("processes", {"sensor": 1}, "status.processes.sensor is 1, expected true or false"),
+        ("processes", {7: True}, "status.processes has the name 7, expected a string"),
+        ("links", {"smart": {"offered": 1}}, "status.links.smart.delivered is missing"),
+        ("links", [], "status.links is list of 0, expected a table"),
+        ("events", [{"slot": 1, "event": "x", "by": None}], "status.events.0.by is None, expected a string"),
+        ("colour", "red", "status.colour is an unknown entry"),
+    ],
+)
+def test_a_malformed_status_is_refused(entry: str, value: Any, said: str) -> None:
+    """With the place and what was expected there."""
+    with pytest.raises(MalformedMessage) as found:
+        read_answer(KEY, pack({"status": {**asdict(STATUS), entry: value}}))
+    assert said in str(found.value)
+
+
+def test_the_lines_say_where_the_run_is_and_what_is_missing() -> None:
+    """A link without packets has no fraction."""
+    assert list(STATUS.lines) == [
+        "slot 40 of 80, 1,234 slots/s, held before slot 40",
+        "processes: sensor; not on the network: smart",
+        "link smart: 30 of 40 packets delivered, 0.7500",
+        "link naive: 0 of 0 packets delivered, –",
+        "event at slot 9: cut smart (by the operator)",
+    ]
+    running = replace(STATUS, state="running", processes={"sensor": True})
+    assert list(running.lines)[:2] == ["slot 40 of 80, 1,234 slots/s, running", "processes: sensor"]
+
+
+def test_the_status_of_shards_is_that_of_the_slowest_with_the_packets_of_all() -> None:
+    """A process is there if it is there in every shard."""
+    ahead = replace(STATUS, slot=60, state="running", processes={"sensor": True, "smart": True}, events=[])
+    found = status_of_shards([ahead, STATUS])
+    assert (found.slot, found.state, found.events) == (40, "held", STATUS.events)
+    assert found.processes == {"sensor": True, "smart": False}
+    assert found.links == {"smart": LinkStatus(80, 60, 0.75), "naive": LinkStatus(0, 0, None)}
