@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from hashlib import sha256
 
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.digest import BLOCK_SLOTS, BeliefLog, RunDigest
+from evedrop.model.digest import BLOCK_SLOTS, BeliefLog, Blocks, PartialDigests, RunDigest
 from evedrop.model.receiver import Belief
 
 
@@ -124,3 +125,26 @@ def test_rows_are_what_was_added() -> None:
             rows = log.rows(first, k + 1)
             for field in ("x_hat", "P", "action"):
                 assert np.array_equal(getattr(rows, field), [getattr(one, field) for one in beliefs[first : k + 1]])
+
+
+@given(cuts=st.lists(st.integers(1, 39), max_size=4), seed=st.integers(0, 99))
+@settings(max_examples=20)
+def test_a_block_may_be_digested_in_parts(cuts: list[int], seed: int) -> None:
+    """Whatever slots the parts have, its digests are those of the whole block."""
+    beliefs = random_beliefs(40, 2, 3, seed)
+    parts = PartialDigests(3)
+    bounds = [0, *sorted(set(cuts)), 40]
+    for first, end in itertools.pairwise(bounds):
+        x_hat, P, action = (np.array([one[i] for one in beliefs[first:end]]) for i in range(3))
+        parts.add(x_hat, P, action)
+    assert np.array_equal(parts.digests(), logged(beliefs, 2, 3)[0])
+
+
+@given(cuts=st.sets(st.integers(1, 699), max_size=4))
+def test_blocks_know_where_each_slot_belongs(cuts: set[int]) -> None:
+    """Blocks follow one another from slot 0 to the end, and end where a multiple of 256 slots or a cut is."""
+    blocks = Blocks(700, sorted(cuts))
+    starts = sorted({0, 256, 512, *cuts})
+    for k in range(700):
+        assert blocks.start(k) == max(start for start in starts if start <= k)
+        assert blocks.end(k) == min([start for start in starts if start > k], default=700)
