@@ -1,0 +1,144 @@
+"""Messages and briefs whose entries have the right types and contradict one another, or the run."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.protocol.keys import RunKeys, reader_of, writer_of
+from evedrop.live.protocol.message_limits import low_pass
+from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
+from tests.live.protocol.test_brief import BRIEFS, refusal
+
+
+def u4(*counts: int) -> bytes:
+    """Counts as a message has them."""
+    return np.array(counts, "<u4").tobytes()
+
+
+def late_packets(fields: dict[str, Any]) -> None:
+    """More than two of every slot that a packet may come from."""
+    fields["late"] = [{"k": 4, "gamma": b"\0"}] * 100
+
+
+def more_used(fields: dict[str, Any]) -> None:
+    """More late packets used than arrived."""
+    fields["late_used"] = np.full((2, TRIALS), 2, "<u2").tobytes()
+
+
+def two_fates(fields: dict[str, Any]) -> None:
+    """A packet that was delivered and lost."""
+    reasons = fields["links"]["legitimate"]["lost"]
+    fields["links"]["legitimate"]["lost"] = {**reasons, next(iter(reasons)): u4(3, 1)}
+
+
+def many_delays(fields: dict[str, Any]) -> None:
+    """More packets by their delay than were offered."""
+    fields["links"]["eve"]["delays"] = u4(6, 1, 0, 0)
+
+
+def negative_seconds(fields: dict[str, Any]) -> None:
+    """A decision that took less than no time."""
+    fields["seconds"] = np.array([-1.0]).tobytes()
+
+
+CONTRADICTIONS = {
+    "delivery": (late_packets, "100 entries in late; expected at most two for each slot from 2 to 4"),
+    "report": (more_used, "more in late_used than in late; expected at most as many late packets used as arrived"),
+    "journal": (two_fates, "fates of legitimate's packets of slot 4; expected 3 fates"),
+    "journal of delays": (many_delays, "more delays than packets of eve; expected at most 6"),
+    "decisions": (negative_seconds, "seconds of -1; expected numbers of at least 0"),
+}
+
+
+@pytest.mark.parametrize("what", CONTRADICTIONS)
+def test_a_message_that_contradicts_itself_is_refused(what: str) -> None:
+    """With what was found and what was expected."""
+    change, said = CONTRADICTIONS[what]
+    name = what.partition(" ")[0]
+    key, read = READERS[name]
+    read(EXAMPLES[name])
+    fields = fields_of(name)
+    change(fields)
+    with pytest.raises(MalformedMessage) as found:
+        read(msgpack.packb(fields))
+    assert found.value.key == key
+    assert said in str(found.value)
+
+
+def test_every_key_has_one_writer_and_a_reader() -> None:
+    """Acknowledgements go from the legitimate estimator to the router, and from there to the sensor."""
+    keys = RunKeys("r1")
+    found = {key: (writer_of(key), reader_of(key)) for key in (keys.acknowledged, keys.acknowledgements, keys.uplink)}
+    assert found == {
+        keys.acknowledged: ("legitimate", "router"),
+        keys.acknowledgements: ("router", "sensor"),
+        keys.uplink: ("sensor", "router"),
+    }
+
+
+def test_a_router_drops_what_is_larger_than_its_kind() -> None:
+    """Puts and deletes of a kind, whatever follows in the key; and an operator's questions and their answers."""
+    rules = low_pass("r1", {"uplink": 70, "telemetry": 900})
+    assert [(rule["id"], rule["messages"]) for rule in rules] == [
+        ("uplink", ["put", "delete"]),
+        ("telemetry", ["put", "delete"]),
+        ("question", ["query"]),
+        ("answer", ["reply"]),
+    ]
+    assert rules[0]["key_exprs"] == ["evedrop/r1/uplink", "evedrop/r1/uplink/**"]
+    assert (rules[0]["size_limit"], rules[1]["size_limit"]) == (70, 900)
+    assert all(rule["flows"] == ["ingress"] for rule in rules)
+
+
+def without_parameter(found: dict[str, Any]) -> None:
+    """The scheme needs it."""
+    del found["part"]["scheme"]["state_probability"]
+
+
+def other_scheme(found: dict[str, Any]) -> None:
+    """The scheme does not know it."""
+    found["part"]["scheme"]["colour"] = 3
+
+
+def other_controller(found: dict[str, Any]) -> None:
+    """There is none of that name."""
+    found["part"]["strategy"] = "pid"
+
+
+def fewer_states(found: dict[str, Any]) -> None:
+    """The plant and the model are not of the same system."""
+    noise = found["part"]["plant"]["noise"]
+    found["part"]["plant"]["noise"] = [row[:-1] for row in noise[:-1]]
+
+
+def no_matrix(found: dict[str, Any]) -> None:
+    """Its rows do not have the same length."""
+    found["model"]["A"] = [[1.0], [0.0, 1.0]]
+
+
+UNUSABLE = {
+    "eavesdroppers/sensor": [(without_parameter, "part.scheme.state_probability is missing")],
+    "acknowledged/sensor": [(other_scheme, "part.scheme.colour is not a parameter of the scheme")],
+    "microgrid/controller": [(other_controller, "part.strategy is pid, expected one of ")],
+    "microgrid/sensor": [(fewer_states, "part.plant"), (no_matrix, "model.A, model.Q or model.initial_covariance")],
+}
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_a_brief_whose_parts_do_not_fit_together_is_refused(name: str, tmp_path: Path) -> None:
+    """With the entry."""
+    for change, said in UNUSABLE[name]:
+        found = copy.deepcopy(BRIEFS[name])
+        assert refusal(found, tmp_path) is None
+        change(found)
+        refused = refusal(found, tmp_path)
+        assert refused is not None
+        assert said in refused, json.dumps(refused)
