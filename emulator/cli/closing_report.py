@@ -11,6 +11,7 @@ from pathlib import Path
 from evedrop.cli.report import print_summary
 from evedrop.errors import UsageError
 from evedrop.loading import load
+from evedrop.output import silence
 from evedrop.results.writer import load_results
 
 
@@ -32,9 +33,13 @@ def print_ending(folder: Path, status: int, how: str) -> None:
 
     status: the exit status of the run; how: why it failed.
     """
-    with contextlib.suppress(UsageError, OSError):
+    try:
         print_results(folder)
         sys.stdout.flush()
+    except UsageError:
+        pass
+    except OSError:
+        silence()  # what is left in its buffer must not fail later
     if status not in {0, 1}:
         with contextlib.suppress(OSError):
             sys.stderr.write(f"evedrop: {how}\n")
