@@ -132,6 +132,26 @@ def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: E
     assert "logs/eve.log" not in report
 
 
+@pytest.mark.parametrize(
+    ("key", "sender"),
+    [
+        ("ack/sent", "legitimate"),
+        ("ack/delivered", "router"),
+        ("uplink", "sensor"),
+        ("telemetry/eve", "eve"),
+        ("control/eve", "observer"),
+    ],
+)
+def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, sender: str) -> None:
+    """By the key that the message was put on, whoever complains of it."""
+    for name in ("legitimate", "router", "sensor", "eve", "observer"):
+        bench.children.start(bench.briefs[name])
+    said = f"malformed message on evedrop/r1/{key}: 3; expected 4"
+    (bench.results / "logs" / "naive.log").write_text(f"evedrop: {said}\n")
+    report = bench.children.failure_report(Exit("naive", 3), RunEnded(3, said))
+    assert report.startswith(f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"), report
+
+
 PROGRESS = RunProgress(3, 2.5, "slots/s", {"eve": float("inf")})
 OUTAGE = ConnectionOutage("router", 3, 5, 0.5)
 

@@ -27,7 +27,9 @@ class Network:
         self.watches: dict[str, Callable[[bool], None]] = {}
         self.told: dict[str, int] = dict.fromkeys(NAMES, 0)
         self.does: dict[str, Callable[[int], None]] = {}
-        """Process → what it does when it is told for the so-many-th time that the run is over."""
+        """Process → what it does when it is told that the run is over, by how often it has been told."""
+        self.unread: set[str] = set()
+        """Keys without a reader."""
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Remember who reads."""
@@ -54,6 +56,10 @@ class Network:
                 self.ends(name)
 
         return put
+
+    def reaches(self, key: str) -> bool:
+        """Whether a key has a reader."""
+        return key not in self.unread
 
     def linked(self) -> bool:
         """Always."""

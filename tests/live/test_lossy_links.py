@@ -142,7 +142,9 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.distance\.link="):
         design(every_model, changes={"legitimate.link": quality})
     links = {f"eavesdroppers.{name}.link": quality for name in scenario()["eavesdroppers"]}
-    design(every_model, changes={"legitimate.link": quality, **links})
+    found = design(every_model, changes={"legitimate.link": quality, **links})
+    # A scenario that is checked already takes the same changes.
+    assert design(load(every_model), changes={"legitimate.link": quality, **links}).trace == found.trace
 
 
 def test_bursts_that_last_too_long_are_a_warning() -> None:

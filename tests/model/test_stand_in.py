@@ -1,4 +1,4 @@
-"""What an eavesdropper's own class says of itself, through a stand-in that checks every answer."""
+"""Stand-ins for eavesdroppers' classes: they check every answer of the class."""
 
 from __future__ import annotations
 

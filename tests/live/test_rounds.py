@@ -1,0 +1,166 @@
+"""When the observer begins rounds of resending, and which outages it lists: with a clock, and connections in the test's hands."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.observer.conductor import Conductor, Stop
+from evedrop.live.observer.recovery import Recovery
+from evedrop.live.observer.stall import patience_of
+from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.commands import Again, ControlCommand
+from evedrop.news import News
+from tests.clock import TestClock
+from tests.live.test_ending import Network
+
+
+class Conducted:
+    """The part of a conductor and of a steering that a recovery uses, with the connections in the test's hands."""
+
+    relayed, at = False, None
+
+    def __init__(self) -> None:
+        self.lost: dict[str, float] = {}
+        self.rounds: list[int] = []
+        self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
+        self.changes: dict[str, Any] = {}
+        self.another_router = False
+        self.unreached: list[str] = []
+        self.clock: Clock = SYSTEM_CLOCK
+
+    @property
+    def missing(self) -> list[str]:
+        """Those that are lost."""
+        return list(self.lost)
+
+    def lose(self, *names: str) -> None:
+        """These vanish."""
+        self.lost |= dict.fromkeys(names, self.clock.monotonic())
+
+    def router_changed(self) -> bool:
+        """As the test says."""
+        return self.another_router
+
+    def command(self, name: str, command: ControlCommand) -> None:
+        """Note the rounds."""
+        if name == "sensor" and isinstance(command, Again):
+            self.rounds.append(command.slot)
+
+    def start(self) -> None:
+        """Nothing to start."""
+
+    def report(self, done: int) -> None:
+        """Nobody to tell."""
+
+    def remind(self) -> None:
+        """Nothing to say again."""
+
+
+def test_losses_that_overlap_are_one_outage() -> None:
+    """One entry for each process that was cut off, from its first loss to when slots are joined again; then another."""
+    conducted, said = Conducted(), list[News]()
+    recovery = Recovery(
+        conducted,  # type: ignore[arg-type]
+        conducted,  # type: ignore[arg-type]
+        Flow(32, 8, 30.0),
+        0.0,
+        said.append,
+    )
+    recovery.look(10)
+    for lost in (
+        ("smart",),
+        ("smart", "sensor"),
+        ("smart",),
+    ):  # lost and back three times, and no slot joined meanwhile
+        conducted.lose(*lost)
+        recovery.look(10)
+        conducted.lost = {}
+        recovery.look(10)
+    assert conducted.rounds == [10, 10, 10]
+    assert said == []
+    recovery.look(11)
+    conducted.lose("router", "sensor", "smart")
+    recovery.look(12)
+    conducted.lost, conducted.another_router = {}, True
+    recovery.look(12)
+    recovery.look(13)
+    found = [(one.process, one.slot, one.until) for one in recovery.outages]
+    assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
+    assert said == recovery.outages
+
+
+def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, pace: float = 0.0) -> Recovery:
+    """With batches of 8 slots."""
+    conducted.clock = clock
+    return Recovery(
+        conducted,  # type: ignore[arg-type]
+        conducted,  # type: ignore[arg-type]
+        Flow(32, 8, longest_outage),
+        pace,
+        lambda _: None,
+        clock,
+    )
+
+
+def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> None:
+    """A token that is back may be faster than the subscription behind it; after some seconds the round begins all the same."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, 30.0)
+    recovery.look(10)
+    for there_after in (1.0, 9.0):
+        conducted.rounds.clear()
+        conducted.lose("router", "sensor")
+        recovery.look(10)
+        conducted.lost, conducted.unreached = {}, ["router"]
+        recovery.look(10)
+        clock.now += there_after
+        assert conducted.rounds == []
+        if there_after < 2.0:
+            recovery.look(10)
+            assert conducted.rounds == []
+            conducted.unreached = []
+        recovery.look(10)
+        assert conducted.rounds == [10]
+        conducted.unreached = []
+
+
+@pytest.mark.parametrize(("longest_outage", "pace"), [(1.0, 0.0), (8.0, 0.25), (60.0, 0.0), (60.0, 2.0)])
+@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("gap", [0.1, 7.0, 40.0])
+def test_a_round_that_is_lost_is_repeated_before_a_process_counts_as_silent(
+    longest_outage: float, pace: float, lost: bool, gap: float
+) -> None:
+    """Also in a run whose slots were joined at long intervals before; with three rounds after an outage."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, longest_outage, pace)
+    recovery.look(8)
+    clock.now += gap
+    recovery.look(16)
+    if lost:
+        conducted.lose("router")
+        recovery.look(16)
+        conducted.lost = {}
+    recovery.look(16)
+    patience, until = patience_of(longest_outage, pace, 8), clock.now
+    while clock.now - until < patience:
+        clock.now += 0.05
+        recovery.look(16)
+    assert len(conducted.rounds) >= (3 if lost else 1)
+    assert len(conducted.rounds) <= 6
+
+
+def test_a_process_is_reached_when_its_commands_have_a_reader() -> None:
+    """Its token alone is not enough; one that is away is not waited for."""
+    network = Network()
+    network.unread = {network.keys.control("smart"), network.keys.control("sensor")}
+    conductor = Conductor(network, ("legitimate", "smart"), Stop(), clock=TestClock())  # type: ignore[arg-type]
+    conductor.assemble()
+    assert conductor.unreached == ["sensor", "smart"]
+    network.watches["sensor"](False)
+    assert conductor.news() is None
+    assert conductor.unreached == ["smart"]
+    network.unread.clear()
+    assert conductor.unreached == []
