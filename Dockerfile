@@ -12,7 +12,7 @@ COPY constraints.txt build/wheels* /wheels/
 RUN if ls /wheels/*.whl >/dev/null 2>&1; then index=--no-index; fi; \
     /build/bin/pip download --quiet --disable-pip-version-check --no-cache-dir $index --find-links /wheels \
       --require-hashes --no-deps --requirement /wheels/constraints.txt --dest /packages
-COPY pyproject.toml README.md LICENSE /source/
+COPY pyproject.toml hatch_build.py README.md LICENSE /source/
 COPY emulator /source/emulator
 COPY peers /source/peers
 COPY scenarios /source/scenarios

@@ -63,8 +63,8 @@ def packets(scenario: Scenario, batch: Batch) -> list[Reception]:
     scheme = scheme_of(process, scenario.encoding.spec)
     encoder = scheme.encoder(keys.secret(scheme.secret_streams), batch)
     trajectory = Trajectory(process, keys.process, batch)
-    course = scenario.course("smart")
-    fates = Link(course, "smart", keys.link("smart", course), batch).fates(range(batch.slots)).in_time
+    schedule = scenario.schedule("smart")
+    fates = Link(schedule, "smart", keys.link("smart", schedule), batch).fates(range(batch.slots)).in_time
     found = []
     for k in range(batch.slots):
         x = trajectory.advance()

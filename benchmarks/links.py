@@ -1,26 +1,22 @@
 """Speed of the loss models: of their fates alone, and of a live run behind each. Prints tables; about ten minutes.
 
-    python benchmarks/links.py [--quick]
+    python benchmarks/links.py [--quick]      # --quick: two models live, within seconds
 
 Machines are noisy: every model is measured in turn, over and over, and the median is quoted beside that of `bernoulli`.
 """
 
 from __future__ import annotations
 
-import json
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
-import tomllib
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-import tomli_w
-from processes import watch
+from live_run import measured, scenario_file
+from processes import watch_cpu
 
-from evedrop.loading import shipped
 from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.streams import Batch, BlockReader, root_of_seed, stream_key
 
@@ -65,21 +61,21 @@ def fates_alone(trials: int, slots: int, chunk: int, rounds: int) -> None:
         print(f"    {name:<30} {statistics.median(times):8.2f}")
 
 
-def live(trials: int, slots: int, rounds: int) -> None:
+def live(trials: int, slots: int, rounds: int, names: Sequence[str]) -> None:
     """What the router of a run computes for a slot, four receivers behind one model, and slots a second of the whole.
 
     The whole run has theory in it, too: for chains more of it than for independent losses, for the others none.
     """
-    speeds: dict[str, list[float]] = {name: [] for name in SPECS}
-    costs: dict[str, list[float]] = {name: [] for name in SPECS}
+    speeds: dict[str, list[float]] = {name: [] for name in names}
+    costs: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(rounds):
-        for name, spec in SPECS.items():
-            speed, cost = run(spec, trials, slots)
+        for name in names:
+            speed, cost = run(SPECS[name], trials, slots)
             speeds[name].append(speed)
             costs[name].append(cost / slots * 1e6)
     print(f"live, {trials} trials, four receivers:")
     most = []
-    for name in SPECS:
+    for name in names:
         slower = statistics.median(b / a for a, b in zip(speeds[name], speeds["bernoulli"], strict=True))
         dearer = statistics.median(a / b for a, b in zip(costs[name], costs["bernoulli"], strict=True))
         most.append(dearer)
@@ -92,30 +88,15 @@ def live(trials: int, slots: int, rounds: int) -> None:
 
 def run(spec: dict[str, Any], trials: int, slots: int) -> tuple[float, float]:
     """Slots a second of one live run, and the seconds its router computed."""
-    tables = tomllib.loads(shipped()["eavesdroppers"].read_text(encoding="utf-8"))
-    tables.pop("expect", None)
-    for table in (tables["legitimate"], *tables["eavesdroppers"].values()):
-        table["link"] = {"loss": spec}
+    links = {"legitimate": {"link": {"loss": spec}}}
+    names = ("naive", "suspicious", "smart")
+    eavesdroppers: dict[str, dict[str, Any]] = {name: {"strategy": name, "link": {"loss": spec}} for name in names}
+    eavesdroppers["suspicious"] |= {"use_state": 0.8, "use_innovation": 0.1}
+    used: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "links.toml"
-        file.write_text(tomli_w.dumps({**tables, "slots": slots, "trials": trials}), encoding="utf-8")
-        command = [
-            sys.executable,
-            "-m",
-            "evedrop",
-            "run",
-            str(file),
-            "--view",
-            "off",
-            "--json",
-            "--out",
-            f"{folder}/run",
-        ]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE)
-        usage = watch(process)
-        assert process.stdout is not None
-        summary = json.loads(process.stdout.read())
-    return float(summary["slots_per_second"]), usage["router"].cpu_seconds
+        file = scenario_file(folder, {**links, "eavesdroppers": eavesdroppers, "slots": slots, "trials": trials})
+        summary = measured(file, watch=lambda process, _: used.update(watch_cpu(process)))
+    return float(summary["slots_per_second"]), used["router"]
 
 
 def main(quick: bool) -> None:
@@ -124,8 +105,11 @@ def main(quick: bool) -> None:
     rounds = 3 if quick else 9
     fates_alone(1, 8192, 256, rounds)
     fates_alone(1000, 520, 104, rounds)
-    live(1, 3_000 if quick else 20_000, 1 if quick else 5)
-    live(1000, 500 if quick else 3_000, 1 if quick else 5)
+    if quick:
+        live(1, 500, 1, ("bernoulli", "gilbert-elliott"))
+    else:
+        live(1, 20_000, 5, tuple(SPECS))
+        live(1000, 3_000, 5, tuple(SPECS))
 
 
 if __name__ == "__main__":

@@ -2,12 +2,13 @@
 
     python benchmarks/montecarlo.py [--quick]
 
-(a) the paper's study, 1000 trials × 86 400 slots × 9 values of μ_d, covariance only, by two workers;
-(b) the full simulation over numpy drawing as many uniforms and normals, on one core, and where the rest goes;
-(c) the full simulation against a loop over trials with filterpy's KalmanFilter (`pip install filterpy==1.4.5`);
-(d) two workers against one.
+(a) the paper's study, 1000 trials × 86 400 slots × 9 values of μ_d, covariance only, by two workers: projected from two parts
+    of its slots, because what does not depend on the slots, such as the start of the workers, is paid once;
+(b) the full simulation against a loop over trials with filterpy's KalmanFilter (`pip install filterpy==1.4.5`);
+(c) two workers against one.
 
-Times of one core are processor times, medians of several rounds. `--quick` takes a twentieth of the slots in (a) and says so.
+benchmarks/kernels.py compares the full simulation with the drawing of as many random numbers. Times of one core are processor
+times, medians of several rounds.
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
+from table import Row, judged, load, run_alone
 
 from evedrop.loading import checked
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.memory.simulation import Mode, Simulation
-from evedrop.model.digest import DIGEST_BYTES, BeliefLog
 from evedrop.scenario import Scenario
-from evedrop.streams import Batch, BlockReader
 from evedrop.studies.sweep import sweep_over
 
 TRIALS = 2000  # side by side, as many as a worker takes at once
 ROUNDS = 5
+PAPER_SLOTS = 86_400
+STUDY_TRIALS = 1000
 
 MICROGRID = """
 title = "microgrid"
@@ -90,24 +91,37 @@ def silent(_: object) -> None:
     """Take no news."""
 
 
-def study(quick: bool) -> None:
-    """(a)."""
-    slots = 86_400 // (20 if quick else 1)
+def study(slots: int) -> float:
+    """Seconds of the paper's study with some number of slots."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "microgrid.toml"
         file.write_text(MICROGRID)
         grid = {"encoding.state_probability": [round(0.1 * i, 1) for i in range(1, 10)]}
         plan = Plan(Mode.COVARIANCE_ONLY, workers=2)
-        before = os.times()
-        seconds = elapsed(
-            lambda: sweep_over(file, {"slots": slots, "trials": 1000}, grid, Path(folder) / "out", silent, plan)
-        )
-        after = os.times()
-    cpu = sum(after[:4]) - sum(before[:4])
-    shortened = " (--quick: a twentieth of the paper's slots)" if quick else ""
-    print(f"(a) 1000 trials × {slots:,} slots × 9 μ_d, covariance only, 2 workers{shortened}:")
-    print(
-        f"    {seconds:.1f} s, {cpu:.1f} s of processor, {cpu / (9000 * slots) * 1e9:.0f} ns a trial-slot; wanted: 40 s"
+        out = Path(folder) / "out"
+        return elapsed(lambda: sweep_over(file, {"slots": slots, "trials": STUDY_TRIALS}, grid, out, silent, plan))
+
+
+def projected(few: int, less: float, many: int, more: float) -> float:
+    """Seconds of all slots, from those of few and of many, on a straight line; in proportion if the many took no longer."""
+    if more <= less:
+        return more / many * PAPER_SLOTS
+    return more + (more - less) / (many - few) * (PAPER_SLOTS - many)
+
+
+def rows(quick: bool) -> Iterator[Row]:
+    """(a)."""
+    few, many = (PAPER_SLOTS // part for part in ((400, 100) if quick else (20, 5)))
+    pairs = [(study(few), study(many)) for _ in range(1 if quick else 3)]
+    seconds = statistics.median(projected(few, less, many, more) for less, more in pairs)
+    yield Row(
+        f"the paper's study, {STUDY_TRIALS} trials × {PAPER_SLOTS:,} slots × 9 points, two workers, projected from "
+        f"{few:,} and {many:,} slots",
+        f"{seconds:.1f} s",
+        f"measured, {many:,} slots: {statistics.median(more for _, more in pairs):.1f} s",
+        "40 s",
+        "20 s",
+        judged(seconds <= 40, seconds <= 20),
     )
 
 
@@ -117,66 +131,12 @@ def full(scenario: Scenario) -> None:
         pass
 
 
-def without_hashing(_: BeliefLog, __: int) -> np.ndarray[Any, Any]:
-    """Digests of nobody."""
-    return np.zeros((TRIALS, DIGEST_BYTES), np.uint8)
-
-
-def drawn_by_numpy(slots: int) -> None:
-    """γ, γᵉ, ν and both noises of two states, by PCG64."""
-    random = np.random.Generator(np.random.PCG64(1))
-    for _ in range(slots):
-        random.random((3, TRIALS))
-        random.standard_normal((4, TRIALS))
-
-
-def drawn_by_us(slots: int) -> None:
-    """The same from our own streams, addressed and reproducible."""
-    batch = Batch(slots, TRIALS)
-    uniform, normal = BlockReader(bytes(32), batch, 3), BlockReader(bytes(31) + b"1", batch, 4)
-    for reader, draw in ((uniform, uniform.uniforms), (normal, normal.normals)):
-        k = 0
-        while k < slots:
-            block = reader.block(k)
-            draw(block)
-            k = block.stop
-
-
-def against_numpy(slots: int) -> float:
-    """(b). Nanoseconds a trial-slot of the full simulation."""
-    scenario = vehicle(slots, TRIALS)
-    times: dict[str, list[float]] = {"full": [], "hashed": [], "numpy": [], "streams": []}
-    for _ in range(ROUNDS):
-        times["hashed"].append(processor_time(lambda: full(scenario)))
-        with patch.object(BeliefLog, "_digest", without_hashing):
-            times["full"].append(processor_time(lambda: full(scenario)))
-        times["numpy"].append(processor_time(lambda: drawn_by_numpy(slots)))
-        times["streams"].append(processor_time(lambda: drawn_by_us(slots)))
-    cost = {name: statistics.median(of) / slots / TRIALS * 1e9 for name, of in times.items()}
-    ratios = [one / other for one, other in zip(times["full"], times["numpy"], strict=True)]
-    base = cost["numpy"]
-    print(
-        f"(b) full simulation, legitimate and one smart eavesdropper, {TRIALS} trials × {slots} slots, hashing excluded:"
-    )
-    print(
-        f"    {cost['full']:.0f} ns a trial-slot, {statistics.median(ratios):.2f} times numpy's PCG64 drawing "
-        f"3 uniforms and 4 normals ({base:.0f} ns); wanted: 6 or less"
-    )
-    rest = cost["full"] - cost["streams"]
-    print(
-        f"    of these, in units of numpy's: {cost['streams'] / base:.2f} our own streams (AES, and an inverse "
-        f"distribution function that is the same everywhere), {rest / base:.2f} states, packets and two estimators with "
-        f"their covariances, kept for results and digests; hashing would add {(cost['hashed'] - cost['full']) / base:.2f}"
-    )
-    return cost["full"]
-
-
-def against_filterpy(ours: float, slots: int) -> None:
-    """(c)."""
+def against_filterpy(slots: int, rounds: int) -> None:
+    """(b)."""
     try:
         from filterpy.kalman import KalmanFilter  # type: ignore # noqa: PLC0415 - an extra
     except ImportError:
-        print("(c) filterpy is not installed (pip install filterpy==1.4.5): not measured")
+        print("(b) filterpy is not installed (pip install filterpy==1.4.5): not measured")
         return
     process = vehicle(slots, 1).process.process
     random = np.random.default_rng(1)
@@ -207,17 +167,19 @@ def against_filterpy(ours: float, slots: int) -> None:
                 if gamma_e and state:
                     smart.update(x)
 
-    theirs = statistics.median(processor_time(loop) for _ in range(ROUNDS)) / slots / trials * 1e9
+    theirs = statistics.median(processor_time(loop) for _ in range(rounds)) / slots / trials * 1e9
+    scenario = vehicle(slots, TRIALS)
+    ours = statistics.median(processor_time(lambda: full(scenario)) for _ in range(rounds)) / slots / TRIALS * 1e9
     print(
-        f"(c) a loop over trials with filterpy: {theirs:,.0f} ns a trial-slot, {theirs / ours:.0f} times ours; wanted: 100"
+        f"(b) a loop over trials with filterpy: {theirs:,.0f} ns a trial-slot, {theirs / ours:.0f} times ours; wanted: 100"
     )
 
 
-def two_workers(slots: int) -> None:
-    """(d)."""
-    scenario = vehicle(slots, 8000)
+def two_workers(slots: int, trials: int, rounds: int) -> None:
+    """(c)."""
+    scenario = vehicle(slots, trials)
     ratios, costs = [], []
-    for _ in range(3):
+    for _ in range(rounds):
         taken, spent = [], []
         for workers in (1, 2):
             with tempfile.TemporaryDirectory() as folder:
@@ -229,20 +191,23 @@ def two_workers(slots: int) -> None:
         costs.append(spent[1] / spent[0])
     shown = ", ".join(f"{ratio:.2f}" for ratio in ratios)
     print(
-        f"(d) two workers against one, 8000 trials × {slots} slots, start to last row: {statistics.median(ratios):.2f} "
+        f"(c) two workers against one, {trials} trials × {slots} slots, start to last row: {statistics.median(ratios):.2f} "
         f"times as fast ({shown}), for {statistics.median(costs):.2f} times the processor time; wanted: 1.8 on two idle "
-        f"cores (load now {os.getloadavg()[0]:.1f})"
+        f"cores (load now {load()})"
     )
 
 
 def main(quick: bool) -> None:
     """All of it."""
-    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the start")
-    cost = against_numpy(500 if quick else 2000)
-    against_filterpy(cost, 1000)
-    two_workers(500 if quick else 2000)
-    study(quick)
+    print(f"{os.cpu_count()} cores, load {load()} before the start")
+    for row in rows(quick):
+        print(f"(a) {row.what}: {row.measured} ({row.yardstick}); wanted: {row.at_least}")
+    against_filterpy(100 if quick else 1000, 1 if quick else ROUNDS)
+    two_workers(*((100, 2000, 1) if quick else (2000, 8000, 3)))
 
 
 if __name__ == "__main__":
-    main("--quick" in sys.argv)
+    if "--json" in sys.argv:
+        run_alone(rows)
+    else:
+        main("--quick" in sys.argv)

@@ -1,45 +1,79 @@
-"""Watches the processes of a run from outside: CPU seconds and resident memory, by process name, from /proc."""
+"""Watches the processes of a run from outside: CPU seconds and memory, from /proc."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import time
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 _TICK = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
-@dataclass
-class Usage:
-    """What a process used so far."""
+@dataclass(frozen=True)
+class Process:
+    """One process of a run, at one moment."""
 
-    cpu_seconds: float = 0.0
-    resident: list[float] = field(default_factory=list)
-    """Resident memory in MB, a sample each time it was looked at."""
+    pid: int
+    name: str
+    """`launcher`, the name in its brief such as `smart`, or the name of another program."""
+    role: str
+    """As `name`, but `eavesdropper` for each of them."""
+    cpu_seconds: float
+    """Processor seconds so far."""
+    resident: float
+    """Resident memory in MB; memory that processes share counts in each."""
+
+    @property
+    def private(self) -> float:
+        """Memory in MB that no other process has."""
+        lines = Path(f"/proc/{self.pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
+        return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) * 1024 / 1e6
 
 
-def watch(process: subprocess.Popen[bytes], interval: float = 0.05) -> dict[str, Usage]:
-    """Sample a command and its children until it ends: process name → usage; the command itself is `launcher`."""
-    usage: dict[str, Usage] = {}
+def processes_of(launcher: int) -> list[Process]:
+    """The launcher of a run and all its descendants, by process id."""
+    stats = dict(_stats())
+    inside = {launcher} & stats.keys()
+    while more := {pid for pid, fields in stats.items() if int(fields[1]) in inside} - inside:
+        inside |= more
+    found = []
+    for pid in sorted(inside):
+        fields = stats[pid]
+        try:
+            role, name = ("launcher", "launcher") if pid == launcher else _names(pid)
+        except OSError:
+            continue
+        seconds = (int(fields[11]) + int(fields[12])) / _TICK
+        found.append(Process(pid, name, role, seconds, int(fields[21]) * _PAGE / 1e6))
+    return found
+
+
+def _stats() -> Iterator[tuple[int, list[str]]]:
+    """Process id → the fields of /proc/PID/stat from the state on."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            yield int(folder.name), (folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        except OSError:
+            continue
+
+
+def _names(pid: int) -> tuple[str, str]:
+    """Role and name of a process, from its command line `python … -m evedrop ROLE …/NAME.json`."""
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").split()
+    if "evedrop" in words[:-2] and words[-1].endswith(".json"):
+        return words[words.index("evedrop") + 1], Path(words[-1]).stem
+    other = next((word for word in words if word.startswith("evedrop.")), Path(words[0]).name if words else "ended")
+    return other, other
+
+
+def watch_cpu(process: subprocess.Popen[bytes], interval: float = 0.05) -> dict[str, float]:
+    """Watch a command until it ends: process name → its processor seconds."""
+    seconds: dict[str, float] = {}
     while process.poll() is None:
-        for folder in Path("/proc").glob("[0-9]*"):
-            try:
-                _sample(folder, process.pid, usage)
-            except OSError:
-                continue
+        seconds.update({one.name: one.cpu_seconds for one in processes_of(process.pid)})
         time.sleep(interval)
-    return usage
-
-
-def _sample(folder: Path, parent: int, usage: dict[str, Usage]) -> None:
-    fields = (folder / "stat").read_text().rpartition(")")[2].split()
-    pid = int(folder.name)
-    if pid != parent and int(fields[1]) != parent:
-        return
-    arguments = (folder / "cmdline").read_bytes().split(b"\0")
-    name = "launcher" if pid == parent else Path(arguments[-2].decode()).stem if len(arguments) > 1 else ""
-    one = usage.setdefault(name, Usage())
-    one.cpu_seconds = (int(fields[11]) + int(fields[12])) / _TICK
-    one.resident.append(int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / 1e6)
+    return seconds

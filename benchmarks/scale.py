@@ -10,26 +10,24 @@ what else runs on the machine is in all of its numbers, and the load is printed 
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from live_run import measured, scenario_file, slots_on_disk
+from processes import processes_of
 
-from evedrop import run
 from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
-_TICK = os.sysconf("SC_CLK_TCK")
-_PAGE = os.sysconf("SC_PAGE_SIZE")
-_LOOK_SECONDS = 0.1
+_LOOK_SECONDS = 0.03
 _STEADY = 0.2  # from this part of the slots on
 _STRATEGIES = ("naive", "suspicious", "smart")
 COLOURS = (BLUE, ORANGE, GREEN, RED, GREY)
@@ -55,7 +53,7 @@ class Grid:
 
 
 FULL = Grid((1, 10, 100, 1000, 4000), (1, 4, 16), (1, 2, 4), 8.0)
-QUICK = Grid((10, 1000), (1, 4), (1, 2), 2.0)
+QUICK = Grid((1, 10), (1, 2), (1,), 0.1)
 
 
 @dataclass(frozen=True)
@@ -94,49 +92,35 @@ def changes_of(slots: int, trials: int, receivers: int, shards: int) -> dict[str
         eavesdroppers[f"{strategy}-{i}"] = {"strategy": strategy, "link": {"quality": 0.9}}
         if strategy == "suspicious":
             eavesdroppers[f"{strategy}-{i}"] |= {"use_state": 0.8, "use_innovation": 0.3}
-    return {
-        "slots": slots,
-        "trials": trials,
-        "shards": shards,
-        "pace": 0.0,
-        "eavesdroppers": eavesdroppers,
-        "event": [],
-        "expect": [],
-    }
-
-
-def one_run(folder: str, changes: str) -> None:
-    """A run whose progress is printed, with the time."""
-
-    def tell(news: Mapping[str, Any]) -> None:
-        if news["event"] == "progress":
-            print(json.dumps([time.monotonic(), news["done"]]), flush=True)
-
-    run("eavesdroppers", out=folder, tell=tell, **json.loads(changes))
+    return {"slots": slots, "trials": trials, "shards": shards, "pace": 0.0, "eavesdroppers": eavesdroppers}
 
 
 def measure(trials: int, receivers: int, shards: int, seconds: float) -> Measured:
     """Run one point of the grid and watch it."""
     expected = 60e-6 + 11e-6 * receivers + trials * (0.3e-6 + 0.075e-6 * receivers)  # a slot, on two cores of 2024
-    slots = max(40, int(seconds / expected))
+    slots = max(6000 if trials < 100 else 40, int(seconds / expected))
     looks: list[tuple[float, float, dict[str, list[float]]]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        changes = json.dumps(changes_of(slots, trials, receivers, shards))
-        command = [sys.executable, __file__, "one-run", f"{folder}/run", changes]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    told: list[tuple[float, int]] = []
+
+    def watch(process: subprocess.Popen[bytes], out: Path) -> None:
+        folders = [out / "shards" / str(1 + i) for i in range(shards)] if shards > 1 else [out]
         while process.poll() is None:
             looks.append((time.monotonic(), *look(process.pid)))
+            told.append((time.monotonic(), min(slots_on_disk(folder) for folder in folders)))
             time.sleep(_LOOK_SECONDS)
-        assert process.stdout is not None
-        told = [json.loads(line) for line in process.stdout]
-    assert process.returncode == 0, command
+
+    with tempfile.TemporaryDirectory() as folder:
+        measured(scenario_file(folder, changes_of(slots, trials, receivers, shards)), watch=watch)
     steady = [(at, done) for at, done in told if done >= _STEADY * slots]
-    (begin, done), (end, last) = steady[0], steady[-1]
+    if not steady or steady[0][1] == (last := max(steady, key=lambda one: one[1]))[1]:
+        raise RuntimeError(f"{slots} slots of {trials} trials were over before they were looked at twice")
+    begin, done = steady[0]
+    end = next(at for at, now in steady if now == last[1])
     used = processor_seconds(looks, begin, end)
     busiest = max(used, key=lambda kind: max(used[kind]))
     return Measured(
         *(trials, receivers, shards, slots),
-        slots_per_second=(last - done) / (end - begin),
+        slots_per_second=(last[1] - done) / (end - begin),
         megabytes=max(resident for _, resident, _ in looks),
         cores=sum(map(sum, used.values())) / (end - begin),
         busiest=busiest,
@@ -145,26 +129,18 @@ def measure(trials: int, receivers: int, shards: int, seconds: float) -> Measure
 
 
 def look(launcher: int) -> tuple[float, dict[str, list[float]]]:
-    """Resident megabytes of a command and its children together; kind of process → processor seconds so far, by process id."""
+    """Resident megabytes of a command and its children together; role → processor seconds so far, by process id."""
     resident, seconds = 0.0, dict[str, list[float]]()
-    for folder in sorted(Path("/proc").glob("[0-9]*"), key=lambda path: int(path.name)):
-        try:
-            fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(folder.name) != launcher and int(fields[1]) != launcher:
-                continue
-            words = (folder / "cmdline").read_bytes().split(b"\0")
-        except OSError:
-            continue
-        resident += int(fields[21]) * _PAGE / 1e6
-        kind = "launcher" if int(folder.name) == launcher else words[3].decode() if len(words) > 4 else "new"
-        seconds.setdefault(kind, []).append((int(fields[11]) + int(fields[12])) / _TICK)
+    for one in processes_of(launcher):
+        resident += one.resident
+        seconds.setdefault(one.role, []).append(one.cpu_seconds)
     return resident, seconds
 
 
 def processor_seconds(
     looks: list[tuple[float, float, dict[str, list[float]]]], begin: float, end: float
 ) -> dict[str, list[float]]:
-    """Kind of process → what each of them used between two times."""
+    """Role → what each of them used between two times."""
     inside = [seconds for at, _, seconds in looks if begin <= at <= end]
     first, last = inside[0], inside[-1]
     return {
@@ -289,8 +265,5 @@ def main(quick: bool, picture: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["one-run"]:
-        one_run(*sys.argv[2:])
-    else:
-        pictures = [Path(word) for word in sys.argv[1:] if not word.startswith("--")]
-        main("--quick" in sys.argv, pictures[0] if pictures else None)
+    pictures = [Path(word) for word in sys.argv[1:] if not word.startswith("--")]
+    main("--quick" in sys.argv, pictures[0] if pictures else None)

@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from evedrop import run, montecarlo, compare, design, load_results
+    from evedrop import run, preloaded, montecarlo, compare, design, load_results
 
 These names are loaded when they are used: a peer imports this package, too, and needs none of them.
 """
@@ -13,15 +13,17 @@ if TYPE_CHECKING:
     from typing import Any
 
     from evedrop.api import compare, design, montecarlo, run
+    from evedrop.live.launch.preloading import preloaded
     from evedrop.results.writer import load_results
 
-__all__ = ["compare", "design", "load_results", "montecarlo", "run"]
+__all__ = ["compare", "design", "load_results", "montecarlo", "preloaded", "run"]
 
 _HOMES = {
     "compare": "evedrop.api",
     "design": "evedrop.api",
     "load_results": "evedrop.results.writer",
     "montecarlo": "evedrop.api",
+    "preloaded": "evedrop.live.launch.preloading",
     "run": "evedrop.api",
 }
 

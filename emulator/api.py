@@ -138,7 +138,7 @@ def design(
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
     quality = {}
     for name in made.receivers:
-        law = law_of(made.course(name))
+        law = law_of(made.schedule(name))
         alike = None if law is None else law.alike
         if alike is None:
             raise UsageError(
@@ -153,7 +153,7 @@ def design(
         if outcomes_at is None:
             left_out[name] = table.strategy
         else:
-            adversaries.append(Adversary.who(name, quality[name], outcomes_at(1.0)))
+            adversaries.append(Adversary.with_outcomes(name, quality[name], outcomes_at(1.0)))
     process, mu, mu_d = made.process.process, quality[LEGITIMATE], made.encoding.mu_d
     return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
 

@@ -65,7 +65,7 @@ def number(path: str, found: Any) -> Iterator[str]:
         yield from _wrong(path, found, "a finite number")
 
 
-def positive(path: str, found: Any) -> Iterator[str]:
+def not_negative(path: str, found: Any) -> Iterator[str]:
     """Check that a value is a finite number, 0 or more."""
     wrong = list(number(path, found))
     yield from wrong or (_wrong(path, found, "a number of 0 or more") if found < 0 else ())

@@ -8,8 +8,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
+from evedrop.names import KERNELS_VARIABLE
+
 _NEEDED = frozenset(
     {
+        KERNELS_VARIABLE,
         *(
             "PATH",
             "HOME",
@@ -48,6 +51,9 @@ def own_environment() -> dict[str, str]:
     """For a process of a run, or a worker: where programs, libraries and temporary files are, and the language."""
     return {name: value for name, value in os.environ.items() if name in _NEEDED or name.startswith(_NEEDED_KINDS)}
 
+
+SINGLE_THREADED: Mapping[str, str] = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+"""For a process of a run: one thread for linear algebra, and output that is written at once."""
 
 _CLIENT = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx), app: (handover: rx))"
 # A router's receiving must never wait for its sending threads.

@@ -137,6 +137,9 @@ class Interrupted(EvedropError):
 
     exit_status = 130
 
+    def __init__(self, said: str = "interrupted; the results so far are in the results folder") -> None:
+        super().__init__(said)
+
 
 class NoAnswer(Exception):
     """A class raised an error, gave an invalid answer, or did not answer when asked; the text says which."""

@@ -14,18 +14,18 @@ from evedrop.command import Command
 from evedrop.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ScoredSlots
 from evedrop.kernels import elementary
 from evedrop.model import update
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.delays.constant import ConstantDelay
 from evedrop.model.delays.delay import DelayModel
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
 from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.links.checks import probability_mistakes
 from evedrop.model.links.link import Chain, Fate, LossModel, fates_of
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception, prior, trace_of
+from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, prior, trace_of
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
-from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.names import ProcessAction
 from evedrop.streams import Batch, BlockReader
@@ -55,6 +55,7 @@ __all__ = [
     "ApplicationTally",
     "Batch",
     "Belief",
+    "Beliefs",
     "Bernoulli",
     "BlockReader",
     "Chain",
@@ -88,6 +89,7 @@ __all__ = [
     "Outcomes",
     "OutcomesAt",
     "Packet",
+    "PacketBlock",
     "PacketReader",
     "PacketTaker",
     "Panel",

@@ -33,3 +33,7 @@ class ProcessAction(StrEnum):
         """Whether the process is on the network afterwards; None if it may lose its connection or keep it."""
         # A process that was stopped for long loses its connection, and must have it back.
         return {ProcessAction.END: False, ProcessAction.STOP: None}.get(self, True)
+
+
+KERNELS_VARIABLE = "EVEDROP_KERNELS"
+"""The environment variable that selects the kernels: see `evedrop.kernels.choice`."""

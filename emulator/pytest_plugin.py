@@ -8,6 +8,7 @@ Source: docs/testing.md.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -17,6 +18,8 @@ from evedrop.discovery import is_scenario
 
 if TYPE_CHECKING:
     from evedrop.studies.scenario_tests import Finding
+
+_PRELOADED = pytest.StashKey[ExitStack]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -55,6 +58,7 @@ class ScenarioItem(pytest.Item):
         from evedrop.errors import Interrupted  # noqa: PLC0415 - needed only to run a scenario
         from evedrop.studies.scenario_tests import Manner, Outcome, carry_out  # noqa: PLC0415 - the same
 
+        self._imports_once()
         options = self.config.option
         manner = Manner(options.evedrop_in_memory, options.evedrop_trials, options.evedrop_out)
         try:
@@ -66,6 +70,15 @@ class ScenarioItem(pytest.Item):
                 self.user_properties.append((name, str(value)))
         if tested.outcome is not Outcome.PASSED:
             raise ScenarioFailed(tested)
+
+    def _imports_once(self) -> None:
+        """Let the live runs of all scenarios share their imports."""
+        from evedrop.live.launch.preloading import preloaded  # noqa: PLC0415 - needed only to run a scenario
+
+        if _PRELOADED not in self.config.stash and not self.config.option.evedrop_in_memory:
+            stack = self.config.stash[_PRELOADED] = ExitStack()
+            stack.enter_context(preloaded())
+            self.config.add_cleanup(stack.close)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], *more: Any) -> Any:
         """The reasons, one line each; a traceback only for a bug of Evedrop."""

@@ -18,6 +18,11 @@ from evedrop.interrupts import INTERRUPTED, SIGNALS, heeded, leave
 
 SHOW_STACKS = signal.SIGUSR1
 """The signal upon which a process of a run writes the stack of every thread to its log."""
+AFTERTHOUGHT_SECONDS = 0.5
+"""A signal that ended another process of a run may reach this one as well, within this time: then the run did not fail.
+
+A closing terminal hangs up on all processes; a user may end them one by one.
+"""
 
 
 @contextmanager

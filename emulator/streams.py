@@ -13,16 +13,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import final
+from typing import Generic, TypeVar, final
 
 import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from numpy.typing import NDArray
 
-from evedrop.kernels.elementary import normal_quantile
+from evedrop.kernels.current import kernels
 
 Words = NDArray[np.uint64]
 Floats = NDArray[np.float64]
+Made = TypeVar("Made", bound=np.generic)
 
 MOST_SLOTS = 100_000_000
 """The most slots of a run."""
@@ -44,8 +45,7 @@ def stream_key(root: bytes, name: str) -> bytes:
 class Stream:
     """A stream over a range of trials (step 1), `per_trial` words for each in every slot.
 
-    AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots. The
-    blocks are kept between calls; only their slot numbers change.
+    AES in ECB mode over counter blocks formed here is counter mode with jumps: one call serves many slots.
     """
 
     def __init__(self, key: bytes, trials: range, per_trial: int) -> None:
@@ -53,36 +53,33 @@ class Stream:
         self._blocks = (per_trial + 1) // 2
         self._trials = trials
         self._per_trial = per_trial
-        self._counters = np.empty((0, len(trials) * self._blocks, 2), dtype=">u8")
+        self._counters: Words = np.empty((0, len(trials) * self._blocks, 2), np.uint64)
         self._keystream = bytearray()
 
     def words(self, slots: range) -> Words:
         """Raw 64-bit words, (slots, trials, per_trial), for a range of step 1; the next call overwrites them."""
+        return self.whole_blocks(slots)[:, :, : self._per_trial]
+
+    def whole_blocks(self, slots: range) -> Words:
+        """The same with the unused last word of each trial where `per_trial` is odd, so that the array is contiguous."""
         if len(slots) > len(self._counters):
-            self._counters = np.empty((len(slots), *self._counters.shape[1:]), dtype=">u8")
-            first, last = self._trials.start * self._blocks, self._trials.stop * self._blocks
-            self._counters[:, :, 1] = np.arange(first, last, dtype=np.uint64)
+            self._counters = np.empty((len(slots), *self._counters.shape[1:]), np.uint64)
             self._keystream = bytearray(self._counters.nbytes + _AES_BLOCK)
         counters = self._counters[: len(slots)]
-        counters[:, :, 0] = np.arange(slots.start, slots.stop, dtype=np.uint64)[:, None]
+        kernels.fill_counters(counters, slots.start, self._trials.start * self._blocks)
         length = self._encryptor.update_into(counters.data.cast("B"), self._keystream)
         drawn = np.frombuffer(self._keystream, dtype="<u8", count=length // 8)
-        return drawn.reshape(len(slots), len(self._trials), 2 * self._blocks)[:, :, : self._per_trial]
+        return drawn.reshape(len(slots), len(self._trials), 2 * self._blocks)
 
 
 def uniforms(raw: Words) -> Floats:
     """Uniform numbers in [0, 1), multiples of 2⁻⁵³, one for each word."""
-    numbers = (raw >> np.uint64(11)).view(np.int64).astype(np.float64)  # signed words are converted faster
-    numbers *= 2.0**-53
-    return numbers
+    return kernels.uniforms(raw.reshape(1, -1, 1), 1).reshape(raw.shape)
 
 
 def normals(raw: Words) -> Floats:
     """Standard normal numbers, one for each word, by the inverse distribution function on an odd grid of 2⁻⁵³."""
-    numbers = (raw >> np.uint64(12)).view(np.int64).astype(np.float64)
-    numbers += 0.5
-    numbers *= 2.0**-52
-    return normal_quantile(numbers)
+    return kernels.normals(raw.reshape(1, -1, 1), 1).reshape(raw.shape)
 
 
 @dataclass(frozen=True)
@@ -101,10 +98,7 @@ class Batch:
 
 @final
 class BlockReader:
-    """Draws a stream ahead, a block of slots at a time, and converts a block in one call.
-
-    Holds one block: reading slots in order costs each number once; any other order is correct, only slower.
-    """
+    """Converts the numbers of a stream, block by block of the size that is fastest."""
 
     def __init__(self, key: bytes, batch: Batch, per_trial: int) -> None:
         self._stream = Stream(key, batch.trial_range, per_trial)
@@ -113,28 +107,62 @@ class BlockReader:
         width = max(1, batch.trials * per_trial)
         self._length = max(1, min(256, _BLOCK_WORDS // width, batch.slots))
 
-    def block(self, k: int) -> range:
-        """The slots of the block that holds slot k; blocks are aligned."""
-        start = k - k % self._length
-        return range(start, min(start + self._length, self._batch.slots))
+    def ahead(self, slots: range) -> range:
+        """These slots, and the rest of the block that the last of them is in; many slots are as fast without it."""
+        last = slots.stop if len(slots) >= self._length else -(-slots.stop // self._length) * self._length
+        return range(slots.start, min(last, self._batch.slots))
 
     def uniforms(self, slots: range) -> Floats:
         """Uniforms, shape (slots, per_trial, trials)."""
-        return self._converted(slots, uniforms)
+        return self._converted(slots, kernels.uniforms)
 
     def normals(self, slots: range) -> Floats:
         """Standard normals, shape (slots, per_trial, trials)."""
-        return self._converted(slots, normals)
+        return self._converted(slots, kernels.normals)
 
-    def _converted(self, slots: range, convert: Callable[[Words], Floats]) -> Floats:
+    def _converted(self, slots: range, convert: Callable[[Words, int], Floats]) -> Floats:
         """Convert a block at a time, so that intermediate arrays stay in the cache, and the allocator keeps its pages."""
         if len(slots) <= self._length:
-            return convert(self._words(slots))
+            return convert(self._stream.whole_blocks(slots), self._per_trial)
         numbers = np.empty((len(slots), self._per_trial, self._batch.trials))
         for start in range(0, len(slots), self._length):
             some = slice(start, start + self._length)
-            numbers[some] = convert(self._words(slots[some]))
+            numbers[some] = convert(self._stream.whole_blocks(slots[some]), self._per_trial)
         return numbers
 
-    def _words(self, slots: range) -> Words:
-        return np.ascontiguousarray(self._stream.words(slots).transpose(0, 2, 1))
+
+@final
+class Ahead(Generic[Made]):
+    """Values that are made from a stream some slots ahead, and read a slot or many slots at a time.
+
+    make: the values of consecutive slots, (c, …). Reading slots in order makes each value once; any other order is correct,
+    only slower.
+    """
+
+    def __init__(self, reader: BlockReader, make: Callable[[range], NDArray[Made]]) -> None:
+        self._reader, self._make = reader, make
+        self._slots = range(0)
+        self._values: NDArray[Made]
+
+    def at(self, k: int) -> NDArray[Made]:
+        """The values of slot k, (…)."""
+        if k not in self._slots:
+            self._draw(range(k, k + 1))
+        row: NDArray[Made] = self._values[k - self._slots.start]
+        return row
+
+    def of(self, slots: range) -> NDArray[Made]:
+        """The values of consecutive slots, at least one, (c, …)."""
+        if slots.start < self._slots.start or slots.stop > self._slots.stop:
+            self._draw(slots)
+        start = self._slots.start
+        return self._values[slots.start - start : slots.stop - start]
+
+    def _draw(self, slots: range) -> None:
+        held, wanted = self._slots, self._reader.ahead(slots)
+        if slots.start in held:
+            more = self._make(range(held.stop, wanted.stop))
+            self._values = np.concatenate([self._values[slots.start - held.start :], more])
+        else:
+            self._values = self._make(wanted)
+        self._slots = wanted

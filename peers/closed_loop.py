@@ -6,15 +6,12 @@ from typing import final
 
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_closed_loop import EstimatorLoop, SensorPlantEntry, decoded
-from evedrop.live.protocol.brief_parts import SensorPart
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_closed_loop import EstimatorLoop, SensorLoop
 from evedrop.live.protocol.closed_loop import known, read_decided
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.input_aware import InputAwareEstimator
-from evedrop.model.local_filter import LocalFilter
-from evedrop.model.plant import Drive
-from evedrop.model.process import Floats, Trajectory
+from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Receiver
 
 
@@ -43,53 +40,27 @@ class Decided:
 
 
 @final
-class Actuator:
-    """The plant at the sensor: moves the state, and waits for the inputs after every slot."""
+class Steered:
+    """The closed loop at the sensor: waits for the inputs after every slot, and may send the true state.
 
-    def __init__(self, brief: Brief[SensorPart], entry: SensorPlantEntry, session: ProcessSession) -> None:
-        plant, loop = entry.plant, brief.part.controller
-        self.inputs = 0 if loop is None else plant.inputs
-        """How many inputs the controller decides."""
-        self._drive = Drive(plant, decoded(entry.disturbances, brief.slots))
-        key = brief.stream_keys.get("measurement", b"")
-        measures = plant.output_matrix is not None
-        self._local = LocalFilter(brief.model.process, plant, key, brief.batch) if measures else None
-        self._decided: Decided | None = None
-        self._period = 1
-        self._put = None
-        if loop is not None:
-            self._period = loop.period
-            self._decided = Decided(session, self._period, (plant.inputs, brief.trials), brief.flow.longest_outage)
-            self._put = (
-                kept_decisive(session, session.keys.state, brief, self._period) if loop.acts_on == "truth" else None
-            )
+    inputs: how many the controller decides.
+    """
 
-    def pushed(self, k: int) -> Floats:
-        """The term that inputs and disturbances add to the state of slot k, as `Trajectory.advance` takes it."""
-        return self._drive.pushed(k)
+    def __init__(self, brief: AnyBrief, inputs: int, loop: SensorLoop, session: ProcessSession) -> None:
+        self._period = loop.period
+        self._decided = Decided(session, loop.period, (inputs, brief.trials), brief.flow.longest_outage)
+        on_truth = loop.acts_on == "truth"
+        self._put = kept_decisive(session, session.keys.state, brief, loop.period) if on_truth else None
 
-    def transmitted(self, k: int, x: Floats, trajectory: Trajectory) -> tuple[Floats, Floats]:
-        """The state to transmit for the state x (n, R) of slot k, and the prediction that its innovation refers to, (n, R)."""
-        if self._local is None:
-            return x, trajectory.predicted
-        return self._local.take(k, x, self.pushed(k)), self._local.predicted
+    def decides(self, k: int) -> bool:
+        """Whether the controller decides in slot k."""
+        return k % self._period == 0
 
-    @property
-    def measures(self) -> bool:
-        """Whether the sensor filters its measurements."""
-        return self._local is not None
-
-    def wait(self, k: int, x: Floats) -> tuple[Floats, Flags] | None:
-        """Wait for the inputs of slot k, whose state is x (n, R), and where the decision failed; None without a controller."""
-        if self._decided is None:
-            return None
-        decides = k % self._period == 0
-        if decides and self._put is not None:
+    def wait(self, k: int, x: Floats) -> tuple[Floats, Flags]:
+        """The inputs (m, R) of slot k, whose true state is x (n, R), and where the decision failed, (R,)."""
+        if self._put is not None and self.decides(k):
             self._put(k, known("x", k, x))
-        steered = self._decided.of(k)
-        if decides:
-            self._drive.hold(steered[0])
-        return steered
+        return self._decided.of(k)
 
 
 @final

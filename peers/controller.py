@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 from evedrop.live.network.process_session import ProcessSession
@@ -15,7 +14,7 @@ from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.live.protocol.closed_loop import decided, read_known
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import End
-from evedrop.model.controllers import CONTROLLERS
+from evedrop.model.slot.controller import ControllerCore
 from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive
 
@@ -26,7 +25,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
     plant = part.plant.plant
     assignment = part.assignment.assignment(process, plant)
     disturbances = decoded(part.disturbances, brief.slots)
-    controller = CONTROLLERS[part.strategy](assignment, brief.trials)
+    controller = ControllerCore(part.strategy, assignment, disturbances, brief.trials)
     on_truth = part.acts_on == "truth"
     with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
@@ -41,9 +40,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
             session.place.slot = k
             message = due.take(lambda: Reader(key, inbox.recv()), k)
             x = read_known(message, name, k, (process.n, brief.trials))
-            began = time.perf_counter()
-            u = controller.decide(k, x, disturbances[k])
-            took = time.perf_counter() - began
-            put(k, decided(k, u, controller.failed))
-            reporter.add(k, u, controller.failed, took)
+            made = controller.decide(k, x)
+            put(k, decided(k, made.u, made.failed))
+            reporter.add(k, *made)
         session.wait_for(End)

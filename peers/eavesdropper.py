@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from evedrop.conformance.checked import checked_eavesdropper
+from evedrop.conformance.problems import Problem
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -15,5 +17,8 @@ from evedrop.peers.following import follow
 
 def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
     """Run the eavesdropper of a brief; connect: opens its session."""
-    knowledge = Knowledge(brief.model.process, brief.model.state_probability, brief.part.parameters, brief.stream_keys)
-    follow(brief, STRATEGIES.imported(brief.part.strategy)(knowledge, brief.batch), connect=connect)
+    strategy, parameters = brief.part.strategy, brief.part.parameters
+    knowledge = Knowledge(brief.model.process, brief.model.state_probability, parameters, brief.stream_keys)
+    receiver = STRATEGIES.imported(strategy)(knowledge, brief.batch)
+    problem = Problem(brief.model.process, brief.batch)
+    follow(brief, checked_eavesdropper(receiver, brief.process, strategy, parameters, problem), connect=connect)

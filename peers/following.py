@@ -1,16 +1,17 @@
-"""The work of every receiver: take one delivery in each slot, update the estimate, report."""
+"""The work of every receiver: take the deliveries that have arrived, update the estimate, report."""
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
-from evedrop.live.network.process_session import ProcessSession, Received
+from evedrop.live.network.pending import Pending, most_slots
+from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
@@ -18,11 +19,11 @@ from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import End
-from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_delivery
+from evedrop.live.protocol.packet_blocks import read_deliveries
+from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement
 from evedrop.live.protocol.telemetry import leaving
-from evedrop.model.receiver import Belief, Receiver
-from evedrop.model.slot.intermittent_receiver import Follower
-from evedrop.model.slot.transit import Arrival
+from evedrop.model.receiver import Belief, Flags, Receiver
+from evedrop.model.slot.receiver import ReceiverCore
 from evedrop.peers.closed_loop import Consultation
 
 
@@ -38,56 +39,96 @@ def follow(
     It may acknowledge packets, and send its estimate to a controller. Deliveries that it already had are acknowledged
     again, and otherwise ignored. connect: opens its session.
     """
-    name, shape, window = brief.process, (receiver.process.n, brief.trials), brief.part.window
-    outages = {start: (stop, keeps) for start, stop, keeps in brief.part.outages}
-    follower = Follower(receiver, window, brief.first)
-    if brief.first:
-        _remember(brief, follower, outages)
+    core = _core_of(brief, receiver)
     with connect(brief) as session:
-        downlink = session.keys.downlink(name)
-        deliveries = session.inbox(downlink)
-        put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
-        cuts = [slot for start, (stop, _) in outages.items() for slot in (start, stop)]
-        put_progress = session.kept(session.keys.progress(name), 0)
-        answers = ReceiverReplies(brief, session, acknowledges, None if consult is None else consult(session))
-        reporter = BeliefReporter(brief, put_telemetry, put_progress, cuts, brief.first, window > 0)
-        due = GapDetector(downlink, brief.flow.longest_outage)
+        replies = ReceiverReplies(brief, session, acknowledges, None if consult is None else consult(session))
+        following = Following(brief, core, replies, session)
         session.ready()
-        k = brief.first
-        while k < brief.slots:
-            session.place.slot = k
-            message = Reader(downlink, deliveries.recv())
+        following.carry_on()
+        replies.over(following.deliveries)
+        session.wait_for(End)
+
+
+@final
+class Following:
+    """A receiver's work on a session that is being opened: it takes all deliveries that have arrived at once.
+
+    Where another process waits for an answer to each of them, it takes them one by one.
+    """
+
+    def __init__(
+        self, brief: Brief[ReceiverPart], core: ReceiverCore, replies: ReceiverReplies, session: ProcessSession
+    ) -> None:
+        name, key = brief.process, session.keys.downlink(brief.process)
+        self._brief, self._core, self._replies, self._place = brief, core, replies, session.place
+        self._outages = _outages_of(brief)
+        self.deliveries = Pending(session.inbox(key), key, most_slots(brief))
+        self._put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
+        cuts = [slot for start, (stop, _) in self._outages.items() for slot in (start, stop)]
+        put_progress = session.kept(session.keys.progress(name), 0)
+        self._reporter = BeliefReporter(
+            brief, self._put_telemetry, put_progress, cuts, brief.first, brief.part.window > 0
+        )
+        self._due = GapDetector(key, brief.flow.longest_outage)
+        self._k = brief.first
+
+    def carry_on(self) -> None:
+        """Take all deliveries until the run is over, or until this process is away to its end."""
+        while self._k < self._brief.slots:
+            self._place.slot = self._k
+            message = self.deliveries.peek()
             found = message.integer("k")
             if is_barrier(message):
-                if found != k:
-                    due.missed(k, found)
-                    continue
-                if k in outages:
-                    # Before the report that the conductor waits for, which may then end this process at once.
-                    _save(brief, follower.belief)
-                    put_telemetry(k, leaving(k, follower.belief))
-                reporter.flush(k)
-                if outages.get(k, (0, False))[0] >= brief.slots:
-                    break
+                self.deliveries.drop()
+                if found == self._k:
+                    self._hold()
+                    if self._outages.get(found, (0, False))[0] >= self._brief.slots:
+                        break
+                else:
+                    self._due.missed(self._k, found)
                 continue
-            if k in outages and found >= k:  # back from a pause
-                stop, _ = outages[k]
-                follower.miss(range(k, stop))
-                reporter.skip(stop)
-                k = stop
-            if found != k:
-                if found < k:
-                    answers.had(found, message)
-                due.missed(k, found)
+            if self._k in self._outages and found >= self._k:  # back from a pause
+                self._return()
+            if found == self._k:
+                self._take()
                 continue
-            arrival = read_delivery(message, k, shape, brief.model.header, window)
-            answers.before(k, arrival)
-            belief = follower.take(k, arrival)
-            answers.after(k, belief)
-            reporter.add(k, belief, (follower.late, follower.late_used))
-            k += 1
-        answers.over(deliveries, downlink)
-        session.wait_for(End)
+            self.deliveries.drop()
+            if found < self._k:
+                self._replies.had(found, message)
+            self._due.missed(self._k, found)
+
+    def _hold(self) -> None:
+        """Report all slots before this one; if this process is away from now on, its belief, too."""
+        if self._k in self._outages:
+            # Before the report that the conductor waits for, which may then end this process at once.
+            _save(self._brief, self._core.belief)
+            self._put_telemetry(self._k, leaving(self._k, self._core.belief))
+        self._reporter.flush(self._k)
+
+    def _return(self) -> None:
+        stop, _ = self._outages[self._k]
+        self._core.miss(range(self._k, stop))
+        self._reporter.skip(stop)
+        self._k = stop
+
+    def _take(self) -> None:
+        """Take the deliveries of this slot, and of those after it that have arrived."""
+        brief, k = self._brief, self._k
+        messages = self.deliveries.take(k, 1 if self._replies.awaited else self._end_of_block - k)
+        slots = range(k, k + len(messages))
+        shape = len(brief.model.A), brief.trials
+        arrivals = read_deliveries(messages, k, shape, brief.model.header, brief.part.window)
+        self._replies.before(k, arrivals.gamma[0])
+        followed = self._core.take(slots, arrivals)
+        self._replies.after(k, self._core.belief)
+        self._reporter.add(slots, *followed)
+        self._k = slots.stop
+
+    @property
+    def _end_of_block(self) -> int:
+        """The slot up to which deliveries may be taken at once: none beyond the end of a report, or the next absence."""
+        k, batch = self._k, self._brief.flow.batch
+        return min(k - k % batch + batch, self._brief.slots, *(start for start in self._outages if start > k))
 
 
 @final
@@ -106,10 +147,15 @@ class ReceiverReplies:
         if self._acknowledge is not None:
             self._acknowledge(_acknowledged(delivery, k, self._trials))
 
-    def before(self, k: int, arrival: Arrival) -> None:
-        """Handle slot k's delivery before the receiver takes it."""
+    @property
+    def awaited(self) -> bool:
+        """Whether another process waits for an answer to every delivery, so that each is taken by itself."""
+        return self._acknowledge is not None or self._consultation is not None
+
+    def before(self, k: int, gamma: Flags) -> None:
+        """Handle slot k's delivery before the receiver takes it; gamma: γ (R,)."""
         if self._acknowledge is not None:
-            self._acknowledge(acknowledgement(k, arrival.heard.gamma))
+            self._acknowledge(acknowledgement(k, gamma))
         if self._consultation is not None:
             self._consultation.before(k)
 
@@ -118,14 +164,13 @@ class ReceiverReplies:
         if self._consultation is not None:
             self._consultation.after(k, belief)
 
-    def over(self, deliveries: Received, key: str) -> None:
+    def over(self, deliveries: Iterable[Reader]) -> None:
         """After the last slot, acknowledge deliveries that still arrive, on a thread of its own that ends with the session."""
         if self._acknowledge is not None:
-            threading.Thread(target=self._go_on, args=(deliveries, key), name="acknowledges", daemon=True).start()
+            threading.Thread(target=self._go_on, args=(deliveries,), name="acknowledges", daemon=True).start()
 
-    def _go_on(self, deliveries: Received, key: str) -> None:
-        for delivery in deliveries:
-            message = Reader(key, delivery)
+    def _go_on(self, deliveries: Iterable[Reader]) -> None:
+        for message in deliveries:
             if not is_barrier(message):
                 self.had(message.integer("k"), message)
 
@@ -144,12 +189,21 @@ def _save(brief: Brief[ReceiverPart], belief: Belief) -> None:
         np.savez(file, belief.x_hat, belief.P, belief.action, *belief.memory)
 
 
-def _remember(brief: Brief[ReceiverPart], follower: Follower, outages: dict[int, tuple[int, bool]]) -> None:
-    """Restore the belief that this process had when it was ended, if it keeps its state over this outage."""
+def _outages_of(brief: Brief[ReceiverPart]) -> dict[int, tuple[int, bool]]:
+    """First slot of each absence → the slot after it, and whether this process keeps its state."""
+    return {start: (stop, keeps) for start, stop, keeps in brief.part.outages}
+
+
+def _core_of(brief: Brief[ReceiverPart], receiver: Receiver) -> ReceiverCore:
+    """The receiver at its first slot, with the belief that it had when it was ended, if it keeps its state over this absence."""
+    core = ReceiverCore(receiver, brief.part.window, brief.first)
+    if not brief.first:
+        return core
+    outages = _outages_of(brief)
     start, keeps = next((start, keeps) for start, (stop, keeps) in outages.items() if stop == brief.first)
-    if not keeps or brief.part.state_file is None:
-        return
-    with np.load(brief.part.state_file) as saved:
-        x_hat, P, action, *memory = (saved[f"arr_{i}"] for i in range(len(saved.files)))
-        follower.belief = Belief(x_hat, P, action, tuple(memory))
-    follower.miss(range(start, brief.first))
+    if keeps and brief.part.state_file is not None:
+        with np.load(brief.part.state_file) as saved:
+            x_hat, P, action, *memory = (saved[f"arr_{i}"] for i in range(len(saved.files)))
+            core.belief = Belief(x_hat, P, action, tuple(memory))
+        core.miss(range(start, brief.first))
+    return core

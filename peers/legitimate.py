@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+from evedrop.conformance.checked import checked_estimator
+from evedrop.conformance.problems import Problem
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -18,7 +20,9 @@ from evedrop.peers.following import follow
 def estimate(brief: Brief[LegitimatePart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
     """Run the legitimate estimator of a brief; connect: opens its session."""
     scheme = scheme_of(brief.model.process, brief.part.scheme)
-    receiver, loop = scheme.estimator(brief.stream_keys, brief.batch), brief.part.controller
+    estimator = scheme.estimator(brief.stream_keys, brief.batch)
+    problem = Problem(brief.model.process, brief.batch)
+    receiver, loop = checked_estimator(estimator, brief.part.scheme["scheme"], problem), brief.part.controller
     if loop is not None and loop.plant is not None:
         receiver = InputAwareEstimator(receiver, loop.plant.plant, brief.part.window)
     consult = partial(Consultation, brief, loop, receiver=receiver) if loop is not None else None

@@ -7,26 +7,31 @@ from collections.abc import Callable, Collection
 from functools import partial
 from typing import final
 
-from evedrop.errors import RunError
+from evedrop.conformance.checked import checked_encoder
+from evedrop.conformance.problems import Problem
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.pending import most_slots
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_closed_loop import decoded
 from evedrop.live.protocol.brief_parts import SensorPart
 from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import End, Go, Hold, Start
-from evedrop.live.protocol.packets import PacketExtras, barrier, read_acknowledgement, resend, uplink
+from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
+from evedrop.model.local_filter import LocalFilter
 from evedrop.model.numeric.detection import CusumBatch
-from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
-from evedrop.model.schemes.scheme import Encoder, Packet, Scheme
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.slot.plant import PlantCore
+from evedrop.model.slot.sensor import SensorCore, Sent
 from evedrop.names import OBSERVER, SENSOR
-from evedrop.peers.closed_loop import Actuator
+from evedrop.peers.closed_loop import Steered
 
 _PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
 _LOOK_SECONDS = 0.05  # how soon a request to hold is noticed
@@ -91,22 +96,22 @@ class Window:
 
 @final
 class Barriers:
-    """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command."""
+    """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command.
+
+    flush: reports all slots below one.
+    """
 
     def __init__(
         self,
         brief: Brief[SensorPart],
         session: ProcessSession,
         window: Window,
-        scheme: Scheme,
-        actuator: Actuator | None,
+        telemetry: Callable[[int, bytes], None],
+        flush: Callable[[int], None],
     ) -> None:
         self._session, self._window = session, window
+        self._telemetry, self._flush = telemetry, flush
         self._barriers = set(brief.part.holds)
-        self._telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
-        watches = brief.part.chart is not None
-        inputs, measures = (0, False) if actuator is None else (actuator.inputs, actuator.measures)
-        self.reporter = TruthReporter(brief, self._telemetry, scheme.may_be_silent, watches, inputs, measures)
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
@@ -117,7 +122,7 @@ class Barriers:
 
     def wait_at(self, k: int) -> None:
         """Report all slots below k, and wait for the conductor's `go`."""
-        self.reporter.flush(k)
+        self._flush(k)
         self._telemetry(k, held(k))
         # The command may arrive more than once, and may belong to an earlier barrier.
         with self._session.place.waiting(self._session.keys.control(SENSOR)):
@@ -131,67 +136,143 @@ class Barriers:
 
 @final
 class Acknowledgements:
-    """Waits for the acknowledgements of each slot before the next is sent, and watches for attacks on them."""
+    """Waits for the acknowledgements of each slot before the next is sent."""
 
-    def __init__(self, brief: Brief[SensorPart], session: ProcessSession, encoder: Encoder) -> None:
-        self._encoder, self._trials = encoder, brief.trials
+    def __init__(self, brief: Brief[SensorPart], session: ProcessSession) -> None:
+        self._trials = brief.trials
         self._key = session.keys.acknowledgements
         self._inbox = session.inbox(self._key)
         self._due = GapDetector(self._key, brief.flow.longest_outage)
-        chart = brief.part.chart
-        self._watch = CusumBatch(chart, brief.trials) if chart is not None else None
 
-    def wait(self, k: int, packet: Packet) -> Flags | None:
-        """Wait for the acknowledgements of slot k; returns where they raise an alarm, (R,), or None if they are not watched."""
+    def wait(self, k: int) -> Flags:
+        """The acknowledgements of slot k, (R,)."""
         message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
-        acknowledged = read_acknowledgement(message, k, self._trials)
-        self._encoder.acknowledged(k, acknowledged)
-        return self._watch.take(acknowledged, packet.sent) if self._watch is not None else None
+        return read_acknowledgement(message, k, self._trials)
+
+
+@final
+class Sensing:
+    """The sensor's work on a session that is being opened.
+
+    It makes many slots at once, and sends one after the other. It makes one at a time where each is due at a certain time, or
+    where the next depends on an answer to it.
+    """
+
+    def __init__(self, brief: Brief[SensorPart], scheme: Scheme, core: SensorCore, session: ProcessSession) -> None:
+        part = brief.part
+        self._brief, self._session, self._core = brief, session, core
+        self._send = session.kept(session.keys.uplink, head=resend, back=part.history)
+        self._window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, self._send)
+        self._back = Acknowledgements(brief, session) if scheme.needs_acknowledgements else None
+        self._steered = None
+        inputs = 0
+        if part.plant is not None and part.controller is not None:
+            inputs = part.plant.plant.inputs
+            self._steered = Steered(brief, inputs, part.controller, session)
+        telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
+        self._reporter = TruthReporter(
+            brief, telemetry, scheme.may_be_silent, self._core.watches, inputs, self._core.filters
+        )
+        self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
+        self._betrayed = set(part.leaks.values())
+        self._start = 0.0
+
+    def carry_on(self) -> None:
+        """Send all slots."""
+        brief = self._brief
+        alone = brief.part.pace or self._back is not None or self._steered is not None
+        most = 1 if alone else most_slots(brief)
+        self._start = time.monotonic()
+        k = 0
+        while k < brief.slots:
+            batch = brief.flow.batch
+            slots = range(k, min(k + most, k - k % batch + batch, brief.slots))
+            self._wait(k, lambda: None)
+            self._block(slots)
+            k = slots.stop
+
+    def _block(self, slots: range) -> None:
+        """Make consecutive slots, send them, and report them. The first of them may be sent."""
+        made, first = self._core.send(slots), slots.start
+        packets = made.packets
+
+        def report(end: int) -> None:
+            """Report the slots that have been sent: at a barrier, nothing else may be on its way."""
+            nonlocal first
+            if end > first:
+                some = slice(first - slots.start, end - slots.start)
+                self._reporter.add(range(first, end), made.rows(some))
+                first = end
+
+        for row, k in enumerate(slots):
+            if row:
+                self._wait(k, lambda k=k: report(k))  # type: ignore[misc]
+            header, sent = (None if column is None else column[row] for column in (packets.header, packets.sent))
+            self._send(k, uplink(k, packets.z[row], header, sent, made.x[row] if k in self._betrayed else None))
+        if len(slots) == 1 and (self._back is not None or self._steered is not None):
+            self._answered(slots.start, made)
+        else:
+            report(slots.stop)
+
+    def _answered(self, k: int, made: Sent) -> None:
+        """Wait for the answers to slot k, and report it."""
+        alarms, sent = None, made.packets.at(0).sent
+        if self._back is not None:
+            alarms = self._core.acknowledged(k, self._back.wait(k), sent)
+        steered = None
+        if self._steered is not None:
+            u, failed = self._steered.wait(k, made.true[0])
+            if self._steered.decides(k):
+                self._core.hold(u)
+            steered = u[None], failed[None]
+        self._reporter.add(range(k, k + 1), made, None if alarms is None else alarms[None], steered)
+
+    def _wait(self, k: int, before: Callable[[], None]) -> None:
+        """Wait until slot k may be sent and is due; at a barrier before it, wait for the conductor, after calling `before`."""
+        self._session.place.slot = k
+        self._window.wait(k)
+        pace = self._brief.part.pace
+        # With a pace, a hold may be requested at any moment before the slot is due; each slot has at most one barrier.
+        while not (wanted := self._barriers.wanted(k)) and pace and (left := self._left(k)) > 0.0:
+            time.sleep(min(left, _LOOK_SECONDS))
+        if wanted:
+            before()
+            self._send(k, barrier(k))
+            began = time.monotonic()
+            self._barriers.wait_at(k)
+            self._start += time.monotonic() - began
+            time.sleep(max(0.0, self._left(k)) if pace else 0.0)
+
+    def _left(self, k: int) -> float:
+        """The seconds until slot k is due."""
+        return self._start + k * self._brief.part.pace - time.monotonic()
+
+
+def _core_of(brief: Brief[SensorPart], scheme: Scheme) -> SensorCore:
+    process, keys, entry = brief.model.process, brief.stream_keys, brief.part.plant
+    plant = None if entry is None else entry.plant
+    disturbances = None if entry is None else decoded(entry.disturbances, brief.slots)
+    initial = scheme.initial_state(keys, brief.batch)
+    local = None
+    if plant is not None and plant.output_matrix is not None:
+        local = LocalFilter(process, plant, keys.get("measurement", b""), brief.batch)
+    chart = brief.part.chart
+    encoder = scheme.encoder(keys, brief.batch)
+    return SensorCore(
+        checked_encoder(encoder, brief.part.scheme["scheme"], scheme, Problem(process, brief.batch)),
+        PlantCore(process, keys["process"], brief.batch, initial, plant, disturbances),
+        local,
+        None if chart is None else CusumBatch(chart, brief.trials),
+    )
 
 
 def sense(brief: Brief[SensorPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
     """Run the sensor of a brief; connect: opens its session."""
-    process, keys, part = brief.model.process, brief.stream_keys, brief.part
-    scheme = scheme_of(process, part.scheme)
-    encoder = scheme.encoder(keys, brief.batch)
-    initial = scheme.initial_state(keys, brief.batch)
-    noise = None if part.plant is None else part.plant.plant.noise
-    trajectory = Trajectory(process, keys["process"], brief.batch, initial, noise)
-    betrayed, pace = set(part.leaks.values()), part.pace
+    scheme = scheme_of(brief.model.process, brief.part.scheme)
+    core = _core_of(brief, scheme)
     with connect(brief) as session:
-        send = session.kept(session.keys.uplink, head=resend, back=part.history)
-        window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, send)
-        back = Acknowledgements(brief, session, encoder) if scheme.needs_acknowledgements else None
-        actuator = Actuator(brief, part.plant, session) if part.plant is not None else None
-        barriers = Barriers(brief, session, window, scheme, actuator)
+        sensing = Sensing(brief, scheme, core, session)
         session.ready()
         session.wait_for(Start)
-        start = time.monotonic()
-        for k in range(brief.slots):
-            session.place.slot = k
-            window.wait(k)
-            # With a pace, a hold may be requested at any moment before the slot is due; each slot has at most one barrier.
-            while not (wanted := barriers.wanted(k)) and pace and (left := start + k * pace - time.monotonic()) > 0.0:
-                time.sleep(min(left, _LOOK_SECONDS))
-            if wanted:
-                send(k, barrier(k))
-                began = time.monotonic()
-                barriers.wait_at(k)
-                start += time.monotonic() - began
-                time.sleep(max(0.0, start + k * pace - time.monotonic()) if pace else 0.0)
-            true = trajectory.advance(None if actuator is None else actuator.pushed(k))
-            x, predicted = true, trajectory.predicted
-            if actuator is not None:
-                x, predicted = actuator.transmitted(k, true, trajectory)
-            packet = encoder.encode(k, x, predicted)
-            if packet.z.shape != x.shape:
-                found, name = packet.z.shape, part.scheme["scheme"]
-                raise RunError(
-                    f"slot {k}: encode of the scheme {name} gave z of shape {found}; expected {x.shape}; correct the class"
-                )
-            beside = PacketExtras(packet.header, packet.sent, x if k in betrayed else None)
-            send(k, uplink(k, packet.z, **beside.given))
-            alarms = back.wait(k, packet) if back is not None else None
-            steered = actuator.wait(k, true) if actuator is not None else None
-            barriers.reporter.add(k, x, packet.nu, packet.sent, alarms, steered, true)
+        sensing.carry_on()
         session.wait_for(End)

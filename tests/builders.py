@@ -10,7 +10,8 @@ import numpy as np
 
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import Part
-from evedrop.model.process import Process
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Belief, Beliefs
 from evedrop.results.writer import Results, load_results
 from evedrop.streams import root_of_seed, stream_key
 
@@ -66,3 +67,14 @@ def part_of(brief: AnyBrief, kind: type[P]) -> P:
     """The part of a brief, which must be one of this role."""
     assert isinstance(brief.part, kind)
     return brief.part
+
+
+def mirrored(P: Floats) -> Floats:
+    """Covariances (…, n, n, R) with the upper triangles of P, each its own transpose."""
+    upper = np.triu(np.ones(P.shape[-3:-1], np.bool_))[:, :, None]
+    return np.where(upper, P, P.swapaxes(-3, -2))
+
+
+def one_slot(belief: Belief) -> Beliefs:
+    """A belief as a block of one slot."""
+    return Beliefs(belief.x_hat[None], belief.P[None], belief.action[None])

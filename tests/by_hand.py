@@ -9,16 +9,19 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import write_briefs
 from evedrop.live.launch.ports import places_at
+from evedrop.live.launch.preloading import process_starter
+from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief import read_brief
+from evedrop.names import OBSERVER
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from tests.conftest import wait_until
@@ -28,7 +31,7 @@ LONG = 90.0
 
 @dataclass
 class ByHand:
-    """Final."""
+    """A run, the processes that were started of it, and what they say."""
 
     scenario: Scenario
     folder: Path
@@ -39,7 +42,12 @@ class ByHand:
     """Whether it may be in clear although others could listen."""
     relay: str | None = None
     """Where the second router listens, if there is one."""
-    processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    paused: bool = False
+    """Whether it is held before slot 0, until a command lets it go on."""
+    processes: dict[str, StartedProcess] = field(default_factory=dict)
+    until_gone: ExitStack = field(default_factory=ExitStack)
+    """Is closed when the processes are gone."""
+    _servers: list[Starter] = field(default_factory=list)
     _done: list[int] = field(default_factory=list)
     _elsewhere: bool = False
 
@@ -47,10 +55,16 @@ class ByHand:
         """Write the briefs; endpoints: process → where it finds the router, if that is elsewhere."""
         self._elsewhere = bool(endpoints)
         places = places_at(self.endpoint, insecure=self.insecure, relay=self.relay)
-        for path in write_briefs(self.scenario, places, self.folder / "run", self.folder / "briefs", int(LONG)):
+        folders = (self.results, self.folder / "briefs")
+        for path in write_briefs(self.scenario, places, *folders, int(LONG), paused=self.paused):
             if path.stem in endpoints:
                 brief = json.loads(path.read_text())
                 path.write_text(json.dumps({**brief, "router": endpoints[path.stem]}))
+
+    @property
+    def results(self) -> Path:
+        """Its results folder."""
+        return self.folder / "run"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,17 +80,25 @@ class ByHand:
             names = self.names[1:]
         for name in names or self.names:
             path = self.folder / "briefs" / f"{name}.json"
-            command = [sys.executable, "-m", "evedrop", read_brief(path).role, str(path)]
             with self.log(name).open("ab") as log:
-                self.processes[name] = subprocess.Popen(
-                    [*self.entered.get(name, ()), *command],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE if name == "observer" else log,
-                    stderr=log,
-                    env={**os.environ, "TMPDIR": str(self.folder)},
-                )
+                self.processes[name] = self._started(read_brief(path).role, path, log)
         if "observer" in (names or self.names):
             threading.Thread(target=self._listen, daemon=True).start()
+
+    def _started(self, role: str, path: Path, log: IO[bytes]) -> StartedProcess:
+        environment = {**os.environ, "TMPDIR": str(self.folder)}
+        enter = self.entered.get(path.stem)
+        if enter is None:
+            if not self._servers:
+                self._servers.append(self.until_gone.enter_context(process_starter()))
+            return self._servers[0](role, path, log, environment)
+        return subprocess.Popen(
+            [*enter, sys.executable, "-m", "evedrop", role, str(path)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE if role == OBSERVER else log,
+            stderr=log,
+            env=environment,
+        )
 
     def _listen(self) -> None:
         lines = self.processes["observer"].stdout
@@ -111,18 +133,17 @@ class ByHand:
 
     def kill(self, name: str) -> None:
         """Kill -9."""
-        self.processes[name].kill()
-        self.processes[name].wait()
+        close(self.processes[name])
 
     def statuses(self, limit: float = LONG) -> dict[str, int]:
         """Process → its exit status, once all have ended."""
         wait_until(lambda: all(one.poll() is not None for one in self.processes.values()), "the end of all", limit)
-        return {name: one.returncode for name, one in self.processes.items()}
+        return {name: one.wait() for name, one in self.processes.items()}
 
     @property
     def summary(self) -> Mapping[str, Any]:
         """Of the results."""
-        return load_results(self.folder / "run").summary
+        return load_results(self.results).summary
 
 
 @contextmanager
@@ -133,8 +154,16 @@ def by_hand(scenario: Scenario, folder: Path, endpoint: str, **given: Any) -> It
         yield run
     finally:
         for process in run.processes.values():
-            process.kill()
-            process.wait()
+            close(process)
+        run.until_gone.close()
+
+
+def close(process: StartedProcess) -> None:
+    """Kill -9."""
+    process.kill()
+    process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
 
 
 def as_if_undisturbed(summary: Mapping[str, Any], scenario: Scenario, folder: Path) -> None:

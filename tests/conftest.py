@@ -22,10 +22,16 @@ from unittest.mock import patch
 import pytest
 from hypothesis import HealthCheck, settings
 
+from evedrop import preloaded
 from evedrop.cli import main as cli
+from evedrop.kernels import choice
+from evedrop.names import KERNELS_VARIABLE
 from evedrop.results.writer import Results, load_results
+from tests.commands import NEWS, TELLING, CommandProcess, ForkedCommand
 from tests.privileged import say_what_was_skipped
 
+FORKABLE = frozenset({"env", "cwd", "stdout"})
+"""The options of Popen that a forked command can have, too."""
 LIMIT = 120.0
 """Seconds after which a condition that a test waits for counts as never met: far above what a busy machine needs."""
 
@@ -33,6 +39,10 @@ LIMIT = 120.0
 settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("unhurried")
 
+
+# Where no C compiler worked, every run begins with a warning, which most tests do not expect: ask for numpy, as users can.
+if choice.KERNELS == choice.FALLBACK:
+    os.environ[KERNELS_VARIABLE] = choice.KERNELS = "numpy"
 
 # `nohup make test`, and a job in the background of a script, ignore these; the commands that tests start would too.
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
@@ -90,7 +100,7 @@ class Done:
 class Live:
     """A command that runs, its children, and what it leaves behind."""
 
-    def __init__(self, process: subprocess.Popen[str], temporary: Path, folder: Path, news: Path | None = None) -> None:
+    def __init__(self, process: CommandProcess, temporary: Path, folder: Path, news: Path | None = None) -> None:
         self.process = process
         self.temporary = temporary
         self.folder = folder
@@ -127,6 +137,11 @@ class Live:
             return []
         return self._news.read_text().rpartition("\n")[0].splitlines()  # the last line may be half written
 
+    def held(self) -> None:
+        """Wait until a run that begins paused is held before its first slot, and can be steered."""
+        wait_until(lambda: self.told("held") or self.process.poll() is not None, "a run that is held")
+        assert self.process.poll() is None, "the run must not end before it is steered"
+
     def running(self, more_than: int = 0) -> None:
         """Wait until it says that more than so much is done: what it measured is more than nothing."""
         wait_until(lambda: self.done() > more_than or self.process.poll() is not None, "a run under way")
@@ -146,7 +161,7 @@ class Live:
             out, err = self.process.communicate(timeout=limit)
         except subprocess.TimeoutExpired:
             pytest.fail(f"the command did not end within {limit:g} s")
-        return Done(self.process.returncode, out, err)
+        return Done(self.process.wait(), out, err)
 
     def nothing_left(self) -> None:
         """No process and no brief, key or password is left behind."""
@@ -157,30 +172,6 @@ class Live:
     def results(self) -> Results:
         """What is on disk."""
         return load_results(self.folder)
-
-
-TELLING = """
-from evedrop.interrupts import heed_signals
-heed_signals()
-import resource, sys
-from pathlib import Path
-from evedrop.__main__ import program
-from evedrop.cli.report import ProgressLine
-
-show, news, largest = ProgressLine.tell, Path(sys.argv[1]), int(sys.argv[2])
-if largest:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
-
-def tell(line, told):
-    with news.open("a") as file:
-        file.write(f"{getattr(told, 'done', 0)} {told.event}\\n")
-    show(line, told)
-
-ProgressLine.tell = tell
-sys.argv[1:] = sys.argv[3:]
-program()
-"""
-"""The command as it is, which besides writes what its progress line would show; and whose files may be limited in size."""
 
 
 @dataclass(frozen=True)
@@ -247,22 +238,48 @@ class Evedrop:
 
     def process(self, *arguments: str, **options: Any) -> Done:
         """The same in a process of its own; options are those of Popen."""
+        if options.keys() <= FORKABLE:
+            return Live(self._forked(arguments, self.environment, options), self.temporary, self.folder).end()
         return self.begun(*arguments, **options).end()
 
+    def _forked(
+        self, arguments: tuple[str, ...], environment: dict[str, str], options: Mapping[str, Any]
+    ) -> ForkedCommand:
+        folder = options.get("cwd", self.folder)
+        return ForkedCommand(arguments, options.get("env", environment), folder, options.get("stdout"))
+
     def begun(self, *arguments: str, **options: Any) -> Live:
-        """The same, without waiting for its end."""
+        """The same in a new interpreter, without waiting for its end."""
         return Live(self.start(["-m", "evedrop"], arguments, options), self.temporary, self.folder)
 
-    def started(self, *arguments: str, out: str = "run", largest_file: int = 0, **options: Any) -> Live:
-        """Start a command in a process of its own, to be followed and disturbed."""
+    def started(
+        self, *arguments: str, out: str = "run", largest_file: int = 0, interpreter: bool = False, **options: Any
+    ) -> Live:
+        """Start a command in a process of its own, to be followed and disturbed.
+
+        The process is forked from one that has made the imports, unless `interpreter`, the size of its files or other options
+        of Popen than those in FORKABLE ask for an interpreter of its own.
+        """
         news = self.folder / f"{out.replace('/', '-')}.news"
-        telling = ["-c", TELLING, str(news), str(largest_file)]
-        process = self.start(telling, (*arguments, "--out", out), options)
+        words = (*arguments, "--out", out)
+        options["env"] = {**options.get("env", self.environment), NEWS: str(news)}
+        if interpreter or largest_file or options.keys() - FORKABLE:
+            telling = ["-P", str(TELLING), str(largest_file)]
+            process: CommandProcess = self.start(telling, words, options)
+        else:
+            process = self._forked(words, self.environment, options)
         return Live(process, self.temporary, self.folder / out, news)
 
     def live(self, scenario: str, *arguments: str, **options: Any) -> Live:
         """Start a live run without a view."""
         return self.started("run", scenario, "--view", "off", *arguments, **options)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def imports_once() -> Iterator[None]:
+    """The live runs that tests start from this process need not make their imports again."""
+    with preloaded():
+        yield
 
 
 @pytest.fixture

@@ -6,6 +6,20 @@ import os
 
 from tests.conftest import Evedrop
 
+BEGIN = """
+import os
+import sys
+
+begun = []
+
+def opened(event, values):
+    if event == "open" and str(values[0]).endswith("/{name}.json") and not values[2] & (os.O_WRONLY | os.O_RDWR) and not begun:
+        begun.append(values)
+        import rogue
+
+sys.addaudithook(opened)
+"""
+"""When the process of a name reads its brief, it becomes another."""
 ROGUE = """
 import dataclasses
 import evedrop.peers.sensor
@@ -18,15 +32,14 @@ def change(how, honest=Report.pack):
     Report.pack = lambda self: honest(dataclasses.replace(self, **how(self)))
 
 def packets(how):
-    evedrop.peers.sensor.uplink = lambda k, z: how(k, z) if k else uplink(k, z)
+    evedrop.peers.sensor.uplink = lambda k, *rest: how(k, *rest) if k else uplink(k, *rest)
 
 """
 
 
 def with_rogue(evedrop: Evedrop, name: str, does: str) -> dict[str, str]:
     """The environment in which the process of that name does something else than it should."""
-    begin = f"import sys\nif sys.orig_argv[-1].endswith('/{name}.json'):\n    import rogue\n"
-    (evedrop.folder / "sitecustomize.py").write_text(begin)
+    (evedrop.folder / "sitecustomize.py").write_text(BEGIN.format(name=name))
     (evedrop.folder / "rogue.py").write_text(ROGUE + does + "\n")
     found = os.environ.get("PYTHONPATH", "")
     return {**evedrop.environment, "PYTHONPATH": f"{evedrop.folder}{os.pathsep}{found}".rstrip(os.pathsep)}

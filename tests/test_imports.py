@@ -56,10 +56,10 @@ def ours(names: set[str]) -> set[str]:
 
 
 def test_peers_and_network_stay_light() -> None:
-    """Peers, network and protocol load zenoh, msgpack, numpy, cryptography, and neither view nor results nor scenarios."""
+    """Peers, network and protocol load five packages and their own, and neither view nor results nor scenarios."""
     modules = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
     for module, names in loaded_by(*modules).items():
-        assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "_cffi_backend"}, module
+        assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "xxhash", "_cffi_backend"}, module
         assert not ours(names) & {"evedrop.view", "evedrop.results", "evedrop.score", "evedrop.scenario", "evedrop.api"}
 
 
@@ -70,26 +70,57 @@ def test_a_solver_is_loaded_only_when_a_controller_is_made() -> None:
     assert not packages(names) & {"osqp", "scipy"}
 
 
+MATHEMATICS = {"evedrop.model", "evedrop.streams", "evedrop.kernels", "evedrop.names", "evedrop.errors"}
+"""What the model may import."""
+
+
 def test_model_is_mathematics() -> None:
-    """The model loads numpy, and cryptography for its streams: no network, no view, no scipy outside theory."""
+    """The model loads numpy, cryptography for streams, xxhash for digests: no network, no view, no scipy outside theory."""
     model = [name for name in modules_of("model") if not name.startswith(SCIPY)]
     assert len(model) > 15
     for module, names in loaded_by(*model).items():
-        assert packages(names) <= {"numpy", "cryptography", "_cffi_backend"}, module
-        assert ours(names) <= {"evedrop.model", "evedrop.streams", "evedrop.kernels", "evedrop.errors"}, module
+        assert packages(names) <= {"numpy", "cryptography", "xxhash", "_cffi_backend"}, module
+        assert ours(names) <= MATHEMATICS, module
 
 
 def test_theory_may_use_scipy_and_no_more() -> None:
     """Theory loads scipy besides, and still neither network nor view nor results."""
     for module, names in loaded_by(*modules_of("model.theory")).items():
         assert packages(names) <= {"numpy", "scipy", "cryptography", "_cffi_backend"}, module
-        assert ours(names) <= {"evedrop.model", "evedrop.streams", "evedrop.kernels", "evedrop.errors"}, module
+        assert ours(names) <= MATHEMATICS, module
 
 
 @pytest.mark.parametrize("module", ["evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api"])
 def test_launcher_and_memory_load_neither_zenoh_nor_rerun(module: str) -> None:
     """The launcher stays clear of what could hang, so that it can end it; Monte Carlo and the Python calls need neither."""
     assert not packages(loaded_by(module)[module]) & {"zenoh", "rerun", "matplotlib"}
+
+
+STARTS = {
+    "evedrop.live.launch.launcher": {"numpy", "xxhash", "pydantic", "cryptography"},
+    "evedrop.live.observer.observer": {
+        "numpy",
+        "xxhash",
+        "pydantic",
+        "cryptography",
+        "zenoh",
+        "msgpack",
+        "pyarrow",
+        "tomli_w",
+    },
+    "evedrop.live.network.operator": {"numpy", "xxhash", "cryptography", "zenoh", "msgpack"},
+}
+"""Module → the packages, besides those that these need themselves, whose imports a run's first slot or a command may wait for."""
+THEIRS = {"pydantic_core", "annotated_types", "typing_extensions", "typing_inspection", "_cffi_backend", "cloudpickle"}
+SLOW = {"http.server", "rich", "multiprocessing", "asyncio", "unittest", "concurrent.futures"}
+
+
+@pytest.mark.parametrize("module", STARTS)
+def test_a_run_starts_without_what_only_its_end_or_its_view_needs(module: str) -> None:
+    """Neither scipy, nor the terminal's tables, nor a web server is loaded before the first slot."""
+    names = loaded_by(module)[module]
+    assert packages(names) - THEIRS <= STARTS[module] | {"_distutils_hack"}
+    assert not names & SLOW
 
 
 def test_the_command_line_loads_nothing_to_print_help() -> None:

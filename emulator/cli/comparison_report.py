@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
-from evedrop.score.kept import MARKS, SecrecyKept
+from evedrop.score.verdict import MARKS, SecrecyKept
 
 if TYPE_CHECKING:
     from evedrop.results.comparison import Cell, Comparison, SimulatedError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import entries, output
+from evedrop.cli.options import entries, output, workers
 
 if TYPE_CHECKING:
     from evedrop.memory.montecarlo import Plan
@@ -13,9 +13,7 @@ if TYPE_CHECKING:
 
 def memory(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how trials are computed."""
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of worker processes; does not affect the results"
-    )
+    workers(parser)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="use a Dask cluster, tcp://HOST:PORT")
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument(

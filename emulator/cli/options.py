@@ -57,12 +57,18 @@ def entries(parser: argparse.ArgumentParser) -> None:
 def output(parser: argparse.ArgumentParser) -> None:
     """Add the options for the results folder and for JSON."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
-    parser.add_argument("--json", action="store_true", help="print only the summary, as JSON, on standard output")
+    as_json(parser, "print only the summary, as JSON, on standard output")
 
 
-def as_json(parser: argparse.ArgumentParser) -> None:
-    """Add `--json`, for JSON instead of text."""
-    parser.add_argument("--json", action="store_true", help="print JSON")
+def as_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
+    """Add `--json`, for JSON instead of text; what: the help."""
+    parser.add_argument("--json", action="store_true", help=what)
+
+
+def workers(parser: argparse.ArgumentParser) -> None:
+    """Add `--workers`, the number of processes that compute trials in memory."""
+    what = "number of worker processes; does not affect the results"
+    parser.add_argument("--workers", type=int, metavar="N", help=what)
 
 
 def served(parser: argparse.ArgumentParser) -> None:

@@ -25,6 +25,7 @@ from rich.progress import (
 from rich.table import Table
 
 from evedrop.figures import columns, shown_figure, unloadable_figures
+from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import ControllerSummary, LinkSummary, Summary
@@ -85,6 +86,8 @@ class ProgressLine:
         self._task: TaskID = self._progress.add_task("starting", total=total, rate="", errors="")
 
     def __enter__(self) -> Self:
+        if (warning := fallback_warning()) is not None:
+            self.console.print(f"warning: {warning}", soft_wrap=True)
         self._progress.start()
         return self
 

@@ -118,7 +118,7 @@ def _dry_run(
         lambda process: scheme_of(process, scheme),
         SCHEMES[scheme["scheme"]],
     )
-    return how_broken(EavesdropperChecks(listening).shapes, Problem(model, Batch(*batch)))
+    return how_broken(EavesdropperChecks(listening).at_first, Problem(model, Batch(*batch)))
 
 
 _ASKED: Mapping[str, Callable[..., Any]] = {

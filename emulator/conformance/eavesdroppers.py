@@ -12,9 +12,10 @@ from typing import Any, final
 
 import numpy as np
 
+from evedrop.conformance.blocks import expect_same_followed
 from evedrop.conformance.packets import SchemeOf, Slot, expect_belief, frozen_belief, made, played, row_of
 from evedrop.conformance.problems import Problem, large, small
-from evedrop.conformance.receivers import Step, expect_actions, expect_expected, expect_pure
+from evedrop.conformance.receivers import ReceiverChecks, Step, expect_actions, expect_expected, expect_pure
 from evedrop.conformance.rules import (
     Broken,
     NamedKeys,
@@ -24,19 +25,12 @@ from evedrop.conformance.rules import (
     expect_bool,
     expect_names,
     expect_outcomes,
-    expect_same,
     frozen,
     judged,
 )
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes.scheme import Scheme
-
-_COLUMN = (
-    "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "
-    "batch's trials"
-)
-_STATE = "keep no state outside of Belief, and take random numbers from the streams alone"
 
 
 @dataclass(frozen=True)
@@ -96,22 +90,34 @@ def eavesdropper_verdicts(listening: Listening) -> list[RuleVerdict]:
         ("a slot asked for again", checks.again),
         ("packets that were lost", checks.lost),
         ("actions that γ tells", checks.actions),
+        ("many slots at once", checks.blocks),
     ]
     return judged((exact, small(slots)), ([("what it says to theory", checks.theory)], large()))
 
 
 @final
-class EavesdropperChecks:
+class EavesdropperChecks(ReceiverChecks):
     """The rules, each checked on one problem."""
+
+    state = "keep no state outside of Belief, and take random numbers from the streams alone"
 
     def __init__(self, listening: Listening) -> None:
         self._listening = listening
+        self._heard: dict[int, tuple[Problem, list[Step]]] = {}
+        """Its steps on a problem, by the problem's id."""
 
-    def _rows(self, problem: Problem, rubbish: float = 0.0) -> list[Row]:
-        return [row_of(step[2]) for _, step in self._listening.steps(problem, rubbish)]
+    def rows(self, problem: Problem, rubbish: float = 0.0) -> Iterator[Row]:
+        """Its beliefs."""
+        return (row_of(step[2]) for _, step in self._listening.steps(problem, rubbish))
+
+    def undisturbed(self, problem: Problem) -> list[Row]:
+        """Its beliefs, computed once."""
+        return [row_of(after) for _, _, after in self._steps(problem)]
 
     def _steps(self, problem: Problem) -> list[Step]:
-        return [step for _, step in self._listening.steps(problem)]
+        if id(problem) not in self._heard:
+            self._heard[id(problem)] = (problem, [step for _, step in self._listening.steps(problem)])
+        return self._heard[id(problem)][1]
 
     def shapes(self, problem: Problem) -> None:
         """All results have the right shapes and types, and no input is changed."""
@@ -119,7 +125,7 @@ class EavesdropperChecks:
         with calling("streams()", kind):
             streams = kind.streams(parameters)
         expect_names("streams()", streams)
-        self._rows(problem)
+        self._steps(problem)
         with calling("outcomes() and follows_gamma()", kind):
             outcomes_at = kind.outcomes(parameters, 0.5)
             follows = kind.follows_gamma(parameters)
@@ -138,33 +144,9 @@ class EavesdropperChecks:
             expect_outcomes(f"outcomes() of the quality {mu_e}", found)
         expect_bool("follows_gamma()", follows)
 
-    def twice(self, problem: Problem) -> None:
-        """Two that take turns do the same as one alone."""
-        once = self._rows(problem)
-        both = list(zip(*(self._listening.steps(problem) for _ in range(2)), strict=True))
-        for which in (0, 1):
-            rows = [row_of(pair[which][1][2]) for pair in both]
-            said = "{0!r} by itself and {1!r} with another one of its kind"
-            expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
-
-    def alone(self, problem: Problem) -> None:
-        """A trial alone gives the same bits as among others."""
-        among = self._rows(problem)
-        for trial in (0, problem.batch.trials - 1):
-            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            number = problem.batch.first_trial + trial
-            expect_same(among, self._rows(problem.part(trial, 1)), slice(trial, trial + 1), number, said, _COLUMN)
-
     def again(self, problem: Problem) -> None:
         """It gives the same answer for a slot after later slots."""
         expect_pure(self._listening.made(problem), self._steps(problem), problem, self._listening.kind)
-
-    def lost(self, problem: Problem) -> None:
-        """The value in place of a lost packet changes nothing."""
-        said = "{0!r} or {1!r}, depending on z where nothing was received"
-        remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
-        rubbish = self._rows(problem, rubbish=1e30)
-        expect_same(self._rows(problem), rubbish, slice(None), problem.batch.first_trial, said, remedy)
 
     def actions(self, problem: Problem) -> None:
         """If it follows γ, γ alone determines its actions, and so its beliefs."""
@@ -172,6 +154,11 @@ class EavesdropperChecks:
         if kind.follows_gamma(self._listening.parameters):
             remedy = "let follows_gamma() return False"
             expect_actions(self._listening.made(problem), self._steps(problem), problem, kind, remedy)
+
+    def blocks(self, problem: Problem) -> None:
+        """Blocks of slots give the same beliefs as single slots."""
+        listening = self._listening
+        expect_same_followed(lambda: listening.made(problem), self._steps(problem), problem, listening.kind)
 
     def theory(self, problem: Problem) -> None:
         """The outcomes it states are the observed ones, if it states any for this scheme."""

@@ -66,8 +66,8 @@ def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterato
     for option, one in classes.items():
         title = f"{one.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
         if option == "eavesdropper":
-            beside = classes.get("scheme") or _beside(one)
-            yield Examined(f"{title}, with the scheme {beside.name}", _listened(one, beside))
+            scheme = classes.get("scheme") or _scheme_for(one)
+            yield Examined(f"{title}, with the scheme {scheme.name}", _listened(one, scheme))
         else:
             yield Examined(title, _verdicts(option, one))
 
@@ -102,15 +102,15 @@ def _verdicts(option: str, one: _Named) -> list[RuleVerdict]:
     return checks(lambda: one.kind(**one.parameters), one.kind).verdicts()
 
 
-def _listened(one: _Named, beside: _Named) -> list[RuleVerdict]:
-    lacking = sorted({*_streams(one)} - {*beside.kind.secret_streams})
+def _listened(one: _Named, scheme: _Named) -> list[RuleVerdict]:
+    lacking = sorted({*_streams(one)} - {*scheme.kind.secret_streams})
     if lacking:
         raise UsageError(
-            f"--eavesdropper {one.name}: asks for the key of {' and '.join(lacking)}, and the scheme {beside.name} has "
-            f"{', '.join(beside.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
+            f"--eavesdropper {one.name}: asks for the key of {' and '.join(lacking)}, and the scheme {scheme.name} has "
+            f"{', '.join(scheme.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
         )
-    spec = {"scheme": beside.name, **beside.parameters}
-    listening = Listening(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), beside.kind)
+    spec = {"scheme": scheme.name, **scheme.parameters}
+    listening = Listening(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), scheme.kind)
     try:
         return eavesdropper_verdicts(listening)
     except Broken as error:
@@ -125,7 +125,7 @@ def _streams(one: _Named) -> list[str]:
         raise UsageError(f"--eavesdropper {one.name}: {error}") from error
 
 
-def _beside(one: _Named) -> _Named:
+def _scheme_for(one: _Named) -> _Named:
     """The paper's scheme, or the first scheme that has the keys the eavesdropper asks for."""
     needed = {*_streams(one)}
     for name in ("innovation", *SCHEMES):

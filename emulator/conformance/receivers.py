@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from evedrop.conformance.packets import expect_belief, row_of
 from evedrop.conformance.problems import QUALITY, Problem
-from evedrop.conformance.rules import Broken, calling, expect_array, expect_same
+from evedrop.conformance.rules import Broken, Row, calling, expect_array, expect_same
 from evedrop.model import update
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Receiver, Reception
@@ -17,9 +19,64 @@ from evedrop.model.theory.covariances import ExpectedCovariance, OutcomesAt
 SIGMAS = 6.0
 """Standard deviations allowed for chance."""
 _SLACK = 0.02
+_COLUMN = (
+    "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "
+    "batch's trials"
+)
 
 Step = tuple[Belief, Reception, Belief]
 """The belief before a slot, the reception in it, and the belief after it."""
+
+
+class ReceiverChecks(ABC):
+    """The rules that schemes and eavesdroppers share, each checked on one problem."""
+
+    state: ClassVar[str]
+    """What to do if another one of its kind makes a difference."""
+
+    @abstractmethod
+    def rows(self, problem: Problem, rubbish: float = 0.0) -> Iterable[Row]:
+        """Everything that is compared, slot by slot; rubbish: the value in place of a lost packet."""
+
+    @abstractmethod
+    def undisturbed(self, problem: Problem) -> list[Row]:
+        """The same of one by itself, computed once for all rules that compare something with it."""
+
+    @abstractmethod
+    def shapes(self, problem: Problem) -> None:
+        """All results have the right shapes and types, and no input is changed."""
+
+    @abstractmethod
+    def blocks(self, problem: Problem) -> None:
+        """Blocks of slots give the same results as single slots."""
+
+    def at_first(self, problem: Problem) -> None:
+        """The rules that a dry run checks: shapes, types and blocks of slots."""
+        self.shapes(problem)
+        self.blocks(problem)
+
+    def twice(self, problem: Problem) -> None:
+        """Two that take turns do the same as one alone."""
+        once = self.undisturbed(problem)
+        for rows in zip(*zip(self.rows(problem), self.rows(problem), strict=True), strict=True):
+            said = "{0!r} by itself and {1!r} with another one of its kind"
+            expect_same(once, rows, slice(None), problem.batch.first_trial, said, self.state)
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone gives the same bits as among others."""
+        among = self.undisturbed(problem)
+        for trial in (0, problem.batch.trials - 1):
+            one = list(self.rows(problem.part(trial, 1)))
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            number = problem.batch.first_trial + trial
+            expect_same(among, one, slice(trial, trial + 1), number, said, _COLUMN)
+
+    def lost(self, problem: Problem) -> None:
+        """The value in place of a lost packet changes nothing."""
+        zeros, rubbish = self.undisturbed(problem), list(self.rows(problem, 1e30))
+        said = "{0!r} or {1!r}, depending on z where nothing was received"
+        remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
+        expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, said, remedy)
 
 
 def expect_pure(receiver: Receiver, steps: Sequence[Step], problem: Problem, kind: type) -> None:

@@ -147,12 +147,15 @@ def _short(value: Any) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def expect_same(one: Sequence[Row], other: Sequence[Row], trials: slice, first: int, said: str, remedy: str) -> None:
+def expect_same(
+    one: Sequence[Row], other: Sequence[Row], trials: slice, first: int, said: str, remedy: str, start: int = 0
+) -> None:
     """Raise Broken at the first slot, array and trial in which two records differ by a bit.
 
-    trials: those of `one` that `other` has; first: the number of the first of them; said: a text with places for both values.
+    trials: those of `one` that `other` has; first: the number of the first of them; said: a text with places for both values;
+    start: the first slot.
     """
-    for k, (row, again) in enumerate(zip(one, other, strict=True)):
+    for k, (row, again) in enumerate(zip(one, other, strict=True), start):
         for name, found in row.items():
             mine, theirs = found[..., trials], again[name]
             differ = mine.view(np.uint8) != theirs.view(np.uint8) if mine.dtype == np.bool_ else _differ(mine, theirs)

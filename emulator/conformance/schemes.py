@@ -5,16 +5,19 @@ Source: docs/your-own.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import final
 
 import numpy as np
 
-from evedrop.conformance.packets import SchemeOf, Slot, made, played, row_of
+from evedrop.conformance.blocks import expect_same_in_blocks
+from evedrop.conformance.packets import SchemeOf, Slot, made, played
 from evedrop.conformance.problems import Problem, large, small
-from evedrop.conformance.receivers import SIGMAS, expect_actions, expect_expected, expect_pure
+from evedrop.conformance.receivers import SIGMAS, ReceiverChecks, expect_actions, expect_expected, expect_pure
 from evedrop.conformance.rules import (
     Broken,
     NamedKeys,
+    Row,
     RuleVerdict,
     calling,
     expect_bool,
@@ -27,12 +30,7 @@ from evedrop.conformance.rules import (
 from evedrop.model.outcomes import legitimate_outcomes
 from evedrop.model.schemes.scheme import Scheme
 
-_COLUMN = (
-    "compute each trial from its own column alone: no sum over trials, no `@` or other BLAS, random numbers by the "
-    "batch's trials"
-)
 _QUALITIES = (0.0, 0.5, 1.0)
-_STATE = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
 
 
 def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict]:
@@ -47,20 +45,36 @@ def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict
         ("packets that were lost", checks.lost),
         ("slot 0", checks.first),
         ("actions that γ tells", checks.actions),
+        ("many slots at once", checks.blocks),
     ]
     in_the_mean = [("no worse than prediction", checks.prediction), ("what it says to theory", checks.theory)]
     return judged((exact, small()), (in_the_mean, large()))
 
 
 @final
-class SchemeChecks:
+class SchemeChecks(ReceiverChecks):
     """The rules, each checked on one problem."""
+
+    state = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
 
     def __init__(self, scheme_of: SchemeOf, kind: type[Scheme]) -> None:
         self._scheme_of, self._kind = scheme_of, kind
+        self._played: dict[tuple[int, bool], tuple[Problem, list[Slot]]] = {}
+        """The slots of a problem, by its id and whether the sides were made apart."""
 
-    def _slots(self, problem: Problem, apart: bool = False, rubbish: float = 0.0) -> list[Slot]:
-        return list(played(self._scheme_of, problem, self._kind, apart=apart, rubbish=rubbish))
+    def _slots(self, problem: Problem, apart: bool = False) -> list[Slot]:
+        if (id(problem), apart) not in self._played:
+            found = list(played(self._scheme_of, problem, self._kind, apart=apart))
+            self._played[id(problem), apart] = (problem, found)
+        return self._played[id(problem), apart][1]
+
+    def rows(self, problem: Problem, rubbish: float = 0.0) -> Iterator[Row]:
+        """Packets and beliefs."""
+        return (slot.row for slot in played(self._scheme_of, problem, self._kind, rubbish=rubbish))
+
+    def undisturbed(self, problem: Problem) -> list[Row]:
+        """Packets and beliefs, computed once."""
+        return [slot.row for slot in self._slots(problem)]
 
     def shapes(self, problem: Problem) -> None:
         """All results have the right shapes and types, made together and apart, and no input is changed."""
@@ -74,8 +88,7 @@ class SchemeChecks:
             raise Broken(f"estimator_streams has {more}, which secret_streams lacks; expected some of those")
         expect_probability("state_probability", scheme.state_probability)
         for apart in (False, True):
-            for _ in played(self._scheme_of, problem, self._kind, apart=apart):
-                pass
+            self._slots(problem, apart)
         for mu in _QUALITIES:
             with calling("outcomes()", self._kind):
                 found = scheme.outcomes(mu)
@@ -87,25 +100,6 @@ class SchemeChecks:
             bits = (scheme.packet_bits, scheme.secret_bits, scheme.initial_secret_bits)
         if any(type(one) is not int or one < 0 for one in bits):
             raise Broken(f"packet_bits, secret_bits and initial_secret_bits are {bits!r:.80}; expected whole numbers")
-
-    def twice(self, problem: Problem) -> None:
-        """Two that take turns do the same as one alone."""
-        once = [slot.row for slot in self._slots(problem)]
-        pair = (played(self._scheme_of, problem, self._kind) for _ in range(2))
-        both = list(zip(*pair, strict=True))
-        for which in (0, 1):
-            rows = [slots[which].row for slots in both]
-            said = "{0!r} by itself and {1!r} with another one of its kind"
-            expect_same(once, rows, slice(None), problem.batch.first_trial, said, _STATE)
-
-    def alone(self, problem: Problem) -> None:
-        """A trial alone gives the same bits as among others."""
-        among = [slot.row for slot in self._slots(problem)]
-        for trial in (0, problem.batch.trials - 1):
-            one = [slot.row for slot in self._slots(problem.part(trial, 1))]
-            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            number = problem.batch.first_trial + trial
-            expect_same(among, one, slice(trial, trial + 1), number, said, _COLUMN)
 
     def apart(self, problem: Problem) -> None:
         """Sensor and estimator made separately, as in a live run, do the same as in memory."""
@@ -123,14 +117,6 @@ class SchemeChecks:
             estimator = scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
         expect_pure(estimator, [(one.before, one.heard, one.after) for one in slots], problem, self._kind)
 
-    def lost(self, problem: Problem) -> None:
-        """The value in place of a lost packet changes nothing."""
-        zeros = [row_of(slot.after) for slot in self._slots(problem)]
-        rubbish = [row_of(slot.after) for slot in self._slots(problem, rubbish=1e30)]
-        said = "{0!r} or {1!r}, depending on z where nothing was received"
-        remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
-        expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, said, remedy)
-
     def first(self, problem: Problem) -> None:
         """The packet of slot 0 is not an innovation, because there is no state before it."""
         slot = next(iter(played(self._scheme_of, problem, self._kind)))
@@ -147,6 +133,10 @@ class SchemeChecks:
             estimator = scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
         steps = [(one.before, one.heard, one.after) for one in self._slots(problem)]
         expect_actions(estimator, steps, problem, self._kind, "set reads_packets = True if it depends on more than γ")
+
+    def blocks(self, problem: Problem) -> None:
+        """Blocks of slots give the same packets and beliefs as single slots."""
+        expect_same_in_blocks(made(self._scheme_of, problem, self._kind), self._slots(problem), problem, self._kind)
 
     def prediction(self, problem: Problem) -> None:
         """The estimator's mean error never exceeds that of a receiver that hears nothing."""

@@ -119,8 +119,8 @@ def _split(scenario: Scenario, receiver: str) -> Split:
 
 def _independent(scenario: Scenario, receiver: str) -> bool:
     """Whether a link loses packets independently, and neither delays nor changes; colluding links count as one."""
-    course = scenario.course(receiver)
-    law = law_of(course)
-    if law is None or law.alike is None or course.correlation is not None or course.outages or course.changes:
+    schedule = scenario.schedule(receiver)
+    law = law_of(schedule)
+    if law is None or law.alike is None or schedule.correlation is not None or schedule.outages or schedule.changes:
         return False
-    return set(course.settings) == {"loss"} and scenario.link(receiver).model.chain is not None
+    return set(schedule.settings) == {"loss"} and scenario.link(receiver).model.chain is not None

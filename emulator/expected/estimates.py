@@ -84,5 +84,5 @@ def written_bytes(scenario: Scenario) -> float:
     n, receivers = len(scenario.process.A), len(scenario.receivers)
     recorded_row = 8 * (2 * n + n * n) + 40
     journal_row = scenario.trials / 8 + 60
-    digest_rows = scenario.trials / 256 * 50
+    digest_rows = scenario.trials / 256 * 34
     return scenario.slots * receivers * (recorded_row * scenario.record_trials + journal_row + digest_rows + 80)

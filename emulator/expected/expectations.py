@@ -29,6 +29,19 @@ class ExpectedTraceStream(Protocol):
 
 
 @final
+class KnownTraces:
+    """The stream of traces that have been computed, (slots,)."""
+
+    def __init__(self, traces: Floats) -> None:
+        self._left = traces
+
+    def next_traces(self, slots: int) -> Floats:
+        """The traces of the next slots, (slots,)."""
+        found, self._left = self._left[:slots], self._left[slots:]
+        return found
+
+
+@final
 class _Unknown:
     """The stream of a receiver that no theory covers."""
 
@@ -134,7 +147,7 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     return {
         name: Expectation(
             scenario.process.process,
-            law_of(scenario.course(name)),
+            law_of(scenario.schedule(name)),
             outcomes_of(scenario, name),
             bound_of(scenario, name),
             closed_of(scenario, name),

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from evedrop.errors import TraceError
-from evedrop.fitting import losses
-from evedrop.fitting.candidate import Candidate, wilson
-from evedrop.fitting.delays import delay_candidates
+from evedrop.fitting import candidate
+from evedrop.fitting.candidate import Candidate, delay_candidates, wilson
 from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
-from evedrop.model.links.checks import toml_of
+from evedrop.model.checks import toml_of
 from evedrop.recordings.link_recording import LinkRecording, Outcomes
 
 FEWEST = 100
@@ -127,7 +126,7 @@ def fit(path: Path, column: str | None = None, delay_column: str | None = None) 
     if wanted is not None and len(delays) < _FEWEST_DELAYS:
         what = f"{wanted} has {len(delays)} delays; expected {_FEWEST_DELAYS} or more, such as a longer recording"
         raise TraceError(str(path), "file", what)
-    candidates = [losses.bernoulli(outcomes), losses.gilbert(outcomes), losses.gilbert_elliott(outcomes)]
+    candidates = [candidate.bernoulli(outcomes), candidate.gilbert(outcomes), candidate.gilbert_elliott(outcomes)]
     chosen = min(candidates, key=lambda one: one.bic(len(outcomes)))
     return Fit(
         str(path),

@@ -5,7 +5,6 @@ Source: docs/scenario.md.
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
 from collections.abc import Mapping
@@ -19,17 +18,23 @@ from pydantic import ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, is_folder, is_there, shown, text_of
 from evedrop.loading.mistakes import mistakes_across
-from evedrop.model.registry import place_of
+from evedrop.model.registry import near, place_of
 from evedrop.plugins import named_in
-from evedrop.scenario.disturbances import disturbances_beside, disturbances_read
 from evedrop.scenario.drawn import with_faults
 from evedrop.scenario.dry_run import dry_run, foreign
+from evedrop.scenario.events import EVENTS
 from evedrop.scenario.filter_noise import filter_noise_read
-from evedrop.scenario.recordings import beside, read_recordings
+from evedrop.scenario.input_files import (
+    disturbance_file_located,
+    disturbances_read,
+    read_recordings,
+    recordings_located,
+)
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.valid import ValidTables
 from evedrop.scenario.values import unusable
+from evedrop.scenario.words import listed
 
 MOST_BYTES = 2**28
 """The largest scenario file: room for the outcomes of millions of packets."""
@@ -85,10 +90,9 @@ def read(source: str | Path) -> str:
     except Unreadable as error:
         if is_there(path):
             raise UsageError(f"{shown(path)} cannot be read ({error}); a scenario is a TOML file") from error
-        near = difflib.get_close_matches(str(source), shipped(), 1)
-        hint = f"did you mean {near[0]}? " if near else ""
+        hint = near(source, shipped()) or ";"
         raise UsageError(
-            f"no scenario {shown(source)} ({error}); {hint}`evedrop list` shows the shipped ones"
+            f"no scenario {shown(source)} ({error}){hint} `evedrop list` shows the shipped ones"
         ) from error
 
 
@@ -117,8 +121,8 @@ def parse(
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     if mistakes := list(unusable(tables)):
         raise ScenarioError(source, mistakes)
-    beside(tables, folder)
-    disturbances_beside(tables, folder)
+    recordings_located(tables, folder)
+    disturbance_file_located(tables, folder)
     for entry in ("secret_file", "modules"):
         if isinstance(tables.get(entry), str):
             tables[entry] = str((folder / tables[entry]).absolute())
@@ -147,7 +151,7 @@ def checked(
         tables["modules"] = str(Path(tables["modules"]).absolute())
     recordings = [*read_recordings(tables), *disturbances_read(tables), *filter_noise_read(tables)]
     try:
-        scenario = Scenario.model_validate(tables)
+        scenario = Scenario.read(tables)
     except ValidationError as error:
         mistakes = [*sentences(error, Scenario), *recordings, *_across(tables, beyond_horizon, None)]
         raise ScenarioError(source, mistakes) from error
@@ -158,7 +162,7 @@ def checked(
         tables, found = with_faults(tables, scenario)
         mistakes += found
         if not mistakes:
-            scenario = Scenario.model_validate(tables)
+            scenario = Scenario.read(tables)
             mistakes = _across(tables, beyond_horizon, scenario)
     if mistakes:
         raise ScenarioError(source, mistakes)
@@ -217,3 +221,29 @@ def value_of(text: str) -> Any:
     except (ValueError, RecursionError):
         return text
     return tables["value"] if len(tables) == 1 else text
+
+
+def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenario:
+    """The scenario with the event added at a slot, after everything else in that slot; the event itself states no time.
+
+    Raises ScenarioError with every mistake, worded as for the events of a file but without the new event's number.
+    """
+    tables = scenario.model_dump(mode="json", exclude_none=True)
+    number = len(tables["event"])
+    kinds = [kind for kind in EVENTS.values() if kind.by_operator]
+    strange = [name for name in event if not any(name in kind.own_entries() for kind in kinds)]
+    if strange:
+        known = listed([" with ".join(kind.own_entries()) for kind in kinds])
+        raise ScenarioError("event", [f"{name}: cannot be done now; expected {known}" for name in strange])
+    if scenario.modules is None and any(named_in(event)):
+        name = next(iter(named_in(event)))
+        raise ScenarioError(
+            "event", [f"set: names {name}, and the run was started without modules; expected a built-in class"]
+        )
+    tables["event"].append({**event, "at": at})
+    try:
+        # The horizon does not depend on events, and was checked when the run was started.
+        return checked(tables, "event", beyond_horizon=True)
+    except ScenarioError as error:
+        mistakes = [line.removeprefix(f"event.{number}.") for line in error.mistakes]
+        raise ScenarioError(error.source, mistakes) from error

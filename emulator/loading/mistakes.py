@@ -6,13 +6,12 @@ Source: docs/architecture.md, how a scenario is checked.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
 
+from evedrop.errors import UsageError
 from evedrop.expected.expectations import expectations_of
-from evedrop.files import Unreadable, contents
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Process
 from evedrop.model.schemes import scheme_of
@@ -29,7 +28,7 @@ from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.nemesis import nemesis_mistakes
 from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.sentences import sentences
-from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
+from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.valid import ValidTables
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
@@ -65,7 +64,10 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
             together = "event: several of them together result in an invalid link"
             found += [f"{together}: {line}" for line in sentences(error, LinkTable)]
     if tables.secret_file is not None:
-        found += _secret_mistakes(tables.secret_file)
+        try:
+            secret_in(tables.secret_file)
+        except UsageError as error:
+            found.append(str(error))
     return [*found, *_expectation_mistakes(tables, sound=not found)]
 
 
@@ -106,17 +108,6 @@ def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:
         return None
     known = expectations_of(tables.scenario)[name].known
     return None if known else f"no theory covers {name} with these links, attacks and events together"
-
-
-def _secret_mistakes(file: str) -> list[str]:
-    """Reasons why a file cannot hold a secret."""
-    try:
-        size = len(contents(Path(file), MOST_SECRET_BYTES))
-    except Unreadable as error:
-        return [f"secret_file: {file} cannot be read ({error}); expected a file of {SECRET_BYTES} or more random bytes"]
-    if size < SECRET_BYTES:
-        return [f"secret_file: {file} has {size} bytes; expected {SECRET_BYTES} or more, random ones"]
-    return []
 
 
 def _horizon_mistakes(process: Process, slots: int) -> list[str]:

@@ -1,6 +1,7 @@
-"""Checks the results of classes that are not built in: an error in any slot is reported with class, slot and trials.
+"""Checks the classes of a scenario in memory that are not built in: an error in any slot names class, slots and trials.
 
-A dry run calls them for the first slots only (`evedrop.scenario.dry_run`); a live run checks each of their messages.
+Encoders and receivers are checked as in a live run (`evedrop.conformance.checked`); what else a simulation asks of a class is
+checked here.
 
 Source: docs/your-own.md, mistakes.
 """
@@ -13,17 +14,23 @@ from typing import Any, final
 
 import numpy as np
 
-from evedrop.conformance.packets import expect_belief, expect_packet
+from evedrop.conformance.checked import (
+    asking,
+    checked_eavesdropper,
+    checked_encoder,
+    checked_estimator,
+    eavesdropper_in_words,
+    is_foreign,
+    scheme_in_words,
+)
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.rules import Broken, expect_array, expect_finite
-from evedrop.errors import EvedropError, RunError
 from evedrop.model.delays import DELAY_MODELS
-from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.links.link import Fate
-from evedrop.model.registry import place_of
+from evedrop.model.receiver import Receiver
 from evedrop.model.schemes import SCHEMES
-from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.schemes.scheme import Encoder, Scheme
 from evedrop.model.slot.link import Fates, LinkSchedule
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
@@ -36,67 +43,59 @@ class Guard:
     """Checks the results of a scenario's classes that are not built in; does nothing for a scenario without such classes."""
 
     def __init__(self, scenario: Scenario, scheme: Scheme, batch: Batch) -> None:
-        self.active = foreign(scenario.model_dump(exclude_unset=True))
-        self._scheme, self._batch = scheme, batch
+        self._active = foreign(scenario.model_dump(exclude_unset=True))
+        self._scenario, self._scheme, self._batch = scenario, scheme, batch
         self._problem = Problem(scenario.process.process, batch)
-        name = scenario.encoding.scheme
-        self._own_scheme = SCHEMES.foreign(name)
-        self._classes = {LEGITIMATE: f"the scheme {name}"}
+        self._own_scheme = SCHEMES.foreign(scenario.encoding.scheme)
+        self._classes = {LEGITIMATE: scheme_in_words(scenario.encoding.scheme)}
         self._watched = {LEGITIMATE} if self._own_scheme else set[str]()
-        for receiver, table in scenario.eavesdroppers.items():
-            used = table.strategy if table.reads_as is None else table.reads_as
-            self._classes[receiver] = f"{receiver}'s strategy {used}"
-            if STRATEGIES.foreign(table.strategy) or STRATEGIES.foreign(used):
-                self._watched.add(receiver)
-        self._links = {one: list(_models_of(scenario.course(one))) for one in scenario.receivers}
+        for name, table in scenario.eavesdroppers.items():
+            self._classes[name] = eavesdropper_in_words(name, table.strategy, table.parameters)
+            if is_foreign(table.strategy, table.parameters):
+                self._watched.add(name)
+        self._links = {one: list(_models_of(scenario.schedule(one))) for one in scenario.receivers}
 
-    @contextlib.contextmanager
-    def asking(self, receiver: str, slots: range) -> Iterator[None]:
+    def asking(self, receiver: str, slots: range) -> contextlib.AbstractContextManager[None]:
         """Turn an error in the block into one that names the receiver's class, the slots and the trials."""
-        with self._named(self._classes[receiver], slots):
-            yield
+        return self._named(self._classes[receiver], slots)
 
-    @contextlib.contextmanager
-    def asking_link(self, receiver: str, slots: range) -> Iterator[None]:
+    def asking_link(self, receiver: str, slots: range) -> contextlib.AbstractContextManager[None]:
         """Like `asking`, for the models of a receiver's link."""
         models = f" ({', '.join(self._links[receiver])})" if self._links[receiver] else ""
-        with self._named(f"{receiver}'s link{models}", slots):
-            yield
+        return self._named(f"{receiver}'s link{models}", slots)
 
-    @contextlib.contextmanager
-    def _named(self, what: str, slots: range) -> Iterator[None]:
-        try:
-            yield
-        except (EvedropError, OSError):
-            raise
-        except Broken as error:
-            raise self._failed(what, slots, str(error)) from error
-        except Exception as error:
-            if not self.active:
-                raise
-            raise self._failed(what, slots, place_of(error)) from error
+    def _named(self, what: str, slots: range) -> contextlib.AbstractContextManager[None]:
+        return asking(what, slots, self._batch) if self._active else contextlib.nullcontext()
 
-    def packet(self, k: int, packet: Any) -> None:
-        """Raise RunError unless this is a valid packet of the scheme."""
-        if self._own_scheme:
-            self._look(LEGITIMATE, k, lambda: expect_packet(k, packet, self._scheme, self._problem))
+    def encoder(self, encoder: Encoder) -> Encoder:
+        """The encoder; if its class is not built in, one that checks all its packets."""
+        return checked_encoder(encoder, self._scenario.encoding.scheme, self._scheme, self._problem)
 
-    def belief(self, receiver: str, k: int, belief: Any) -> None:
-        """Raise RunError unless this is a valid belief of a receiver."""
-        if receiver in self._watched:
-            self._look(receiver, k, lambda: expect_belief(f"slot {k}: Belief", belief, self._problem))
+    def estimator(self, estimator: Receiver) -> Receiver:
+        """The legitimate estimator; if its class is not built in, one that checks all its beliefs."""
+        return checked_estimator(estimator, self._scenario.encoding.scheme, self._problem)
+
+    def eavesdropper(self, name: str, receiver: Receiver) -> Receiver:
+        """The same for an eavesdropper."""
+        table = self._scenario.eavesdroppers[name]
+        return checked_eavesdropper(receiver, name, table.strategy, table.parameters, self._problem)
 
     def shared(self, k: int, nu: Any, chi: Any | None = None) -> None:
         """Raise RunError unless these are valid ν_k and χ_k of the scheme."""
-        if self._own_scheme:
-            self._look(LEGITIMATE, k, lambda: self._expect_shared(k, nu, chi))
+        if not self._own_scheme:
+            return
+        n, trials = self._problem.process.n, self._batch.trials
+        with self.asking(LEGITIMATE, range(k, k + 1)):
+            expect_array(f"slot {k}: nu()", nu, np.bool_, (trials,), _EACH)
+            if chi is not None:
+                expect_array(f"slot {k}: chi()", chi, np.float64, (n, trials), "n states, R trials")
+                expect_finite(f"slot {k}: chi()", chi, self._batch.first_trial)
 
     def acted(self, receiver: str, k: int, action: Any) -> None:
         """Raise RunError unless this is a receiver's valid answer to a slot's γ."""
         if receiver in self._watched:
-            self._look(
-                receiver, k, lambda: expect_array(f"slot {k}: act()", action, np.uint8, (self._batch.trials,), _EACH)
-            )
+            with self.asking(receiver, range(k, k + 1)):
+                expect_array(f"slot {k}: act()", action, np.uint8, (self._batch.trials,), _EACH)
 
     def fates(self, receiver: str, slots: range, fates: Fates) -> None:
         """Raise RunError unless these are valid fates of the packets of some slots on a receiver's link."""
@@ -108,33 +107,13 @@ class Guard:
             if fates.codes.size and int(fates.codes.max()) > max(Fate):
                 raise Broken(f"fates(): one is {int(fates.codes.max())}; expected Fate.DELIVERED or Fate.LOST")
 
-    def _expect_shared(self, k: int, nu: Any, chi: Any | None) -> None:
-        n, trials = self._problem.process.n, self._batch.trials
-        expect_array(f"slot {k}: nu()", nu, np.bool_, (trials,), _EACH)
-        if chi is not None:
-            expect_array(f"slot {k}: chi()", chi, np.float64, (n, trials), "n states, R trials")
-            expect_finite(f"slot {k}: chi()", chi, self._batch.first_trial)
-
-    def _look(self, receiver: str, k: int, look: Any) -> None:
-        try:
-            look()
-        except Broken as error:
-            said = str(error).removeprefix(f"slot {k}: ")
-            raise self._failed(self._classes[receiver], range(k, k + 1), said) from error
-
-    def _failed(self, what: str, slots: range, how: str) -> RunError:
-        first = self._batch.first_trial
-        where = f"slot {slots.start}" if len(slots) == 1 else f"slots {slots.start} to {slots.stop - 1}"
-        trials = f"trial {first}" if self._batch.trials == 1 else f"trials {first} to {first + self._batch.trials - 1}"
-        return RunError(f"{what} failed in {where}, {trials}: {how}; run `evedrop check` on the class")
-
 
 _EACH = "one for each of the R trials"
 
 
-def _models_of(course: LinkSchedule) -> Iterator[str]:
+def _models_of(schedule: LinkSchedule) -> Iterator[str]:
     """The names of a link's models that are not built in, at first and after changes."""
-    for settings in (course.settings, *(change.settings or {} for change in course.changes)):
+    for settings in (schedule.settings, *(change.settings or {} for change in schedule.changes)):
         yield from _names_in(settings)
 
 

@@ -26,8 +26,7 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes import scheme_of
 from evedrop.news import FolderMoved, RunProgress, Tell
-from evedrop.results.folder import new_folder
-from evedrop.results.held_folder import HeldFolder
+from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
@@ -109,7 +108,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
     if failure is not None:
         raise failure
     if not merger.complete:
-        raise Interrupted("interrupted; the results so far are in the results folder")
+        raise Interrupted
     if summary.ended != how:  # a figure failed
         raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0
@@ -261,7 +260,7 @@ class Merger:
         if writer is not None:
             writer.digest_rows(start, digests)
         for name, of_blocks in digests.items():
-            self._whole &= sorted(of_blocks) == block_starts(self._scenario.slots, self._scenario.cuts(name))
+            self._whole &= sorted(of_blocks) == block_starts(self._scenario.slots, self._scenario.outage_bounds(name))
             if self._whole:
                 self._digests[name].add(of_blocks)
 

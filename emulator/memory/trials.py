@@ -6,21 +6,23 @@ on the distribution of the work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from evedrop.expected.expectations import expected_traces_of
+from evedrop.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.figures.figure import ScoredSlots
-from evedrop.memory.simulation import Chunk, Mode, ReceiverChunk, Simulation
+from evedrop.memory.chunk import Chunk
+from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.digest import Digests
 from evedrop.model.process import Floats
-from evedrop.model.slot.account import Accountant
+from evedrop.model.slot.account import Account, Accountant
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import SlotHistograms
+from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums, slot_sums
 from evedrop.score.totals import Totals
@@ -77,25 +79,37 @@ def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
 
 def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:
     """Simulate a task. `tell` gets the trial-slots done since its last call; the simulation ends early once `stopped`."""
-    scenario = Scenario.model_validate(task.scenario)
+    scenario = Scenario.read(task.scenario)
     names, slots = scenario.receivers, scenario.slots
     trials = range(task.start, task.stop)
     recorded = max(0, min(scenario.first_trial + scenario.record_trials, task.stop) - task.start)
-    simulation = Simulation(scenario, trials, recorded if task.mode is Mode.EXACT else 0, task.mode)
+    simulation = Simulation(scenario, trials, task.mode)
     scale = float(np.trace(scenario.process.process.Q))
+    expected = expected_traces_of(scenario)
+    blocks, keepers = zip(
+        *(_empty_block(scenario, task, start, expected) for start in trials[::BLOCK_TRIALS]), strict=True
+    )
     result = BatchResult(
         task.start,
-        [_empty_block(scenario, task, start) for start in trials[::BLOCK_TRIALS]],
+        list(blocks),
         {name: SlotHistograms(slots, scale) for name in names},
         {name: SlotHistograms(slots, scale) for name in names},
     )
-    expected = expected_traces_of(scenario)
     for chunk in simulation.chunks():
-        _add(result, chunk, {name: one[chunk.first : chunk.first + _count(chunk)] for name, one in expected.items()})
-        _add_plant(result, chunk)
-        if chunk.recorded is not None:
-            result.recorded.append(chunk.recorded.copied())
-        tell(len(trials) * _count(chunk))
+        count = len(next(iter(chunk.receivers.values())).error)
+        some = range(chunk.first, chunk.first + count)
+        for block, keeper in zip(blocks, keepers, strict=True):
+            rows = slice(block.start - task.start, block.start - task.start + block.trials)
+            if chunk.slots is None:
+                _add(block, rows, chunk, {name: one[some.start : some.stop] for name, one in expected.items()})
+            else:
+                _score(block, keeper, rows, chunk, chunk.slots)
+        for name, one in chunk.receivers.items():
+            result.errors[name].add(chunk.first, one.error)
+            result.traces[name].add(chunk.first, one.trace)
+        if chunk.slots is not None and recorded:
+            result.recorded.append(chunk.slots.part(slice(0, recorded)).copied())
+        tell(len(trials) * count)
         if stopped():
             break
     # All trials of the task were simulated side by side, so each decision was for all of them.
@@ -107,76 +121,68 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     return result
 
 
-def _empty_block(scenario: Scenario, task: Task, start: int) -> TrialBlock:
+def _empty_block(
+    scenario: Scenario, task: Task, start: int, expected: Mapping[str, Floats]
+) -> tuple[TrialBlock, Scorekeeper]:
+    """A block that begins with this trial, and the keeper of its score; expected: receiver → its expected traces, (slots,)."""
     names = scenario.receivers
     trials = min(BLOCK_TRIALS, task.stop - start)
-    totals = Totals.of if task.mode is Mode.EXACT else Totals.nothing
-    return TrialBlock(
+    keeper = Scorekeeper(scenario, trials, {name: KnownTraces(one) for name, one in expected.items()})
+    block = TrialBlock(
         start,
         trials,
         {name: SlotSums.zero(scenario.slots) for name in names},
-        totals(scenario, trials),
+        keeper.totals if task.mode is Mode.EXACT else Totals.nothing(scenario, trials),
         {name: Accountant(scenario.window(name), trials) for name in names},
         {},
     )
+    return block, keeper
 
 
 @np.errstate(over="ignore")
-def _add(result: BatchResult, chunk: Chunk, expected: dict[str, Floats]) -> None:
-    """Add a chunk. The square of a naive receiver's error may leave double precision; then it is inf, as it should be."""
-    for name, measured in chunk.receivers.items():
-        for block, part in _parts(result.blocks, result.start, measured):
-            if measured.error is measured.trace:
-                sums = slot_sums(part.error, part.action)
-            else:
-                trace = np.stack([part.trace.sum(axis=1), (part.trace * part.trace).sum(axis=1)], axis=1)
-                sums = slot_sums(part.error, part.action, trace)
-            block.sums[name].add(chunk.first, sums)
-            tally = block.totals.tallies[name]
-            rows = slice(block.start - result.start, block.start - result.start + block.trials)
-            x = None if chunk.x is None else chunk.x[..., rows]
-            tally.watched.add(
-                ScoredSlots(chunk.first, part.error, part.action, sums.trace, expected[name], part.late, x, part.x_hat)
-            )
-            tally.add(chunk.first, part.error, sums, expected[name])
-            account = block.accountants[name].account(range(chunk.first, chunk.first + len(part.error)), part.fates)
-            tally.account(account.delivered, part.action, account.lost, account.unsent)
-            tally.count(account)
-            if account.late is not None and part.late is not None:
-                tally.account_late(account.late, *part.late)
-        result.errors[name].add(chunk.first, measured.error)
-        result.traces[name].add(chunk.first, measured.trace)
+def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, slots: Slots) -> None:
+    """Add a chunk in exact mode to a block, which has some rows of its trials: what is counted is counted here.
 
-
-def _add_plant(result: BatchResult, chunk: Chunk) -> None:
-    """Add a chunk's alarms, and the measurements of a plant's controller and filter."""
-    for block in result.blocks:
-        totals = block.totals
-        rows = slice(block.start - result.start, block.start - result.start + block.trials)
-        if totals.detection is not None and chunk.alarms is not None:
-            totals.detection.add(chunk.first, chunk.alarms[:, rows])
-        if totals.loop is not None and chunk.acted is not None:
-            totals.loop.add(chunk.acted.part(rows))
-        if totals.filter is not None and chunk.true_errors is not None:
-            totals.filter.add({name: error[:, rows] for name, error in chunk.true_errors.items()})
-
-
-def _parts(blocks: list[TrialBlock], start: int, measured: ReceiverChunk) -> Iterator[tuple[TrialBlock, ReceiverChunk]]:
-    """Split the measurements into those of each block."""
-    for block in blocks:
-        rows = slice(block.start - start, block.start - start + block.trials)
-        yield (
-            block,
-            ReceiverChunk(
-                measured.error[:, rows],
-                measured.trace[:, rows],
-                measured.action[:, rows],
-                measured.fates.part(trials=rows),
-                None if measured.late is None else measured.late[..., rows],
-                None if measured.x_hat is None else measured.x_hat[..., rows],
-            ),
+    The square of a naive receiver's error may leave double precision; then it is inf, as it should be.
+    """
+    part = slots.part(rows)
+    receivers = {}
+    for name, one in part.receivers.items():
+        measured = chunk.receivers[name]
+        account = _account(block, name, rows, chunk)
+        trace = measured.trace[:, rows]
+        receivers[name] = replace(
+            one,
+            trace=np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
+            delivered=account.delivered,
+            lost=account.lost,
+            late_delivered=account.late,
+            unsent=account.unsent,
         )
+        keeper.totals.tallies[name].count(account)
+    errors = {name: one.error[:, rows] for name, one in chunk.receivers.items()}
+    for name, scored in keeper.add(replace(part, receivers=receivers), errors).items():
+        block.sums[name].add(chunk.first, scored.sums)
 
 
-def _count(chunk: Chunk) -> int:
-    return len(next(iter(chunk.receivers.values())).error)
+@np.errstate(over="ignore")
+def _add(block: TrialBlock, rows: slice, chunk: Chunk, expected: Mapping[str, Floats]) -> None:
+    """Add a chunk of another mode, which has no estimates, to a block."""
+    for name, one in chunk.receivers.items():
+        error, trace, action = one.error[:, rows], one.trace[:, rows], one.action[:, rows]
+        sums = slot_sums(error, action)
+        if one.error is not one.trace:
+            sums = slot_sums(error, action, np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
+        block.sums[name].add(chunk.first, sums)
+        tally = block.totals.tallies[name]
+        tally.watched.add(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
+        tally.add(chunk.first, error, sums, expected[name])
+        account = _account(block, name, rows, chunk)
+        tally.account(account.delivered, action, account.lost, account.unsent)
+        tally.count(account)
+
+
+def _account(block: TrialBlock, name: str, rows: slice, chunk: Chunk) -> Account:
+    """The account of a receiver's link over a chunk, for a block's trials."""
+    fates = chunk.receivers[name].fates.part(trials=rows)
+    return block.accountants[name].account(range(chunk.first, chunk.first + len(fates.codes)), fates)

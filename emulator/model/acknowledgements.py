@@ -12,7 +12,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.model.receiver import Flags
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
 
 Attack = Callable[[Flags, Flags], Flags]
 """(γ of the user, γᵉ of the jammer) → the acknowledgements on the air, all (R,)."""
@@ -71,10 +71,8 @@ class AckChannel:
     ) -> None:
         self._attack = ATTACKS[attack]
         self._spans = spans
-        self._quality = quality
-        self._reader = BlockReader(key, batch, 1)
-        self._slots = range(0)
-        self._through: Flags
+        reader = BlockReader(key, batch, 1)
+        self._through = Ahead(reader, lambda slots: reader.uniforms(slots)[:, 0, :] < quality)
 
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
         """The acknowledgements of slot k that reach the sensor, (R,).
@@ -82,12 +80,9 @@ class AckChannel:
         sent: `Packet.sent`; a packet that was not sent is never acknowledged, even by a forger. gamma: what the user received;
         gamma_e: what the jammer received.
         """
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            self._through = self._reader.uniforms(self._slots)[:, 0, :] < self._quality
         attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
         on_the_air = self._attack(gamma, gamma_e) if attacked else gamma
-        arrived: Flags = on_the_air & self._through[k - self._slots.start]
+        arrived: Flags = on_the_air & self._through.at(k)
         return arrived if sent is None else arrived & sent
 
 

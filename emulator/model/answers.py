@@ -24,9 +24,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, final
 
-from evedrop.errors import NoAnswer
+from evedrop.errors import NoAnswer, NotRegistered
 
-_SECONDS = 60.0  # for an answer; a class may import much
 _MOST_BYTES = 2**20  # in one answer
 _MODULE = "evedrop.conformance.answering"
 # Where libraries are, if not in the system's folders; nothing else of our environment is passed on.
@@ -38,9 +37,12 @@ class Answers:
     """The known answers of classes, and the child processes that answer. Usable from any thread.
 
     Children are asked one after the other, one for each class, and end by themselves when no more questions can come.
+
+    seconds: how long to wait for an answer; a class may import much.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float = 60.0) -> None:
+        self._seconds = seconds
         self._known: dict[str, dict[str, Any]] = {}
         self._children: dict[str, _Child] = {}
         self._folders: dict[str, str | None] = {}
@@ -53,8 +55,6 @@ class Answers:
 
         Raises NotRegistered if no class has this name, NoAnswer if the class does not give a valid answer.
         """
-        from evedrop.errors import NotRegistered  # noqa: PLC0415 - the registries ask us
-
         question = json.dumps([name, do, *given], default=str)
         with self._lock:
             answer = self._known.get(question) or self._asked(name, question)
@@ -94,7 +94,7 @@ class Answers:
         if child is not None:
             with contextlib.suppress(NoAnswer):  # the process may have ended by itself
                 return child.answer(question)
-        child = self._children[name] = _Child(self._folders.setdefault(name, self.folder))
+        child = self._children[name] = _Child(self._folders.setdefault(name, self.folder), self._seconds)
         try:
             return child.answer(question)
         except NoAnswer as error:
@@ -105,7 +105,8 @@ class Answers:
 class _Child:
     """A process that answers for one class."""
 
-    def __init__(self, folder: str | None) -> None:
+    def __init__(self, folder: str | None, seconds: float) -> None:
+        self._seconds = seconds
         places = json.dumps([str(Path(place).absolute()) for place in sys.path])
         command = (
             "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.raw.readline()); "
@@ -134,10 +135,10 @@ class _Child:
         process = self._process
         assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - both are pipes
         try:
-            deadline = time.monotonic() + _SECONDS
-            _write(process.stdin.fileno(), f"{self._first}{question}\n".encode(), deadline)
+            limit = _Limit(self._seconds)
+            _write(process.stdin.fileno(), f"{self._first}{question}\n".encode(), limit)
             self._first = ""
-            found = json.loads(_line(process.stdout.fileno(), deadline))
+            found = json.loads(_line(process.stdout.fileno(), limit))
             if not isinstance(found, dict):
                 raise NoAnswer("its answer was invalid")
         except BaseException as error:
@@ -154,22 +155,35 @@ class _Child:
         """End the process."""
         self._process.kill()
         self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
+        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+            pipe.close()
 
 
-def _write(handle: int, text: bytes, deadline: float) -> None:
+@final
+class _Limit:
+    """The time within which an answer must come."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._deadline = time.monotonic() + seconds
+
+    def wait(self, reading: list[int], writing: list[int]) -> None:
+        """Wait for a pipe. Raises NoAnswer if the time is over."""
+        if not any(select.select(reading, writing, [], max(0.0, self._deadline - time.monotonic()))):
+            raise NoAnswer(f"it did not answer within {self._seconds:g} s")
+
+
+def _write(handle: int, text: bytes, limit: _Limit) -> None:
     os.set_blocking(handle, False)
     while text:
-        _wait([], [handle], deadline)
+        limit.wait([], [handle])
         text = text[os.write(handle, text) :]
 
 
-def _line(handle: int, deadline: float) -> bytes:
+def _line(handle: int, limit: _Limit) -> bytes:
     line = b""
     while not line.endswith(b"\n"):
-        _wait([handle], [], deadline)
+        limit.wait([handle], [])
         read = os.read(handle, 65536)
         if not read:
             raise OSError("it ended")
@@ -177,8 +191,3 @@ def _line(handle: int, deadline: float) -> bytes:
         if len(line) > _MOST_BYTES:
             raise NoAnswer(f"its answer was longer than {_MOST_BYTES} bytes")
     return line
-
-
-def _wait(reading: list[int], writing: list[int], deadline: float) -> None:
-    if not any(select.select(reading, writing, [], max(0.0, deadline - time.monotonic()))):
-        raise NoAnswer(f"it did not answer within {_SECONDS:g} s")

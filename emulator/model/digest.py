@@ -1,9 +1,12 @@
-"""SHA-256 over all that a receiver received and believed: equal digests mean that two runs agree to the last bit.
+"""Digests of what a receiver received and believed: equal digests mean that two runs agree to the last bit.
 
-For each trial and each aligned block of 256 slots, the digest covers, slot by slot, γ (1 byte), x̂ (n) and P (n × n, row by
-row) as little-endian float64; for a controller, whether its decision failed (1 byte) and u (m). A block also ends where an
-outage of the receiver begins or ends, since another process may continue. A receiver's digest is that of its block digests,
-ordered by trial, then block. A block is named by its first slot.
+For each trial and each aligned block of 256 slots, the digest is XXH3-128 over, slot by slot, γ (1 byte), x̂ (n) and the upper
+triangle of P (row by row) as little-endian float64; for a controller, whether its decision failed (1 byte) and u (m). A block
+also ends where an outage of the receiver begins or ends, since another process may continue. A receiver's digest is SHA-256
+over its block digests, ordered by trial, then block. A block is named by its first slot.
+
+P differs from its transpose by rounding only, so the lower triangle says nothing new: `asymmetry` of `evedrop.model.receiver`
+finds what differs by more.
 
 Source: docs/results.md, digests.
 """
@@ -11,32 +14,27 @@ Source: docs/results.md, digests.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
+from xxhash import xxh3_128, xxh3_128_digest
 
+from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Codes, Flags
+from evedrop.model.receiver import Action, Beliefs, Codes, Flags
 
 BLOCK_SLOTS = 256
-DIGEST_BYTES = 32
-_TILE = 64  # trials transposed at a time, so that a tile fits into the cache
+DIGEST_BYTES = 16
+_TILE_BYTES = 2**18  # of the records made at a time, so that they are still in the cache when they are hashed
+_TILE_TRIALS = 8, 256  # at least as many trials at a time as share a line of the cache, and at most as many as pay
+_HELD_BYTES = (
+    2**20
+)  # of beliefs that wait for the next ones: a call of the hash costs as much as the bytes of some tens of slots
 
 Digests = NDArray[np.uint8]
-
-
-class Rows(NamedTuple):
-    """Beliefs of consecutive slots, one row for each slot."""
-
-    x_hat: Floats
-    """(c, n, R)."""
-    P: Floats
-    """(c, n, n, R)."""
-    action: Codes
-    """(c, R)."""
 
 
 def block_starts(slots: int, cuts: Iterable[int] = ()) -> list[int]:
@@ -66,39 +64,6 @@ class Blocks:
         return [bounds[i - 1] for i in range(bisect_right(bounds, first), bisect_right(bounds, end)) if i > 0]
 
 
-class BeliefLog:
-    """A receiver's beliefs in the current block, and the digests of finished blocks.
-
-    Slots must be added in order; a block must begin with the first one.
-    """
-
-    def __init__(self, n: int, trials: int, slots: int, cuts: Iterable[int] = (), first: int = 0) -> None:
-        length = min(BLOCK_SLOTS, slots)
-        self._ends = {*block_starts(slots, cuts), slots}
-        self._start = first
-        self._x_hat = np.empty((length, n, trials))
-        self._P = np.empty((length, n, n, trials))
-        self._action = np.empty((length, trials), np.uint8)
-
-    def add(self, k: int, belief: Belief) -> tuple[int, Digests] | None:
-        """Add slot k. At the end of a block returns the block's first slot and its digest for every trial, (R, 32)."""
-        if k in self._ends:
-            self._start = k
-        row = k - self._start
-        self._x_hat[row], self._P[row], self._action[row] = belief.x_hat, belief.P, belief.action
-        return (self._start, self._digest(row + 1)) if k + 1 in self._ends else None
-
-    def rows(self, first: int, end: int) -> Rows:
-        """The beliefs of slots first … end−1 of the current block; overwritten by the next block."""
-        rows = slice(first - self._start, end - self._start)
-        return Rows(self._x_hat[rows], self._P[rows], self._action[rows])
-
-    def _digest(self, length: int) -> Digests:
-        _, n, trials = self._x_hat.shape
-        P = self._P[:length].reshape(length, n * n, trials)
-        return _digests(self._action[:length] != Action.LOST, [self._x_hat[:length], P])
-
-
 class InputLog:
     """A controller's inputs in the current block, and the digests of finished blocks.
 
@@ -112,58 +77,109 @@ class InputLog:
         self._failed = np.empty((length, trials), np.bool_)
 
     def add(self, k: int, u: Floats, failed: Flags) -> tuple[int, Digests] | None:
-        """Add slot k, u (m, R) and failed (R,). At the end of a block returns its first slot and its digest, (R, 32)."""
+        """Add slot k, u (m, R) and failed (R,). At the end of a block returns its first slot and its digest, (R, 16)."""
         row = k % BLOCK_SLOTS
         self._u[row], self._failed[row] = u, failed
         if row + 1 != BLOCK_SLOTS and k + 1 != self._slots:
             return None
-        return k - row, _digests(self._failed[: row + 1], [self._u[: row + 1]])
+        return k - row, _digests(self._failed[: row + 1], self._u[: row + 1], None)
 
 
 @final
 class PartialDigests:
-    """The digests of one block whose slots are added in parts."""
+    """The digests of one block after the other, whose slots are added in parts.
+
+    Small parts are held until there are enough slots for one call of the hash for each trial.
+    """
 
     def __init__(self, trials: int) -> None:
-        self._hashes = [sha256() for _ in range(trials)]
+        self._hashes = [xxh3_128() for _ in range(trials)]
+        self._held: Beliefs | None = None
+        self._count = 0
 
     def add(self, x_hat: Floats, P: Floats, action: Codes) -> None:
         """Add the next slots: x̂ (c, n, R), P (c, n, n, R) and action (c, R)."""
-        c, n, trials = x_hat.shape
-        for row, record in _records(action != Action.LOST, [x_hat, P.reshape(c, n * n, trials)]):
-            self._hashes[row].update(record)
+        held = self._held = self._held or _room(*x_hat.shape[1:])
+        slots, room = len(action), len(held.action)
+        if self._count + slots > room or 2 * slots > room:
+            self._hash_held()
+        if 2 * slots > room:
+            self._hash(Beliefs(x_hat, P, action))
+            return
+        rows = slice(self._count, self._count + slots)
+        held.x_hat[rows], held.P[rows], held.action[rows] = x_hat, P, action
+        self._count += slots
 
-    def digests(self) -> Digests:
-        """The digests of all slots so far, (R, 32)."""
-        return np.array([np.frombuffer(one.digest(), np.uint8) for one in self._hashes])
+    def finished(self) -> Digests:
+        """The digests of all slots since the last call, (R, 16); the next slot begins another block."""
+        self._hash_held()
+        digests = _joined(one.digest() for one in self._hashes)
+        for one in self._hashes:
+            one.reset()
+        return digests
+
+    def _hash_held(self) -> None:
+        if self._held is not None and self._count:
+            x_hat, P, action = self._held
+            self._hash(Beliefs(x_hat[: self._count], P[: self._count], action[: self._count]))
+            self._count = 0
+
+    def _hash(self, beliefs: Beliefs) -> None:
+        for first, records in _records(beliefs.action != Action.LOST, beliefs.x_hat, beliefs.P):
+            for one, record in zip(self._hashes[first : first + len(records)], records, strict=True):
+                one.update(record)
 
 
-def _digests(marks: Flags, numbers: Sequence[Floats]) -> Digests:
-    """The digest of every trial, (R, 32), over marks (c, R) and numbers, each (c, …, R), slot by slot."""
-    digests = np.empty((marks.shape[1], DIGEST_BYTES), np.uint8)
-    for row, record in _records(marks, numbers):
-        digests[row] = np.frombuffer(sha256(record).digest(), np.uint8)
-    return digests
+def _room(n: int, trials: int) -> Beliefs:
+    """Room for the beliefs of as many slots as are held."""
+    slots = max(1, min(BLOCK_SLOTS, _HELD_BYTES // (trials * (8 * (n + n * n) + 1))))
+    return Beliefs(np.empty((slots, n, trials)), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8))
 
 
-def _records(marks: Flags, numbers: Sequence[Floats]) -> Iterator[tuple[int, memoryview]]:
-    """Each trial and its bytes to be digested; the bytes are overwritten by the next tile of trials."""
-    length, trials = marks.shape
-    width = sum(one.shape[1] for one in numbers)
-    ordered = np.empty((_TILE, length, width), "<f8")
-    records = np.empty((_TILE, length, 1 + ordered.itemsize * width), np.uint8)
-    for start in range(0, trials, _TILE):
-        tile = slice(start, min(start + _TILE, trials))
-        rows = slice(0, tile.stop - start)
-        place = 0
-        for one in numbers:
-            for i in range(one.shape[1]):
-                ordered[rows, :, place] = one[:, i, tile].T
-                place += 1
-        records[rows, :, 0] = marks[:, tile].T
-        records[rows, :, 1:] = ordered[rows].view(np.uint8)
-        for row, record in enumerate(records[rows], start):
-            yield row, record.data
+@final
+class BlockDigests:
+    """The digests of a receiver's blocks, from beliefs that are added one slot or many at a time, in order.
+
+    Many are hashed at once, while they are still in the processor's cache. cuts: as in `block_starts`.
+    """
+
+    def __init__(self, trials: int, slots: int, cuts: Iterable[int] = ()) -> None:
+        self._blocks = Blocks(slots, cuts)
+        self._part = PartialDigests(trials)
+
+    def add(self, slots: range, beliefs: Beliefs) -> dict[int, Digests]:
+        """Add consecutive slots of one block; returns the block's first slot and its digests, (R, 16), if it ends with them."""
+        self._part.add(*beliefs)
+        if slots.stop != self._blocks.end(slots.start):
+            return {}
+        return {self._blocks.start(slots.start): self._part.finished()}
+
+
+def _digests(marks: Flags, a: Floats, P: Floats | None) -> Digests:
+    """The digest of every trial, (R, 16), over marks (c, R), numbers (c, m, R) and covariances (c, n, n, R), slot by slot."""
+    return _joined(xxh3_128_digest(record) for _, records in _records(marks, a, P) for record in records)
+
+
+def _joined(digests: Iterable[bytes]) -> Digests:
+    return np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES)
+
+
+def _records(marks: Flags, a: Floats, P: Floats | None) -> Iterator[tuple[int, list[memoryview]]]:
+    """Each tile of trials: its first trial, and the bytes of every trial to be digested; the next tile overwrites them."""
+    slots, trials = marks.shape
+    n = 0 if P is None else P.shape[1]
+    size = 1 + 8 * (a.shape[1] + n * (n + 1) // 2)
+    least, most = _TILE_TRIALS
+    some = min(trials, most, max(least, _TILE_BYTES // (slots * size)))
+    tile = np.empty((some, slots, size), np.uint8)
+    flat, length = tile.reshape(-1).data, slots * size
+    rows = [flat[start : start + length] for start in range(0, some * length, length)]
+    # Parts of larger arrays are copied here once, and not for each tile.
+    a, P = np.ascontiguousarray(a), None if P is None else np.ascontiguousarray(P)
+    for first in range(0, trials, some):
+        count = min(some, trials - first)
+        kernels.records(marks, a, P, tile[:count], first)
+        yield first, rows[:count]
 
 
 @final
@@ -174,7 +190,7 @@ class RunDigest:
         self._hash = sha256()
 
     def add(self, blocks: Mapping[int, Digests]) -> None:
-        """Add the next R trials: block → digests, (R, 32)."""
+        """Add the next R trials: block → digests, (R, 16)."""
         self._hash.update(np.stack([blocks[block] for block in sorted(blocks)], axis=1).tobytes())
 
     @property

@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 
 from evedrop.model.plant import Plant
-from evedrop.model.process import Dynamics, Floats, Process
+from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 
 
@@ -64,14 +64,14 @@ class Offset:
     """
 
     def __init__(self, process: Process, plant: Plant, trials: int) -> None:
-        self._dynamics = Dynamics(process.A)
+        self._A = process.A
         self._plant = plant
         self._c = np.zeros((process.n, trials))
         self._moved: Floats = self._c
 
     def next(self, action: Codes, u: Floats) -> Floats:
         """The difference in the next slot, (n, R), from the estimator's action (R,); u (m, R): the inputs of this slot."""
-        c = self._dynamics.product(self._c) + np.where(guessed(action), self._moved, 0.0)
+        c = product(self._A, self._c) + np.where(guessed(action), self._moved, 0.0)
         self._c = np.where(action == int(Action.STATE), 0.0, c)
         self._moved = self._plant.moved(u)
         return self._c

@@ -15,7 +15,7 @@ import numpy as np
 from evedrop.kernels.elementary import inverse, semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
 
 _SETTLED = 1e-14
 _LONGEST = 200_000  # slots after which a filter is regarded as not settling
@@ -45,10 +45,8 @@ class Steps:
     """The filter slot by slot from 0 on, until it has settled; the arithmetic is the same on every machine."""
 
     def __init__(self, process: Process, plant: Plant) -> None:
-        if plant.output_matrix is None or plant.measurement_noise is None:
-            raise ValueError("the plant's states are not measured")
         self._A, self._W = process.A, plant.noise
-        self._C, self._V = plant.output_matrix, plant.measurement_noise
+        self._C, self._V = _measured(plant)
         self._predicted = process.initial_covariance
         self._last: FilterStep | None = None
         self.settled = False
@@ -73,12 +71,12 @@ class Steps:
         return step
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def settled(process: Process, plant: Plant) -> FilterStep:
     """The filter's steady state. Raises ValueError if it never settles or ends up ignoring all measurements."""
     steps = Steps(process, plant)
     marks = []
-    measured = 0 if plant.output_matrix is None else len(plant.output_matrix)
-    longest = _LONGEST if max(process.n, measured) <= _SOME else _LONGEST_OF_MANY
+    longest = _LONGEST if max(process.n, len(_measured(plant)[0])) <= _SOME else _LONGEST_OF_MANY
     for k in range(1, longest + 1):
         step = steps.next()
         if not np.isfinite(step.covariance).all():
@@ -104,12 +102,10 @@ class LocalFilter:
     def __init__(self, process: Process, plant: Plant, key: bytes, batch: Batch) -> None:
         self._process = process
         self._steps = Steps(process, plant)
-        if plant.output_matrix is None or plant.measurement_noise is None:
-            raise ValueError("the plant's states are not measured")
-        self._C, self._factor = plant.output_matrix, semidefinite_factor(plant.measurement_noise)
-        self._reader = BlockReader(key, batch, len(self._C))
-        self._slots = range(0)
-        self._noise: Floats
+        self._C, V = _measured(plant)
+        factor = semidefinite_factor(V)
+        reader = BlockReader(key, batch, len(self._C))
+        self._noise = Ahead(reader, lambda slots: product(factor, reader.normals(slots)))
         self.x: Floats = np.zeros((process.n, batch.trials))
         """x̂ˢ of the last slot, (n, R)."""
         self.predicted: Floats = self.x
@@ -117,14 +113,18 @@ class LocalFilter:
 
     def take(self, k: int, x: Floats, pushed: Floats) -> Floats:
         """x̂ˢ of slot k, (n, R), from its state x (n, R) and the effect of inputs and disturbances on it, (n, R) or (n, 1)."""
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            self._noise = product(self._factor, self._reader.normals(self._slots))
         self.predicted = self._process.predict(self.x) if k else self.x
         before = self.predicted + pushed
-        y = product(self._C, x) + self._noise[k - self._slots.start]
+        y = product(self._C, x) + self._noise.at(k)
         self.x = before + product(self._steps.next().gain, y - product(self._C, before))
         return self.x
+
+
+def _measured(plant: Plant) -> tuple[Floats, Floats]:
+    """C (p, n) and the covariance V (p, p) of the noise. Raises ValueError if nothing is measured."""
+    if plant.output_matrix is None or plant.measurement_noise is None:
+        raise ValueError("the plant's states are not measured")
+    return plant.output_matrix, plant.measurement_noise
 
 
 def _transposed(M: Floats) -> Floats:

@@ -66,38 +66,45 @@ class ModulatedCovariance:
 
         Their number depends only on the law, so values do not depend on how many slots are asked for at a time.
         """
-        k = self._k
+        k, window = self._k, self._law.window
         segment, stop = self._segment(k)
         marks = [mark for start, end, _ in self._law.outages for mark in (start, end) if mark > k]
         until = min([stop, *marks])
-        away = any(start <= k < end for start, end, _ in self._law.outages)
-        block = self._block_of(segment) if k > segment.start and not away and until - k >= BLOCK else None
-        if block is not None and (traces := self._in_a_block(block)) is not None:
+        away = any(start <= k < end + window for start, end, _ in self._law.outages)
+        block = self._block_of(segment) if k > segment.start + window and not away and until - k >= BLOCK else None
+        if block is not None and (traces := self._in_a_block(segment, block)) is not None:
             return traces
         return self._slot_by_slot(segment, 1 if k == segment.start else min(until - k, BLOCK))
 
     def _block_of(self, segment: Segment) -> LinearBlock | None:
         """The operator of the segment's blocks; None where its slots differ, or where the operator is too large to be useful."""
-        if self._law.window or self._remaining is not None or segment.quality_at is not None:
+        if self._law.window > BLOCK or self._remaining is not None or segment.quality_at is not None:
             return None
         if self._process.n**2 * (len(segment.chain.law) + 1) > _LARGEST:
             return None
         if segment.start not in self._blocks:
-            odds = self._odds(segment.quality(range(segment.start, segment.start + 1))[0])
+            quality = segment.quality(range(segment.start, segment.start + 1))[0]
+            odds = [self._odds(quality * segment.arrived[lag]) for lag in range(self._law.window + 1)]
             with np.errstate(over="ignore", invalid="ignore"):
                 self._blocks[segment.start] = LinearBlock.of(self._process, segment.chain, odds)
         return self._blocks[segment.start]
 
-    def _in_a_block(self, block: LinearBlock) -> Floats | None:
+    def _in_a_block(self, segment: Segment, block: LinearBlock) -> Floats | None:
         """The traces of a block; None, without any change, if a value in it is beyond double precision."""
         assert self._settled is not None  # noqa: S101 - a block never begins with slot 0
         assert self._before is not None  # noqa: S101 - the same
+        k, window = self._k, self._law.window
+        before = self._window[0].before if window else self._before
+        assert before is not None  # noqa: S101 - the same: a block begins more than a window after slot 0
         with np.errstate(over="ignore", invalid="ignore"):
-            traces, settled = block.ahead(self._settled, self._before)
+            traces, settled = block.ahead(self._settled, before)
         if not (np.isfinite(traces).all() and np.isfinite(settled).all()):
             return None
-        self._settled, self._before = settled, self._sigma.next(BLOCK)[-1]
-        self._k += BLOCK
+        sigma = [self._before, *self._sigma.next(BLOCK)]
+        quality = segment.quality(range(k, k + BLOCK))
+        for i in range(BLOCK - window, BLOCK):
+            self._window.append(_Slot(k + i, segment, False, quality[i], sigma[i], None))
+        self._settled, self._before, self._k = settled, sigma[-1], k + BLOCK
         return traces
 
     def _slot_by_slot(self, segment: Segment, count: int) -> Floats:

@@ -1,14 +1,15 @@
 """A block of equal slots behind a chain, computed at once: the recursion of `modulated` as one linear operator.
 
 With v = (E(1), …, E(S), Σ, 1) the recursion is v ← M v, so the trace of slot j of a block is t M^j v: only the rows t M^j
-and the last power of the block's operator are kept.
+and the last power of the block's operator are kept. Where packets may be W slots late, v is that of slot k − W, up to which
+everything is settled, and t ends with the operators of the W slots since, t = t₀ M_0 ⋯ M_{W−1}.
 
-Source: docs/mathematics.md, losses in bursts.
+Source: docs/mathematics.md, losses in bursts and late packets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -36,25 +37,20 @@ class LinearBlock:
     """Whether v contains Σ: only where an error may grow with it, because Σ may exceed double precision."""
 
     @classmethod
-    def of(cls, process: Process, chain: Chain, odds: Mapping[str, Floats]) -> LinearBlock:
-        """The block of a chain with the probabilities of the outcomes in its states, (S,) each; leaks are not supported."""
-        n, states = process.n, len(chain.law)
-        size = n * n
-        misleads = bool(np.any(odds["misled"] > 0.0))
-        carried = np.kron(process.A, process.A)
-        count = states * size + (size if misleads else 0) + 1
-        M = np.zeros((count, count))
-        M[: states * size, : states * size] = np.kron(odds["kept"][:, None] * chain.transitions.T, carried)
-        M[: states * size, -1] = np.kron(chain.law * odds["predicted"], process.Q.reshape(-1))
-        if misleads:
-            sigma = slice(states * size, -1)
-            M[: states * size, sigma] = np.kron((chain.law * odds["misled"])[:, None], 2.0 * carried)
-            M[sigma, sigma] = carried
-            M[sigma, -1] = process.Q.reshape(-1)
-        M[-1, -1] = 1.0
-        rows = np.empty((BLOCK, count))
-        row = np.zeros(count)
-        row[: states * size] = np.tile(np.eye(n).reshape(-1), states)
+    def of(cls, process: Process, chain: Chain, odds: Sequence[Mapping[str, Floats]]) -> LinearBlock:
+        """The block of a chain; leaks are not supported.
+
+        odds: lag → the probabilities of the outcomes in the chain's states, (S,) each, of a slot that is so many slots ago; the
+        last lag is that of settled slots.
+        """
+        misleads = any(bool(np.any(one["misled"] > 0.0)) for one in odds)
+        *since, M = (_operator(process, chain, one, misleads) for one in odds)
+        states = len(chain.law) * process.n**2
+        row = np.zeros(len(M))
+        row[:states] = np.tile(np.eye(process.n).reshape(-1), len(chain.law))
+        for one in since:
+            row = row @ one
+        rows = np.empty((BLOCK, len(M)))
         for j in range(BLOCK):
             rows[j] = row = row @ M
         return cls(rows, np.linalg.matrix_power(M, BLOCK), misleads)
@@ -65,3 +61,20 @@ class LinearBlock:
         v = np.concatenate(parts)
         after = self.last[: states.size] @ v
         return self.traces @ v, after.reshape(states.shape)
+
+
+def _operator(process: Process, chain: Chain, odds: Mapping[str, Floats], misleads: bool) -> Floats:
+    """M of a slot, (D, D)."""
+    size, states = process.n**2, len(chain.law)
+    carried = np.kron(process.A, process.A)
+    count = states * size + (size if misleads else 0) + 1
+    M = np.zeros((count, count))
+    M[: states * size, : states * size] = np.kron(odds["kept"][:, None] * chain.transitions.T, carried)
+    M[: states * size, -1] = np.kron(chain.law * odds["predicted"], process.Q.reshape(-1))
+    if misleads:
+        sigma = slice(states * size, -1)
+        M[: states * size, sigma] = np.kron((chain.law * odds["misled"])[:, None], 2.0 * carried)
+        M[sigma, sigma] = carried
+        M[sigma, -1] = process.Q.reshape(-1)
+    M[-1, -1] = 1.0
+    return M

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import Any
 
 import numpy as np
 
 from evedrop.model import update
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
-
-_ACTIONS = np.array([Action.LOST, Action.DISCARDED, Action.STATE], np.uint8)
+from evedrop.model.block_methods import outdated
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception
 
 
 class PacketUser(Receiver):
@@ -18,21 +19,47 @@ class PacketUser(Receiver):
     Source: Lemma V.1; docs/mathematics.md, eavesdroppers.
     """
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take `uses_block` from this class again in a subclass that changes `uses` alone.
+
+        It also takes `follow` from `Receiver` again, where it inherits one that may not ask `uses_block`.
+        """
+        super().__init_subclass__(**options)
+        if outdated(cls, "uses_block", "uses"):
+            setattr(cls, "uses_block", PacketUser.uses_block)  # noqa: B010 - mypy refuses the assignment
+        if outdated(cls, "follow", "uses") and cls.follow is not PacketUser.follow:
+            setattr(cls, "follow", Receiver.follow)  # noqa: B010 - the same
+
     @abstractmethod
     def uses(self, k: int) -> Flags | None:
         """b_k (R,): whether a packet received in slot k is used as the state; None means always."""
 
     def act(self, k: int, gamma: Flags) -> Codes:
         """Lost, used as the state, or discarded."""
-        uses = self.uses(k)
-        used = gamma if uses is None else gamma & uses
-        return _ACTIONS[gamma.view(np.uint8) + used.view(np.uint8)]
+        return _actions(gamma, self.uses(k))
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is used."""
         action = self.act(k, heard.gamma)
-        return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, heard.z),
-            update.believed_covariance(self.process, k, belief.P, action),
-            action,
-        )
+        return update.belief(self.process, k, belief, action, heard.z)
+
+    def uses_block(self, slots: range) -> Flags | None:
+        """`uses` of consecutive slots, (c, R); None means always in all of them."""
+        found = [self.uses(k) for k in slots]
+        if all(one is None for one in found):
+            return None
+        return np.array([np.ones(self.trials, np.bool_) if one is None else one for one in found])
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """`step` for consecutive slots."""
+        action = _actions(gamma, self.uses_block(slots))
+        found = update.beliefs(self.process, slots.start, belief, action, z)
+        return found, found.last
+
+
+def _actions(gamma: Flags, uses: Flags | None) -> Codes:
+    """LOST, STATE or DISCARDED, the codes 0, 1 and 3, from flags of any equal shape."""
+    if uses is None:
+        return gamma.astype(np.uint8)
+    received = gamma.view(np.uint8)
+    return 3 * received - 2 * (gamma & uses).view(np.uint8)

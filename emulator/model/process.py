@@ -16,8 +16,10 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.kernels.elementary import Rows, cholesky, semidefinite_factor, triangular_factor
-from evedrop.streams import Batch, BlockReader
+from evedrop.kernels.current import kernels
+from evedrop.kernels.elementary import cholesky, semidefinite_factor
+from evedrop.kernels.reference import carry
+from evedrop.streams import Ahead, Batch, BlockReader
 
 Floats = NDArray[np.float64]
 
@@ -25,44 +27,16 @@ MARGINAL = 1e-7
 """An eigenvalue of A within this distance of the unit circle counts as on it: computing a double one has errors of 1e-8."""
 MOST_STATES = 64
 """The most states of a process: some computations before a run take a time that grows with n³ or faster."""
+_SLOTS_AT_ONCE = 1024  # whose factors are passed over
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mere rounding
 
 
 def product(M: Floats, x: Floats) -> Floats:
-    """M x for every trial: M (…, m, n), x (…, n, R) → (…, m, R)."""
-    y: Floats = M[..., :, 0, None] * x[..., None, 0, :]
-    for j in range(1, M.shape[-1]):
-        y += M[..., :, j, None] * x[..., None, j, :]
-    return y
-
-
-@final
-class Dynamics:
-    """A as an operator on batches: the same sums as `product`, with A's columns laid out once."""
-
-    def __init__(self, A: Floats) -> None:
-        self._indices = range(1, A.shape[0])
-        self._on_rows = [np.ascontiguousarray(A[:, j, None]) for j in range(A.shape[0])]
-        self._on_matrices = [np.ascontiguousarray(A[:, j, None, None]) for j in range(A.shape[0])]
-
-    def product(self, x: Floats) -> Floats:
-        """A x for every trial: x (n, R) → (n, R)."""
-        columns = self._on_rows
-        y: Floats = columns[0] * x[0]
-        for j in self._indices:
-            y += columns[j] * x[j]
-        return y
-
-    def congruence(self, P: Floats) -> Floats:
-        """A P Aᵀ for every trial: P (n, n, R) → (n, n, R)."""
-        columns, rows = self._on_matrices, self._on_rows
-        left: Floats = columns[0] * P[0]
-        for j in self._indices:
-            left += columns[j] * P[j]
-        result: Floats = left[:, :1] * rows[0]
-        for j in self._indices:
-            result += left[:, j : j + 1] * rows[j]
-        return result
+    """M x for every trial: M (…, m, n), x (…, n, R) → (…, m, R), with at most one axis before the last two."""
+    if M.ndim == x.ndim == 2:
+        one: Floats = kernels.product(M[None], x[None])[0]
+        return one
+    return kernels.product(np.broadcast_to(M, (len(x), *M.shape[-2:])), x)
 
 
 @dataclass(frozen=True)
@@ -91,20 +65,16 @@ class Process:
         return float(np.max(np.abs(np.linalg.eigvals(self.A))))
 
     @cached_property
-    def _dynamics(self) -> Dynamics:
-        return Dynamics(self.A)
-
-    @cached_property
     def _Q_column(self) -> Floats:
         return self.Q[:, :, None]
 
     def predict(self, x_hat: Floats) -> Floats:
         """A x̂, (n, R)."""
-        return self._dynamics.product(x_hat)
+        return product(self.A, x_hat)
 
     def carry(self, P: Floats) -> Floats:
         """A P Aᵀ, (n, n, R): the covariance when w is known."""
-        return self._dynamics.congruence(P)
+        return carry(self.A, P)
 
     def diffuse(self, carried: Floats) -> Floats:
         """A P Aᵀ + Q from A P Aᵀ, (n, n, R): the covariance when w is not known."""
@@ -130,21 +100,23 @@ class ProcessNoise:
         self._reader = BlockReader(key, batch, process.n)
         self._initial_factor = cholesky(process.initial_covariance)
         self._factor = process.noise_factor if covariance is None else semidefinite_factor(covariance)
-        self._slots = range(0)
-        self._noise: Floats
+        self._noise = Ahead(self._reader, self._drawn)
 
     def at(self, k: int) -> Floats:
         """The noise that slot k adds to A x_{k−1}, (n, R)."""
-        if k == 0 and self._initial is not None:
-            return self._initial
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            factors = np.broadcast_to(self._factor, (len(self._slots), *self._factor.shape))
-            if self._slots.start == 0:
-                factors = factors.copy()
-                factors[0] = self._initial_factor
-            self._noise = product(factors, self._reader.normals(self._slots))
-        noise: Floats = self._noise[k - self._slots.start]
+        return self._noise.at(k)
+
+    def block(self, slots: range) -> Floats:
+        """The noise of consecutive slots, (c, n, R)."""
+        return self._noise.of(slots)
+
+    def _drawn(self, slots: range) -> Floats:
+        factors = np.repeat(self._factor[None], len(slots), axis=0)
+        if slots.start == 0:
+            factors[0] = self._initial_factor
+        noise = product(factors, self._reader.normals(slots))
+        if slots.start == 0 and self._initial is not None:
+            noise[0] = self._initial
         return noise
 
 
@@ -176,12 +148,26 @@ class Trajectory:
         if self._next == 0:
             self.x = noise
         else:
-            self.predicted = self._process.predict(self.x)
-            self.x = self.predicted + noise
+            predicted, x = kernels.advance(self._process.A, noise[None], self.x)
+            self.predicted, self.x = predicted[0], x[0]
         if pushed is not None:
             self.x = self.x + pushed
         self._next += 1
         return self.x
+
+    def advance_block(self, count: int) -> tuple[Floats, Floats]:
+        """The states of the next `count` slots and the predictions A x_{k−1} of each, (c, n, R), without inputs."""
+        slots = range(self._next, self._next + count)
+        noise = self._noise.block(slots)
+        if slots.start == 0:
+            first, self.x = self.predicted, noise[0]
+            later, x = kernels.advance(self._process.A, noise[1:], self.x)
+            predicted, x = np.concatenate([first[None], later]), np.concatenate([noise[:1], x])
+        else:
+            predicted, x = kernels.advance(self._process.A, noise, self.x)
+        self.predicted, self.x = predicted[-1], x[-1]
+        self._next = slots.stop
+        return x, predicted
 
 
 @final
@@ -194,33 +180,36 @@ class StateFactors:
     """
 
     def __init__(self, process: Process) -> None:
-        self._A: Rows = process.A.tolist()
-        self._noise_factor: Rows = process.noise_factor.tolist()
-        self._initial = self._times_A(cholesky(process.initial_covariance).tolist())
+        self._A = process.A
+        self._noise_factor = process.noise_factor
+        self._initial = product(self._A, cholesky(process.initial_covariance))
         self._k = 1
         self._carried = self._initial
 
-    def carried(self, k: int) -> Rows:
+    def carried(self, k: int) -> Floats:
         """A L_{k−1}, (n, n), for k ≥ 1: a factor of the encoding noise's covariance A Σ_{k−1} Aᵀ."""
-        if k < self._k:
-            self._k, self._carried = 1, self._initial
-        while self._k < k:
-            spread = zip(self._carried, self._noise_factor, strict=True)
-            self._carried = self._times_A(triangular_factor([left + right for left, right in spread]))
-            self._k += 1
-        return self._carried
+        factor: Floats = self.block(range(k, k + 1))[0]
+        return factor
 
-    def _times_A(self, factor: Rows) -> Rows:
-        n = len(factor)
-        product_rows: Rows = []
-        for a in self._A:
-            row = [a[0] * value for value in factor[0]]
-            for j in range(1, n):
-                weight, values = a[j], factor[j]
-                for c in range(n):
-                    row[c] += weight * values[c]
-            product_rows.append(row)
-        return product_rows
+    def block(self, slots: range) -> Floats:
+        """The same for consecutive slots, at least one, (c, n, n); 0 for slot 0. Slots in order are fastest."""
+        first = max(slots.start, 1)
+        if first < self._k:
+            self._k, self._carried = 1, self._initial
+        self._go_to(first)
+        found = np.zeros((len(slots), *self._A.shape))
+        if slots.stop > first:
+            rows = found[first - slots.start :]
+            rows[0] = self._carried
+            rows[1:] = kernels.carried_factors(self._A, self._noise_factor, self._carried, len(rows) - 1)
+            self._k, self._carried = slots.stop - 1, rows[-1].copy()
+        return found
+
+    def _go_to(self, k: int) -> None:
+        while self._k < k:
+            count = min(k - self._k, _SLOTS_AT_ONCE)
+            self._carried = kernels.carried_factors(self._A, self._noise_factor, self._carried, count)[-1].copy()
+            self._k += count
 
 
 def mistakes_of(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.kernels.elementary import inverse
-from evedrop.model.process import Dynamics, Floats, Process, product
+from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception, trace_of
 from evedrop.model.theory.covariances import radius
 from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
@@ -55,32 +55,35 @@ class ReferenceCode:
         n = self._process.n
         least = min(float(self._process.Q[i, i]) for i in range(n))
         limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * least
-        slots = 0
-        grown = sigma
-        while slots < _MOST_SLOTS:
-            grown = product(product(self.L, grown), self.L.T.copy())
-            if not sum(float(grown[i, i]) for i in range(n)) <= limit:
-                break
-            slots += 1
-        return slots
 
-    @cached_property
-    def _dynamics(self) -> Dynamics:
-        return Dynamics(self.L)
+        def carried(power: Floats, spread: Floats) -> Floats:
+            return product(product(power, spread), power.T.copy())
+
+        def within(spread: Floats) -> bool:
+            return sum(float(spread[i, i]) for i in range(n)) <= limit
+
+        # L^m Σ L^mᵀ grows with m, because A Σ Aᵀ ≤ Σ. So the largest m is found bit by bit, from powers of L by doubling.
+        powers = [self.L]
+        slots, grown = 0, sigma
+        with np.errstate(over="ignore", invalid="ignore"):
+            while len(powers) < _DOUBLINGS and within(carried(powers[-1], sigma)):
+                powers.append(product(powers[-1], powers[-1]))
+            for j in reversed(range(len(powers))):
+                further = carried(powers[j], grown)
+                if within(further):
+                    slots, grown = slots + 2**j, further
+        return slots
 
     def carry(self, reference: Floats) -> Floats:
         """L times a reference, (n, R)."""
-        return self._dynamics.product(reference)
+        return product(self.L, reference)
 
 
 def stationary_covariance(process: Process) -> Floats:
     """Σ = A Σ Aᵀ + Q of a stable process, (n, n), by doubling, with the same bits on every machine."""
     sigma, power = process.Q, process.A
     for _ in range(_DOUBLINGS):
-        added = product(product(power, sigma), power.T.copy())
-        if not np.any(np.abs(added) > 0.0):
-            break
-        sigma = sigma + added
+        sigma = sigma + product(product(power, sigma), power.T.copy())
         power = product(power, power)
     return sigma
 

@@ -10,7 +10,7 @@ import importlib
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar, final
@@ -184,12 +184,20 @@ def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
         there = [
             one for one, value in vars(module).items() if isinstance(value, type) and value.__module__ == module_name
         ]
-        near = difflib.get_close_matches(class_name, there, 1)
-        choice = f"did you mean {module_name}:{near[0]}?" if near else f"expected one of {', '.join(there) or 'none'}"
+        choice = near(class_name, there, f"{module_name}:") or f"; expected one of {', '.join(there) or 'none'}"
         file = getattr(module, "__file__", None)
         where = f" ({file})" if file else ""
-        raise NotRegistered(name, f"{said}, and the module {module_name}{where} has no {class_name}; {choice}")
+        raise NotRegistered(name, f"{said}, and the module {module_name}{where} has no {class_name}{choice}")
     return found, said
+
+
+def near(found: object, names: Iterable[str], before: str = "") -> str:
+    """A hint, `; did you mean NAME?`, if the value found is close to one of the names; otherwise an empty string.
+
+    before: what to write before the name.
+    """
+    close = difflib.get_close_matches(str(found), list(names), 1)
+    return f"; did you mean {before}{close[0]}?" if close else ""
 
 
 @lru_cache(maxsize=32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import final
 
 from evedrop.model.receiver import Flags
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
 
 
 @final
@@ -20,15 +20,18 @@ class Schedule:
     def __init__(self, key: bytes, state_probability: float, batch: Batch) -> None:
         self._reader = BlockReader(key, batch, 1)
         self._state_probability = state_probability
-        self._slots = range(0)
-        self._innovations: Flags
+        self._innovations = Ahead(self._reader, self._drawn)
 
     def at(self, k: int) -> Flags:
         """ν_k as flags, (R,): true for an innovation."""
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            self._innovations = self._reader.uniforms(self._slots)[:, 0, :] >= self._state_probability
-            if self._slots.start == 0:
-                self._innovations[0] = False
-        flags: Flags = self._innovations[k - self._slots.start]
-        return flags
+        return self._innovations.at(k)
+
+    def block(self, slots: range) -> Flags:
+        """ν of consecutive slots, (c, R)."""
+        return self._innovations.of(slots)
+
+    def _drawn(self, slots: range) -> Flags:
+        innovations = self._reader.uniforms(slots)[:, 0, :] >= self._state_probability
+        if slots.start == 0:
+            innovations[0] = False
+        return innovations

@@ -16,8 +16,9 @@ from typing import final
 
 import numpy as np
 
-from evedrop.kernels.elementary import Rows, cholesky, triangular_factor
-from evedrop.model.numeric.factored import Factor
+from evedrop.kernels.current import kernels
+from evedrop.kernels.elementary import cholesky
+from evedrop.kernels.factored import Factor
 from evedrop.model.process import Floats, Process, product
 
 
@@ -25,15 +26,13 @@ from evedrop.model.process import Floats, Process, product
 class Apart:
     """The distance to the twin, given one track of a slot; its numbers depend only on the process."""
 
-    def __init__(self, start: Rows, noise: Rows) -> None:
+    def __init__(self, start: Floats, noise: Floats) -> None:
         n = len(start)
-        nothing = [0.0] * n
-        above = [[*own, *late, *nothing] for own, late in zip(start, noise, strict=True)]
-        below = [[*(-value for value in own), *nothing, *own] for own in start]
-        joint = triangular_factor(above + below)
-        self._state = [row[:n] for row in joint[:n]]
-        self._gain = np.array([row[:n] for row in joint[n:]])
-        self.factor = Factor.of_triangular([row[n:] for row in joint[n:]])
+        nothing = np.zeros((n, n))
+        joint = kernels.triangular_factors(np.block([[start, noise, nothing], [-start, nothing, start]])[None])[0]
+        self._state = joint[:n, :n].tolist()
+        self._gain = joint[n:, :n]
+        self.factor = Factor.of_triangular(joint[n:, n:].tolist())
         """R_k, factored."""
 
     def mean(self, a: Floats) -> Floats:
@@ -52,10 +51,8 @@ class Twins:
     """`Apart` of any slot; asking for slots in order is quick."""
 
     def __init__(self, process: Process) -> None:
-        n = process.n
-        self._A: Rows = process.A.tolist()
-        self._noise: Rows = process.noise_factor.tolist()
-        self._first = cholesky(process.initial_covariance).tolist(), [[0.0] * n for _ in range(n)]
+        self._A, self._noise = process.A, process.noise_factor
+        self._first = cholesky(process.initial_covariance), np.zeros((process.n, process.n))
         self._k = 0
         self._start, self._late = self._first
 
@@ -64,17 +61,9 @@ class Twins:
         if k < self._k:
             self._k, (self._start, self._late) = 0, self._first
         while self._k < k:
-            self._start = self._times_A(self._start)
-            late = zip(self._times_A(self._late), self._noise, strict=True)
-            self._late = triangular_factor([left + right for left, right in late])
+            self._start = product(self._A, self._start)
+            self._late = kernels.triangular_factors(
+                np.concatenate([product(self._A, self._late), self._noise], axis=1)[None]
+            )[0]
             self._k += 1
         return Apart(self._start, self._late)
-
-    def _times_A(self, rows: Rows) -> Rows:
-        products: Rows = []
-        for a in self._A:
-            total = [a[0] * value for value in rows[0]]
-            for weight, row in zip(a[1:], rows[1:], strict=True):
-                total = [left + weight * right for left, right in zip(total, row, strict=True)]
-            products.append(total)
-        return products

@@ -18,36 +18,32 @@ from collections.abc import Callable
 
 import numpy as np
 
+from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Action, Codes, Flags, cleared, select
+from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, cleared, select
 
 _STATE, _INNOVATION = int(Action.STATE), int(Action.INNOVATION)  # numpy compares with an int ten times as fast
 
 
-def estimate(
-    process: Process, k: int, x_hat: Floats, action: Codes, z: Floats, w: Callable[[], Floats] | None = None
-) -> Floats:
-    """x̂_k (n, R) from x̂_{k−1}, the actions (R,), the packets z (n, R) and, for a decoder, w_{k−1} = z − χ (n, R)."""
-
-    def kept() -> Floats:
-        predicted = process.predict(x_hat) if k else x_hat
-        if w is None:
-            return predicted
-        return select(action == _INNOVATION, lambda: predicted + w(), lambda: predicted)
-
-    return select(action == _STATE, lambda: z, kept)
-
-
 def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> Floats:
     """P_k (n, n, R) as a receiver believes it, from P_{k−1} and the actions (R,)."""
+    found: Floats = kernels.follow_covariance(process.A, process.Q, P, action[None], k == 0)[0]
+    return found
 
-    def kept() -> Floats:
-        if k == 0:
-            return P
-        carried = process.carry(P)
-        return select(action == _INNOVATION, lambda: carried, lambda: process.diffuse(carried))
 
-    return cleared(action == _STATE, P.shape, kept)
+def belief(process: Process, k: int, before: Belief, action: Codes, z: Floats, chi: Floats | None = None) -> Belief:
+    """The belief after slot k, from the one before it, the actions (R,), the packets z and, for a decoder, χ_k, (n, R) each."""
+    noise = None if chi is None else chi[None]
+    x_hat, P = kernels.follow(process.A, process.Q, (before.x_hat, before.P), action[None], z[None], noise, k == 0)
+    return Belief(x_hat[0], P[0], action)
+
+
+def beliefs(
+    process: Process, first: int, before: Belief, action: Codes, z: Floats, chi: Floats | None = None
+) -> Beliefs:
+    """The same for c consecutive slots from `first` on: action (c, R), z and χ (c, n, R)."""
+    known = (before.x_hat, before.P)
+    return Beliefs(*kernels.follow(process.A, process.Q, known, action, z, chi, first == 0), action)
 
 
 def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Flags, f: Floats) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 from evedrop.model.process import Floats
 from evedrop.model.schedule import Schedule
 from evedrop.model.slot.link import link_of
-from evedrop.model.theory.estimator_chain import step_probabilities, word_probability
+from evedrop.model.theory.closed_forms import step_probabilities, word_probability
 from evedrop.paper.deliveries import deliveries
 from evedrop.streams import Batch, root_of_seed, stream_key
 from evedrop.view.figure_style import BLUE, RED, panels

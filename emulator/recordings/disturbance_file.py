@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from importlib import resources
 from itertools import islice, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from evedrop.errors import DisturbanceError
 from evedrop.files import Limit, Unreadable, lines_of
@@ -38,12 +39,12 @@ _ROWS_UNASKED = 10_000  # for a scenario without a number of slots, which is rep
 
 def found_file(name: str, folder: Path) -> Path:
     """The path of a file that a scenario in this folder names: in the folder, or otherwise among the shipped files."""
-    beside = folder / name
+    own = folder / name
     shipped = Path(str(resources.files("evedrop.scenarios"))) / name
     try:
-        return shipped if not beside.exists() and shipped.is_file() else beside
+        return shipped if not own.exists() and shipped.is_file() else own
     except OSError:  # the name cannot be a file's: opening it reports that
-        return beside
+        return own
 
 
 def read_disturbances(
@@ -94,9 +95,8 @@ def disturbances_text(names: Sequence[str], units: Sequence[str] | None, rows: S
     return "".join(f"{','.join(line)}\n" for line in [list(head), *([repr(value) for value in row] for row in rows)])
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A line of the file and its number."""
+class _Row(NamedTuple):
+    """A line of the file and its number. A tuple, since a day has 86 400 of them."""
 
     line: int
     cells: list[str]
@@ -125,9 +125,9 @@ def _rows(path: Path, slots: int) -> Iterator[_Row]:
     try:
         reader = csv.reader(lines_of(path, Limit.of_rows(slots)), skipinitialspace=True)
         for cells in reader:
-            row = _Row(reader.line_num, [cell.strip() for cell in cells])
-            if any(row.cells) and not row.cells[0].startswith("#"):
-                yield row
+            stripped = list(map(str.strip, cells))
+            if any(stripped) and not stripped[0].startswith("#"):
+                yield _Row(reader.line_num, stripped)
     except (Unreadable, csv.Error) as error:
         what = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
         raise DisturbanceError(str(path), [what]) from error
@@ -185,14 +185,15 @@ def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _F
     wrong: list[_Row] = []
     all_lines = all_wrong = 0
     for row in rows:
+        line, cells = row
         all_lines += 1
         try:
-            values = [float(row.cells[place]) * factor for place, factor in places]
+            values = [float(cells[place]) * factor for place, factor in places]
         except (ValueError, IndexError):
             values = [math.nan]
-        if len(row.cells) == width and all(map(math.isfinite, values)):
+        if len(cells) == width and all(map(math.isfinite, values)):
             numbers.append(values)
-            lines.append(row.line)
+            lines.append(line)
             continue
         all_wrong += 1
         if all_wrong <= _MOST_SAID + 1:  # more are not reported, and need not be kept

@@ -15,8 +15,7 @@ from typing import Any
 import pyarrow as pa
 
 from evedrop.results.writer import plain
-from evedrop.score.kept import SecrecyKept
-from evedrop.score.verdict import Secrecy, Verdict
+from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict
 
 _NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
 _ALIKE = 1e-6  # relative difference of two errors of theory that count as equal: allows for rounding only

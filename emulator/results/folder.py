@@ -7,12 +7,16 @@ file 0600 from its creation on, whatever the umask is.
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import itertools
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import final
 
 from evedrop.errors import UsageError
 from evedrop.files import shown
@@ -130,3 +134,46 @@ def private_pictures(path: Path) -> Path:
 def write_private(path: Path, text: str) -> None:
     """Write a text to a file that only this user can read."""
     private_file(path).write_text(text, encoding="utf-8")
+
+
+_F_GETPATH = 50  # of macOS; Python has no name for it before 3.9, and none on Linux
+
+
+@final
+class HeldFolder:
+    """An open folder."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the folder. Raises OSError if it cannot be opened."""
+        self.first = path
+        """Its path when it was opened."""
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+
+    @property
+    def now(self) -> Path:
+        """Its current path. Raises FileNotFoundError if it was removed."""
+        if self._is(self.first):
+            return self.first
+        moved = self._found()
+        if moved is not None and self._is(moved):
+            return moved
+        raise FileNotFoundError(errno.ENOENT, "the folder was removed while the run went on", str(self.first))
+
+    def _is(self, path: Path) -> bool:
+        try:
+            return os.path.samestat(path.stat(), os.fstat(self._descriptor))
+        except OSError:
+            return False
+
+    def _found(self) -> Path | None:
+        """The folder's path according to the system."""
+        try:
+            if sys.platform == "darwin":
+                return Path(os.fsdecode(fcntl.fcntl(self._descriptor, _F_GETPATH, bytes(1024)).rstrip(b"\0")))
+            return Path(os.readlink(f"/proc/self/fd/{self._descriptor}"))
+        except OSError:
+            return None
+
+    def close(self) -> None:
+        """Close the folder."""
+        os.close(self._descriptor)

@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, opened, text_of
+from evedrop.model.digest import DIGEST_BYTES
 from evedrop.news import RunEvent
 from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
-from evedrop.results.input_table import inputs_schema_in
 from evedrop.results.summary_file import plain
-from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, trials_schema
+from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
 from evedrop.score.summary import Summary
 from evedrop.streams import MOST_SLOTS
 
@@ -73,9 +73,8 @@ class Results:
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
         if not table.schema.equals(wanted):
-            other = [field.name for field in wanted if field not in table.schema] or table.schema.names
             raise UsageError(
-                f"{path} is not a table of this version (it differs in {', '.join(other)}); run the scenario again"
+                f"{path} is not a table of this version ({_differences(table.schema, wanted)}); run the scenario again"
             )
         empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
         if empty:
@@ -108,7 +107,7 @@ class Results:
 
     @property
     def digests(self) -> pa.Table:
-        """A row per peer, trial and block of 256 slots."""
+        """A row per peer, trial and block of 256 slots. Raises UsageError for the digests of an older version."""
         return self._table("digests", DIGESTS)
 
 
@@ -116,6 +115,18 @@ def _states_in(schema: pa.Schema) -> int:
     """The number of states in a table of trials; 1 if it is not such a table."""
     x = schema.field("x").type if "x" in schema.names else None
     return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
+
+
+def _differences(found: pa.Schema, wanted: pa.Schema) -> str:
+    """How a table's columns differ from those of this version."""
+    digest = found.field("digest").type if "digest" in found.names else None
+    if digest is not None and pa.types.is_fixed_size_binary(digest) and digest.byte_width != DIGEST_BYTES:
+        return (
+            f"its digests have {digest.byte_width} bytes, and those of this version, which cover other bytes, have "
+            f"{DIGEST_BYTES}: they cannot be compared"
+        )
+    other = [field.name for field in wanted if field not in found] or found.names
+    return f"it differs in {', '.join(other)}"
 
 
 def _one_line(error: Exception) -> str:

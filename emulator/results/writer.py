@@ -24,14 +24,23 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.names import CONTROLLER
+from evedrop.results.folder import HeldFolder
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_figures
-from evedrop.results.held_folder import HeldFolder
-from evedrop.results.input_table import input_columns, inputs_schema
 from evedrop.results.reading import Results, load_results
 from evedrop.results.summary_file import plain, summary_text, write_summary
-from evedrop.results.tables import ACTIONS, DIGESTS, JOURNAL, NULLABLE, SENT, SLOTS, trials_schema
+from evedrop.results.tables import (
+    ACTIONS,
+    DIGESTS,
+    JOURNAL,
+    NULLABLE,
+    SENT,
+    SLOTS,
+    input_columns,
+    inputs_schema,
+    trials_schema,
+)
 from evedrop.scenario import Scenario
-from evedrop.scenario.disturbances import disturbances_of
+from evedrop.scenario.input_files import disturbances_of
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
@@ -291,7 +300,7 @@ class ResultsWriter:
         return np.full(count, self._digested.index(name), np.int8)
 
     def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
-        """A row per receiver, trial and block: receiver → block → digests (R, 32) of the trials from first_trial on."""
+        """A row per receiver, trial and block: receiver → block → digests (R, 16) of the trials from first_trial on."""
         for name, blocks in digests.items():
             for block, values in sorted(blocks.items()):
                 trials = len(values)

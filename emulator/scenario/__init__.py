@@ -4,11 +4,6 @@ Source: docs/scenario.md.
 """
 
 from evedrop.scenario.expect import ExpectTable, link_figure
-from evedrop.scenario.tables import SECRET_BYTES, Scenario
+from evedrop.scenario.tables import Scenario
 
-__all__ = [
-    "SECRET_BYTES",
-    "ExpectTable",
-    "Scenario",
-    "link_figure",
-]
+__all__ = ["ExpectTable", "Scenario", "link_figure"]

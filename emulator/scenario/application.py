@@ -129,7 +129,7 @@ class Panel:
     curves: tuple[PanelCurve, ...]
     span: tuple[float, float] | None = None
     """Lowest and highest value shown; None: fitted to the curves."""
-    beside: bool = False
+    with_beliefs: bool = False
     """Whether it is placed with the panels of the receivers' beliefs, rather than with those of the plant."""
 
 

@@ -31,17 +31,17 @@ def loop_mistakes(tables: ValidTables) -> Iterator[str]:
         inputs = listed(plant.inputs)
         yield f"controller: is missing; expected a table [controller] that decides {inputs}, or a plant without inputs"
     if tables.legitimate is not None and tables.legitimate.knows_input and "controller" not in given:
-        yield f"{LEGITIMATE}.knows_input: is true, but nothing has inputs; expected a [plant] and a [controller], or no such line"
+        yield f"{LEGITIMATE}.knows_input: is true, but there are no inputs; add a [plant] and a [controller], or remove the line"
     if tables.process is not None and plant is not None:
-        yield from _beside_process(plant, tables.process)
+        yield from _plant_and_process(plant, tables.process)
         yield from _rows(plant, tables.slots)
         if tables.controller is not None:
-            yield from _beside_plant(plant, tables.controller, tables.process, tables.slot_seconds or 1.0)
+            yield from _controller_and_plant(plant, tables.controller, tables.process, tables.slot_seconds or 1.0)
     if tables.controller is not None:
         yield from _outages(tables, tables.controller)
 
 
-def _beside_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:
+def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:
     n = len(process.A)
     matrices = {name: getattr(plant, name) for name in ("input_matrix", "disturbance_matrix", "noise")}
     for name, rows in matrices.items():
@@ -81,7 +81,7 @@ def _rows(plant: PlantTable, slots: int | None) -> Iterator[str]:
         yield f"plant.disturbance_values: has {len(rows)} rows; expected slots, which is {slots}, or more"
 
 
-def _beside_plant(
+def _controller_and_plant(
     plant: PlantTable, controller: ControllerTable, process: ProcessTable, slot_seconds: float
 ) -> Iterator[str]:
     """Weights and limits of wrong length, and the strategy's objections."""
@@ -113,7 +113,7 @@ def _outages(tables: ValidTables, controller: ControllerTable) -> Iterator[str]:
     if controller.acts_on == "estimate":
         why = "the controller acts on its estimate"
     elif tables.legitimate is not None and tables.legitimate.knows_input:
-        why = "it is told the inputs"
+        why = "it waits for the inputs"
     else:
         return
     for i, event in tables.event:

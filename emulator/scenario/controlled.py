@@ -6,7 +6,7 @@ import numpy as np
 
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.scenario.application import ControlledPlant
-from evedrop.scenario.disturbances import disturbances_of
+from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.tables import Scenario
 
 

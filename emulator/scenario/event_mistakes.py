@@ -142,7 +142,7 @@ def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
                 if away is not None:
                     yield f"{path} is {_said(away[1])} already, from slot {away[0]} on; expected it to be back"
                 elif act.at == ended:
-                    yield f"{path} is back in slot {act.at} only; expected a later slot"
+                    yield f"{path} comes back only in slot {act.at}; expected a later slot"
                 away = act.at, reason
             case Return(reason, after=after):
                 if away is None or away[1] != reason:

@@ -5,7 +5,6 @@ Source: docs/scenario.md, expect.
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +15,10 @@ from pydantic import AfterValidator, Field
 
 from evedrop.figures import expectable_figures, figures_of, unloadable_figures
 from evedrop.figures.links import LINK_FIGURES
+from evedrop.model.checks import is_number
 from evedrop.scenario.application import APPLICATIONS, Application
 from evedrop.scenario.table import Found, Number, Table, expected, one_of
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.words import as_toml, listed, near
 
 SECRECY = ("relative", "perfect")
 
@@ -159,21 +159,21 @@ def _nothing(table: Mapping[str, Any]) -> list[Found]:
 
 def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
     """Mistakes unless there is a bound to compare with, and slots or a quantile only for a figure that allows them."""
-    below, above, near = (table.get(name) for name in ("below", "above", "near"))
+    below, above, middle = (table.get(name) for name in ("below", "above", "near"))
     distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
     found: list[Found] = []
-    if near is None and distances:
+    if middle is None and distances:
         found.append((distances[0], "is set without near; expected near = 0.01 as well"))
-    elif near is None and below is None and above is None:
+    elif middle is None and below is None and above is None:
         what = "and above are both missing; expected at least one, such as below = 0.01, or near and within"
         found.append(("below", what))
-    elif near is not None and not distances:
+    elif middle is not None and not distances:
         found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
     elif len(distances) > 1:
         found.append(("within_relative", "is given together with within; expected one of them"))
-    elif near == 0 and distances == ["within_relative"]:
+    elif middle == 0 and distances == ["within_relative"]:
         found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
-    if below is not None and above is not None and _number(below) and _number(above) and not above < below:
+    if below is not None and above is not None and is_number(below) and is_number(above) and not above < below:
         found.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
     figure = table["figure"]
     if not isinstance(figure, str):
@@ -191,10 +191,6 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
         )
         found.append(("quantile", f"is set, but {figure} is not known trial by trial; {instead}"))
     return found
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _secrecy_mistakes(table: Mapping[str, Any]) -> list[Found]:
@@ -243,7 +239,7 @@ class Around:
             name = getattr(expectation, entry)
             if name is not None and name not in known:
                 choice = f"expected {listed(known)}" if known else "there is no eavesdropper; add one"
-                found.append((entry, f"is {as_toml(name)}; {choice}{_near(name, known)}"))
+                found.append((entry, f"is {as_toml(name)}; {choice}{near(name, known)}"))
         return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
 
     def _figure_mistakes(self, figure: str) -> list[Found]:
@@ -263,7 +259,7 @@ class Around:
                 return [("figure", f"is {as_toml(figure)}{broken}")]
             names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(known)})"
             of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
-            hint = _near(figure, [*own, *links])
+            hint = near(figure, [*own, *links])
             return [("figure", f"is {as_toml(figure)}; expected {names} or {of_links}{hint}")]
         why = self.no_theory(first) if link is None and known[name].needs_theory else None
         if why is not None:
@@ -281,7 +277,7 @@ class Around:
             return []
         choice = [f"{name}.FIGURE ({', '.join(own)})"] if own else []
         choice += [f"{name}.RECEIVER.FIGURE ({', '.join(of_receivers)})"] if of_receivers else []
-        return [("figure", f"is {as_toml(figure)}; expected {' or '.join(choice)}{_near(figure, known)}")]
+        return [("figure", f"is {as_toml(figure)}; expected {' or '.join(choice)}{near(figure, known)}")]
 
     def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
         if self.slots is None:
@@ -303,8 +299,3 @@ class Around:
         if self.trials >= least:
             return []
         return [("quantile", f"is {quantile:g} of {self.trials} trials; expected trials = {least} or more")]
-
-
-def _near(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {near[0]}?" if near else ""

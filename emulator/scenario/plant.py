@@ -114,7 +114,7 @@ def limit_mistakes(
     for i, (least, most) in enumerate(zip(lower or [], upper or [], strict=False)):
         if least > most:
             found.append(
-                (f"{kind}_lower", f"entry {i} is {least}, above that of {kind}_upper, which is {most}; exchange them")
+                (f"{kind}_lower", f"entry {i} is {least}, above that of {kind}_upper, which is {most}; swap them")
             )
     for name, values in within.items():
         for i, value in enumerate(values):

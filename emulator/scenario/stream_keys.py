@@ -13,8 +13,22 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.slot.link import LinkSchedule, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
 from evedrop.scenario import Scenario
-from evedrop.scenario.tables import MOST_SECRET_BYTES, SECRET_BYTES
 from evedrop.streams import root_of_seed, stream_key
+
+_SECRET_BYTES = 32
+_MOST_SECRET_BYTES = 2**20
+
+
+def secret_in(file: str) -> bytes:
+    """The secret in a file. Raises UsageError if the file cannot be read, or is too short."""
+    expected = f"expected a file of {_SECRET_BYTES} or more random bytes"
+    try:
+        secret = contents(Path(file), _MOST_SECRET_BYTES)
+    except Unreadable as error:
+        raise UsageError(f"secret_file: {file} cannot be read ({error}); {expected}") from error
+    if len(secret) < _SECRET_BYTES:
+        raise UsageError(f"secret_file: {file} has {len(secret)} bytes; {expected}")
+    return secret
 
 
 @dataclass(frozen=True)
@@ -26,24 +40,11 @@ class StreamKeys:
 
     @classmethod
     def of(cls, scenario: Scenario) -> StreamKeys:
-        """The keys of a scenario: from its seed, and the secret's from a file if the scenario names one.
-
-        Raises UsageError if the file cannot be read, or is too short.
-        """
+        """The keys of a scenario: from its seed, and the secret's from a file if it names one. Raises as `secret_in`."""
         root = root_of_seed(scenario.seed)
         if scenario.secret_file is None:
             return cls(root, stream_key(root, "secret"))
-        try:
-            secret = contents(Path(scenario.secret_file), MOST_SECRET_BYTES)
-        except Unreadable as error:
-            raise UsageError(
-                f"--secret {scenario.secret_file} cannot be read ({error}); give a file of {SECRET_BYTES} or more bytes"
-            ) from error
-        if len(secret) < SECRET_BYTES:
-            raise UsageError(
-                f"--secret {scenario.secret_file} has {len(secret)} bytes; expected {SECRET_BYTES} or more random ones"
-            )
-        return cls(root, stream_key(secret, "secret"))
+        return cls(root, stream_key(secret_in(scenario.secret_file), "secret"))
 
     def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
         """Stream → its key, for these streams of the shared secret."""
@@ -54,13 +55,15 @@ class StreamKeys:
         """The key of the sensor's process noise."""
         return stream_key(self.seed_root, "process")
 
-    def link(self, receiver: str, course: LinkSchedule) -> dict[str, bytes]:
+    def link(self, receiver: str, schedule: LinkSchedule) -> dict[str, bytes]:
         """Stream → its key, for all streams that a receiver's link draws from."""
-        return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, course)}
+        return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, schedule)}
 
-    def links(self, courses: Mapping[str, LinkSchedule]) -> dict[str, bytes]:
+    def links(self, schedules: Mapping[str, LinkSchedule]) -> dict[str, bytes]:
         """Stream → its key, for all links."""
-        return {name: key for receiver, course in courses.items() for name, key in self.link(receiver, course).items()}
+        return {
+            name: key for receiver, schedule in schedules.items() for name, key in self.link(receiver, schedule).items()
+        }
 
     @property
     def measurement(self) -> bytes:

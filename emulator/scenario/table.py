@@ -18,10 +18,13 @@ from pydantic import (
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from evedrop.errors import NotRegistered
-from evedrop.model.registry import Registry, asked
+from evedrop.model.checks import is_number
+from evedrop.model.registry import Registry, asked, near
 from evedrop.names import RESERVED
-from evedrop.scenario.words import as_toml, listed, near
+from evedrop.scenario.words import as_toml, listed
 
+MOST = 2**1023
+"""The largest whole number that is sure to fit a float."""
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
@@ -145,12 +148,11 @@ def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:
 
 
 def numbers(rows: Any) -> bool:
-    """Whether these are rows of numbers, of any lengths."""
-    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_number, row)) for row in rows)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, float) or (type(value) is int and abs(value) <= 2**1023)
+    """Whether these are rows of numbers, of any lengths; they may be infinite, or NaN."""
+    return isinstance(rows, list) and all(
+        isinstance(row, list) and all(isinstance(one, float) or is_number(one, -MOST, MOST) for one in row)
+        for row in rows
+    )
 
 
 def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]:

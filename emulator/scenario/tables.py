@@ -47,9 +47,6 @@ from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.words import as_toml, listed
 from evedrop.streams import MOST_SLOTS
 
-SECRET_BYTES = 32
-MOST_SECRET_BYTES = 2**20
-
 
 class EncodingTable(Table):
     """`[encoding]`: the scheme and its parameters."""
@@ -173,6 +170,19 @@ class Scenario(Table):
     _applications: dict[str, Table] = PrivateAttr(default_factory=dict)
 
     @classmethod
+    def read(cls, tables: Mapping[str, Any]) -> Self:
+        """The scenario that tables describe. From now on modules are found in its folder of modules. Raises ValidationError.
+
+        This process imports such modules only for schemes and links: see `evedrop.model.answers` for eavesdroppers.
+        """
+        folder = tables.get("modules")
+        if isinstance(folder, str) and Path(folder).is_dir():
+            ANSWERS.folder = str(Path(folder).absolute())
+            if any(trusted_in(tables)):
+                look_in(ANSWERS.folder)
+        return cls.model_validate(tables)
+
+    @classmethod
     def entries(cls) -> list[str]:
         """The names of its entries, those of applications included."""
         return [name for name in super().entries() if name != "made_with"] + APPLICATIONS.names
@@ -221,7 +231,9 @@ class Scenario(Table):
         return scenario
 
     @model_serializer(mode="wrap")
-    def _beside_applications(self, handler: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
+    def _with_application_tables(
+        self, handler: SerializerFunctionWrapHandler, info: SerializationInfo
+    ) -> dict[str, Any]:
         tables: dict[str, Any] = handler(self)
         for name, table in self._applications.items():
             tables[name] = table.model_dump(
@@ -231,21 +243,13 @@ class Scenario(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes in the folder of modules. From now on modules are found in it, so that the other entries can name classes.
-
-        This process imports such modules only for schemes and links: see `evedrop.model.answers` for eavesdroppers.
-        """
+        """Mistakes in the folder of modules."""
         folder = table.get("modules")
         if not isinstance(folder, str):
             return []
         if not Path(folder).is_dir():
             return [("modules", f'is "{folder}", which is not a folder; expected the folder that contains the modules')]
-        absolute = str(Path(folder).absolute())
-        wrong = [("modules", what) for what in elsewhere(absolute, table)]
-        ANSWERS.folder = absolute
-        if any(trusted_in(table)):
-            look_in(absolute)
-        return wrong
+        return [("modules", what) for what in elsewhere(str(Path(folder).absolute()), table)]
 
     @property
     def relayed(self) -> bool:
@@ -302,8 +306,8 @@ class Scenario(Table):
         """A link's settings with some entries changed; `changes` includes those of earlier events."""
         return changed_link(self.link(receiver), changes).settings(self.slot_seconds)
 
-    def course(self, receiver: str) -> LinkSchedule:
-        """The course of a receiver's link: its settings, its changes and the receiver's outages, all known in advance."""
+    def schedule(self, receiver: str) -> LinkSchedule:
+        """The schedule of a receiver's link: its settings, its changes and the receiver's outages, all known in advance."""
         link = self.link(receiver)
         return LinkSchedule(
             link.settings(self.slot_seconds),
@@ -313,7 +317,7 @@ class Scenario(Table):
             None if link.correlation is None else (link.correlation.to, link.correlation.strength),
         )
 
-    def cuts(self, receiver: str) -> list[int]:
+    def outage_bounds(self, receiver: str) -> list[int]:
         """The slots in which a receiver goes away or comes back: each begins a new block of its digest. None for a controller."""
         if receiver == CONTROLLER:
             return []

@@ -5,19 +5,18 @@ Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.acknowledgements import AckChannel, WayBackSpec, rates_of
-from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
+from evedrop.model.acknowledgements import WayBackSpec, rates_of
+from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.score.summary import DetectionSummary
-from evedrop.streams import Batch
 
 _ATTACK_LOOKED_FOR = "all"  # by the sensor of a scenario without an attack
 
@@ -48,41 +47,6 @@ def chart_of(scenario: Scenario) -> Chart | None:
         return chart_for(normal, attacked, table.false_alarms)
     except ValueError:
         return None
-
-
-@final
-class Acknowledging:
-    """The way back in memory: does the work that legitimate estimator, router and sensor share in a live run."""
-
-    def __init__(self, spec: WayBackSpec, chart: Chart | None, key: bytes, batch: Batch) -> None:
-        self._way = AckChannel(spec.attack, spec.quality, key, batch, spec.spans)
-        self._jammer = spec.jammer
-        self._watch = None if chart is None else CusumBatch(chart, batch.trials)
-        self.alarms: Flags = np.zeros(batch.trials, np.bool_)
-        """Whether the last slot raised an alarm, (R,)."""
-
-    @classmethod
-    def of(cls, scenario: Scenario, key: bytes, batch: Batch) -> Acknowledging | None:
-        """The way back of a scenario; None if there are no acknowledgements."""
-        spec = way_back_of(scenario)
-        return None if spec is None else cls(spec, chart_of(scenario), key, batch)
-
-    @property
-    def watches(self) -> bool:
-        """Whether the sensor watches for an attack."""
-        return self._watch is not None
-
-    def take(self, k: int, sent: Flags | None, gammas: Mapping[str, Flags]) -> Flags:
-        """The acknowledgements of slot k that reach the sensor, (R,).
-
-        sent: where the sensor sent a packet, (R,); None: everywhere. gammas: receiver → γ, (R,).
-        """
-        gamma = gammas[LEGITIMATE]
-        gamma_e = gamma if self._jammer is None else gammas[self._jammer]
-        arrived = self._way.arrived(k, sent, gamma, gamma_e)
-        if self._watch is not None:
-            self.alarms = self._watch.take(arrived, sent)
-        return arrived
 
 
 @final

@@ -21,14 +21,14 @@ from evedrop.scenario import Scenario
 from evedrop.score.summary import LinkSummary
 from evedrop.score.sums import Tally
 
-CONFIDENCE = 0.999
+RATE_CONFIDENCE = 0.999
 QUANTILES = (0.5, 0.9, 0.99)
 
 
 def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSummary:
     """A link's account, and how its losses and delays compare with those of its models."""
-    course = scenario.course(receiver)
-    pieces = _pieces(course, tally.done)
+    schedule = scenario.schedule(receiver)
+    pieces = _pieces(schedule, tally.done)
     met = sum(len(slots) for slots, _ in pieces) * tally.trials - tally.lost.get("overflow", 0)
     found = _with_delays(
         LinkSummary(
@@ -38,7 +38,7 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
             mean_burst=_mean_burst(tally),
             expected_mean_burst=None if tally.lost.get("overflow") else _expected_burst(pieces),
         ),
-        course,
+        schedule,
         tally,
     )
     if tally.offered != tally.done * tally.trials:
@@ -78,15 +78,15 @@ def interval(rate: float, expected: float, variance: float) -> tuple[float, floa
     if variance <= 0.0:
         return rate, rate
     count = expected * (1.0 - expected) / variance
-    received, tail = rate * count, (1.0 - CONFIDENCE) / 2.0
+    received, tail = rate * count, (1.0 - RATE_CONFIDENCE) / 2.0
     low = float(betaincinv(received, count - received + 1.0, tail)) if received > 0.0 else 0.0
     high = float(betaincinv(received + 1.0, count - received, 1.0 - tail)) if received < count else 1.0
     return low, high
 
 
-def _pieces(course: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
+def _pieces(schedule: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
     """The slots below `done` in which the link was not cut, in pieces, each with its loss model."""
-    marks = stretches(course)
+    marks = stretches(schedule)
     ends = [*(start for start, _, _ in marks[1:]), done]
     return [
         (range(start, min(end, done)), loss_of(settings["loss"]))
@@ -114,26 +114,26 @@ def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
     return float(chain.law @ lost) / begins if begins > 0.0 else None
 
 
-def _with_delays(link: LinkSummary, course: LinkSchedule, tally: Tally) -> LinkSummary:
+def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> LinkSummary:
     """The link with fractions of its delivered packets by delay, and their quantiles."""
     total = int(tally.delays.sum())
-    if course.settings.get("delay") is None or not total:
+    if schedule.settings.get("delay") is None or not total:
         return link
     fractions = tally.delays / total
     return replace(
         link,
         delays=fractions.tolist(),
-        expected_delays=_expected_delays(course),
+        expected_delays=_expected_delays(schedule),
         delay_quantiles={f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
     )
 
 
-def _expected_delays(course: LinkSchedule) -> list[float] | None:
+def _expected_delays(schedule: LinkSchedule) -> list[float] | None:
     """The fractions by delay that the model predicts; None if the settings change, or if there is a queue."""
-    if any(change.settings is not None for change in course.changes) or course.settings.get("rate", 1.0) < 1.0:
+    if any(change.settings is not None for change in schedule.changes) or schedule.settings.get("rate", 1.0) < 1.0:
         return None
-    model, reorder = delay_of(course.settings["delay"]), course.settings.get("reorder", 0.0)
-    there = [model.arrived(lag) for lag in range(course.window + 1)]
+    model, reorder = delay_of(schedule.settings["delay"]), schedule.settings.get("reorder", 0.0)
+    there = [model.arrived(lag) for lag in range(schedule.window + 1)]
     if any(one is None for one in there):
         return None
     reached = [0.0, *(reorder + (1.0 - reorder) * one for one in there if one is not None), 1.0]

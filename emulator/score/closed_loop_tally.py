@@ -84,7 +84,7 @@ class LoopTally:
         self._plant = plant
         self._sign = -1.0 if knows_input else 1.0
         self._offset = Offset(process, plant, trials) if comparable else None
-        self.slots = 0
+        self.trial_slots = 0
         """Slots times trials so far."""
         self.failed = 0
         """Trial-slots whose inputs were held because a decision failed."""
@@ -113,7 +113,7 @@ class LoopTally:
         inputs = acted.inputs
         for application in self.applications.values():
             application.add(acted.true, inputs.u, acted.estimates)
-        self.slots += inputs.failed.size
+        self.trial_slots += inputs.failed.size
         self.failed += int(np.count_nonzero(inputs.failed))
         self.clipped += int(np.count_nonzero(self._plant.clips(inputs.u)))
         if self._offset is None:
@@ -132,7 +132,7 @@ class LoopTally:
             return None
         whole = copy(known[0])
         for part in known[1:]:
-            whole.slots += part.slots
+            whole.trial_slots += part.trial_slots
             whole.failed += part.failed
             whole.clipped += part.clipped
             whole.other_error += part.other_error
@@ -150,7 +150,7 @@ class LoopTally:
         knows = scenario.legitimate.knows_input
         errors = [
             user.figure("mean_squared_error"),
-            self.other_error / self.slots if self._offset and self.slots else None,
+            self.other_error / self.trial_slots if self._offset and self.trial_slots else None,
         ]
         return ControllerSummary(
             strategy=scenario.controller.strategy,
@@ -160,8 +160,8 @@ class LoopTally:
             decisions=times.decisions,
             mean_solve_seconds=times.mean,
             longest_solve_seconds=times.longest,
-            failed_fraction=self.failed / self.slots if self.slots else None,
-            clipped_fraction=self.clipped / self.slots if self.slots else None,
+            failed_fraction=self.failed / self.trial_slots if self.trial_slots else None,
+            clipped_fraction=self.clipped / self.trial_slots if self.trial_slots else None,
             mean_squared_errors=dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
             mean_trace_covariance=user.figure("mean_trace_covariance"),
             digest=digest,

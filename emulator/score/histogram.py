@@ -12,6 +12,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats
 
 LEVELS = (0.05, 0.5, 0.95)
@@ -40,12 +41,8 @@ class SlotHistograms:
         rows = len(chosen)
         if not rows:
             return
-        bins = (np.ascontiguousarray(chosen).view(np.int64) >> _SHIFT) - self._base
-        np.clip(bins, 0, _BINS - 1, out=bins)
-        bins += _BINS * np.arange(rows)[:, None]
-        counts = np.bincount(bins.reshape(-1), minlength=rows * _BINS)
         start = (first + skip) // self._stride
-        self.counts[start : start + rows] += counts.reshape(rows, _BINS).astype(np.uint32)
+        kernels.add_to_histograms(self.counts[start : start + rows], chosen, _SHIFT, self._base)
 
     def merge(self, other: SlotHistograms) -> None:
         """Add the histograms of further trials."""

@@ -5,13 +5,14 @@ The summary is described in docs/results.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.expected.expectations import expectations_of
+from evedrop.expected.expectations import ExpectedTraceStream, expectations_of
 from evedrop.figures import figures_of
 from evedrop.figures.figure import ScoredSlots
 from evedrop.model.digest import Digests, RunDigest, block_starts
@@ -25,11 +26,10 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
-from evedrop.score.summary import PeerSummary, Summary, Surprising
+from evedrop.score.summary import PeerSummary, Summary, Surprising, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
-from evedrop.score.verified import verification_of
 
 _ENOUGH_TO_SURPRISE = 10  # trials
 
@@ -46,18 +46,23 @@ class Scored(NamedTuple):
 
 @final
 class Scorekeeper:
-    """Scores the slots of a batch of trials, in order."""
+    """Scores the slots of a batch of trials, in order.
 
-    def __init__(self, scenario: Scenario, trials: int) -> None:
-        self._theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
+    theory: receiver → its expected traces; computed if it is not given.
+    """
+
+    def __init__(
+        self, scenario: Scenario, trials: int, theory: Mapping[str, ExpectedTraceStream] | None = None
+    ) -> None:
+        self._theory = theory or {name: one.stream() for name, one in expectations_of(scenario).items()}
         self.totals = Totals.of(scenario, trials)
 
-    def add(self, slots: Slots) -> dict[str, Scored]:
-        """Score the next slots: receiver → its errors, sums and theory."""
+    def add(self, slots: Slots, known: Mapping[str, Floats] | None = None) -> dict[str, Scored]:
+        """Score the next slots: receiver → its errors, sums and theory; known: the errors, if they have been computed."""
         scored = {}
         self._add_plant(slots)
         for name, receiver in slots.receivers.items():
-            errors = squared_errors(slots.x, receiver.x_hat)
+            errors = squared_errors(slots.x, receiver.x_hat) if known is None else known[name]
             one = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
@@ -208,7 +213,7 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising 
 
 def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) -> str | None:
     """A receiver's digest from all its blocks; None if the run was cut short."""
-    if sorted(blocks) != block_starts(scenario.slots, scenario.cuts(receiver)):
+    if sorted(blocks) != block_starts(scenario.slots, scenario.outage_bounds(receiver)):
         return None
     digest = RunDigest()
     digest.add(blocks)
@@ -218,3 +223,31 @@ def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) 
 def events_of(scenario: Scenario, done: int) -> list[RunEvent]:
     """The scenario's events before slot `done`."""
     return [RunEvent(act.at, act.said, "scenario") for act in scenario.timeline.acts if act.at < done]
+
+
+def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Verification]:
+    """The entry `verification` of a live run's summary: receiver → the verified figures, and those that rest on its word.
+
+    accused: processes whose misbehaviour ended the run.
+    """
+    recorded = _recorded_of(scenario)
+    found = {}
+    for name in scenario.receivers:
+        figures = {who: _resting_on(who, name) for who in ("observer", "receiver", "recorded trials")}
+        checked, of_recorded = figures["observer"], [*figures["recorded trials"], "digest"]
+        verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
+        own_word = [one for one in (*checked, *figures["receiver"], *of_recorded) if one not in verified]
+        found[name] = Verification(0 if name in accused else recorded, verified, own_word)
+    return found
+
+
+def _resting_on(who: str, receiver: str) -> list[str]:
+    """The figures of a receiver of a live run with this value of `rests_on`."""
+    figures = figures_of(receiver).items()
+    return [name for name, one in figures if one.rests_on == who and one.only_in_mode is None]
+
+
+def _recorded_of(scenario: Scenario) -> int:
+    """The number of recorded trials; each shard records at least its first."""
+    bounds = [scenario.trials * i // scenario.shards for i in range(scenario.shards + 1)]
+    return sum(max(1, min(scenario.record_trials, stop) - start) for start, stop in pairwise(bounds))

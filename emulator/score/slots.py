@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,22 @@ class ReceiverSlots:
     unsent: NDArray[np.uint32] | None = None
     """Counts of the trials without a packet according to the router, (c,); None: every trial had one."""
 
+    def part(self, trials: slice) -> ReceiverSlots:
+        """The same for some of the trials; what is counted over all trials stays as it is."""
+        late, used, delivered = (
+            None if one is None else one[:, trials] for one in (self.late, self.late_used, self.late_delivered)
+        )
+        return replace(
+            self,
+            x_hat=self.x_hat[..., trials],
+            action=self.action[:, trials],
+            P=self.P[..., trials],
+            delivered=self.delivered[:, trials],
+            late=late,
+            late_used=used,
+            late_delivered=delivered,
+        )
+
 
 @dataclass(frozen=True)
 class InputSlots:
@@ -47,6 +63,10 @@ class InputSlots:
     """As decided, (c, m, R); the plant may clip it."""
     failed: Flags
     """Whether the decision failed, so that the previous inputs are held, (c, R)."""
+
+    def part(self, trials: slice) -> InputSlots:
+        """The same for some of the trials."""
+        return InputSlots(self.u[..., trials], self.failed[:, trials])
 
 
 @dataclass(frozen=True)
@@ -78,38 +98,59 @@ class Slots:
         """Number of trials."""
         return int(self.x.shape[2])
 
+    def part(self, trials: slice) -> Slots:
+        """The same for some of the trials; what is counted over all trials stays as it is."""
+        sent, alarms = (None if one is None else one[:, trials] for one in (self.sent, self.alarms))
+        return replace(
+            self,
+            x=self.x[..., trials],
+            nu=self.nu[:, trials],
+            receivers={name: one.part(trials) for name, one in self.receivers.items()},
+            sent=sent,
+            alarms=alarms,
+            inputs=None if self.inputs is None else self.inputs.part(trials),
+            true=None if self.true is None else self.true[..., trials],
+        )
+
     def copied(self) -> Slots:
-        """A copy whose arrays for the view are its own: x, ν, sent, inputs, and the receivers' x̂, P and actions."""
-        receivers = {
-            name: replace(one, x_hat=one.x_hat.copy(), action=one.action.copy(), P=one.P.copy())
-            for name, one in self.receivers.items()
-        }
-        sent = None if self.sent is None else self.sent.copy()
-        inputs = None if self.inputs is None else InputSlots(self.inputs.u.copy(), self.inputs.failed.copy())
-        return replace(self, x=self.x.copy(), nu=self.nu.copy(), receivers=receivers, sent=sent, inputs=inputs)
+        """A copy whose arrays are its own, so that it does not keep larger ones in memory."""
+        copy: Slots = _copied(self)
+        return copy
+
+
+def _copied(value: Any) -> Any:
+    """An entry whose arrays are its own: tables and classes entry by entry."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, Mapping):
+        return {name: _copied(one) for name, one in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value)(**{one.name: _copied(getattr(value, one.name)) for one in fields(value)})
+    return value
 
 
 def concatenated(parts: Sequence[Slots]) -> Slots:
-    """Consecutive slots as one, without alarms, true states, late and unsent packets and reasons for losses."""
+    """Consecutive slots as one. Raises ValueError if only some of the parts have an entry."""
+    whole: Slots = _joined(parts)
+    return whole
 
-    def column(name: str, one: str) -> NDArray[Any]:
-        return np.concatenate([getattr(part.receivers[name], one) for part in parts])
 
-    receivers = {
-        name: ReceiverSlots(**{one: column(name, one) for one in _ARRAYS}, lost={}) for name in parts[0].receivers
-    }
-    x, nu = (np.concatenate([getattr(part, one) for part in parts]) for one in ("x", "nu"))
-    sent = None if parts[0].sent is None else np.concatenate([all_set(part.sent, part.nu) for part in parts])
-    inputs = None
-    if parts[0].inputs is not None:
-        of_parts = [part.inputs for part in parts if part.inputs is not None]
-        inputs = InputSlots(*(np.concatenate([getattr(one, name) for one in of_parts]) for name in ("u", "failed")))
-    return Slots(parts[0].first, x, nu, receivers, sent, inputs=inputs)
+def _joined(values: Sequence[Any]) -> Any:
+    """The values of one entry in consecutive slots as one: arrays along the slots, tables and classes entry by entry."""
+    kinds = {type(one) for one in values}
+    if len(kinds) > 1:
+        raise ValueError(f"some of the parts have an entry that others lack: {sorted(kind.__name__ for kind in kinds)}")
+    first = values[0]
+    if first is None or isinstance(first, int):  # the number of the first slot
+        return first
+    if isinstance(first, np.ndarray):
+        return np.concatenate(values)
+    if isinstance(first, Mapping):
+        names = dict.fromkeys(name for one in values for name in one)
+        return {name: _joined([one.get(name) for one in values]) for name in names}
+    return type(first)(**{one.name: _joined([getattr(value, one.name) for value in values]) for one in fields(first)})
 
 
 def all_set(flags: Flags | None, like: Flags) -> Flags:
     """The flags; if there are none, flags that are all set."""
     return np.ones_like(like) if flags is None else flags
-
-
-_ARRAYS = ("x_hat", "action", "P", "trace", "delivered")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from evedrop.figures import figure
 from evedrop.figures.figure import ReceiverTotals, TotalsFigure
+from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
@@ -55,10 +56,7 @@ class SlotSums:
 
 def squared_errors(x: Floats, x_hat: Floats) -> Floats:
     """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""
-    error = x - x_hat
-    error *= error
-    squared: Floats = error.sum(axis=1)
-    return squared
+    return kernels.squared_errors(x, x_hat)
 
 
 def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> SlotSums:
@@ -68,8 +66,9 @@ def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> Slot
     """
     count, trials = error.shape
     errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
-    received = np.count_nonzero(action != Action.LOST, axis=1).astype(np.float64)
-    discarded = np.count_nonzero(action == Action.DISCARDED, axis=1)
+    counts = kernels.count_codes(action, len(Action))
+    received = trials - counts[:, Action.LOST].astype(np.float64)
+    discarded = counts[:, Action.DISCARDED]
     return SlotSums(
         trials=np.full(count, float(trials)),
         error=errors,
@@ -121,7 +120,7 @@ class Tally(ReceiverTotals):
         self.received += int(sums.received.sum())
         self.used += int(sums.used.sum())
         windows = window_of(np.arange(first, first + count), self.slots)
-        for window in range(-1, WINDOWS):
+        for window in range(windows[0], windows[-1] + 1):
             inside = np.flatnonzero(windows == window)
             if inside.size:
                 self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)

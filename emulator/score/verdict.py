@@ -17,7 +17,7 @@ from evedrop.model.process import Floats
 from evedrop.score.summary import SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 
-CONFIDENCE = 0.99
+BOUND_CONFIDENCE = 0.99
 _ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
 
 
@@ -88,7 +88,7 @@ class Secrecy:
         if self.perfect is Verdict.HELD:
             run = "perfect secrecy held in this run: its error grew while the legitimate one stayed bounded"
         if self.judged_by == "median" and self.trials > 1:
-            run += " (judged by medians, for the variance is infinite)"
+            run += " (judged by medians, because the variance is infinite)"
         return f"{self.eavesdropper}: {times} × the legitimate error; {run}; {promise}"
 
 
@@ -104,7 +104,7 @@ def mean_bounds(samples: Floats) -> tuple[float, float]:
     if count < 2:
         return -math.inf, math.inf
     mean = float(np.mean(samples))
-    reach = float(stdtrit(count - 1, CONFIDENCE)) * float(np.std(samples, ddof=1)) / math.sqrt(count)
+    reach = float(stdtrit(count - 1, BOUND_CONFIDENCE)) * float(np.std(samples, ddof=1)) / math.sqrt(count)
     return mean - reach, mean + reach
 
 
@@ -115,7 +115,7 @@ def median_bounds(samples: Floats) -> tuple[float, float]:
     count = len(samples)
     ordered = np.sort(samples)
     # The largest rank that is too high with a probability of 1 %, by the binomial law of the number of samples below the median.
-    rank = int(bdtrik(1.0 - CONFIDENCE, count, 0.5)) if bdtr(0, count, 0.5) <= 1.0 - CONFIDENCE else -1
+    rank = int(bdtrik(1.0 - BOUND_CONFIDENCE, count, 0.5)) if bdtr(0, count, 0.5) <= 1.0 - BOUND_CONFIDENCE else -1
     if rank < 0:
         return -math.inf, math.inf
     return float(ordered[rank]), float(ordered[count - 1 - rank])
@@ -201,3 +201,16 @@ def _holds_from(gap: Floats) -> int | None:
     wrong = np.flatnonzero(~(gap[1:] > 0.0)) + 1
     first = int(wrong[-1]) + 1 if wrong.size else 1
     return first if first < len(gap) else None
+
+
+class SecrecyKept(StrEnum):
+    """How much a scheme keeps secret from an adversary, in a word."""
+
+    PERFECT = "perfect"
+    RELATIVE = "relative"
+    UNDECIDED = "too few trials to tell"
+    BROKEN = "broken"
+
+
+MARKS = {SecrecyKept.PERFECT: "●", SecrecyKept.RELATIVE: "◐", SecrecyKept.UNDECIDED: "?", SecrecyKept.BROKEN: "✕"}
+"""Verdicts as marks that can be distinguished without colours."""

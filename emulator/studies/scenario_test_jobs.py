@@ -19,6 +19,7 @@ from evedrop.signals import stop_on_signals
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome, carry_out
 
 _LOOK_SECONDS = 0.1
+_INTERRUPTED = "interrupted; the results so far are in the results folders"
 _WORK = "from evedrop.studies.scenario_test_jobs import work; work()"
 
 
@@ -28,7 +29,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
         with stop_on_signals() as stop:
             for scenario in scenarios:
                 if stop.is_set():
-                    raise Interrupted("interrupted; the results so far are in the results folders")
+                    raise Interrupted(_INTERRUPTED)
                 yield carry_out(scenario, manner)
         return
     crew = _Crew(replace(manner, workers=1))
@@ -38,7 +39,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
             for one in waiting:
                 while not wait([one], _LOOK_SECONDS).done:
                     if stop.is_set():
-                        raise Interrupted("interrupted; the results so far are in the results folders")
+                        raise Interrupted(_INTERRUPTED)
                 yield one.result()
         finally:
             crew.end(waiting)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.score.kept import MARKS, SecrecyKept
+from evedrop.score.verdict import MARKS, SecrecyKept
 from evedrop.view.figure_style import panels
 
 if TYPE_CHECKING:

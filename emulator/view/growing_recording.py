@@ -94,7 +94,9 @@ class Served:
         try:
             self._server = _Server(followed, self.path, host, port)
         except OSError as error:
-            raise UsageError(f"{host}:{port} cannot be had ({error.strerror}) to show the run; give another") from error
+            raise UsageError(
+                f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another"
+            ) from error
         self.port = int(self._server.server_address[1])
         threading.Thread(target=self._server.serve_forever, args=(_LOOK_SECONDS,), name="view", daemon=True).start()
 

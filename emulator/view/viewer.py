@@ -15,13 +15,15 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import TYPE_CHECKING, final
 from urllib.parse import quote
 
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
-from evedrop.view.growing_recording import Followed, Served, feed
 from evedrop.view.viewer_process import HOST, end, is_apart, spawn
+
+if TYPE_CHECKING:
+    from evedrop.view.growing_recording import Followed, Served
 
 _ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
@@ -84,7 +86,7 @@ class WebAddress:
                     probe.bind((self.host, port))
                 except OSError as error:
                     raise UsageError(
-                        f"--serve {self.host}:{self.port}: {self.host}:{port} cannot be had ({error.strerror}); give another"
+                        f"--serve {self.host}:{self.port}: {self.host}:{port} cannot be used ({error.strerror}); give another"
                     ) from error
 
 
@@ -134,6 +136,8 @@ class Viewer:
         mode = choose(mode)
         if mode == "off":
             return None
+        from evedrop.view.growing_recording import Followed  # noqa: PLC0415 - only with a view
+
         followed = Followed(recording, complete)
         for attempt in range(_ATTEMPTS):
             port = free_port()
@@ -153,12 +157,16 @@ class Viewer:
 
         Raises UsageError if it cannot be started, for example because a port is taken.
         """
+        from evedrop.view.growing_recording import Followed  # noqa: PLC0415 - only with a view
+
         stand.check_free()
         followed = Followed(recording, complete)
         return cls._page(followed, stand.host, stand.seen, stand.port, stand.port + 1, logs)
 
     @classmethod
     def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int, logs: Path) -> Viewer:
+        from evedrop.view.growing_recording import Served  # noqa: PLC0415 - only with a view
+
         served = Served(followed, host, data_port)
         try:
             process = spawn(port, ["--serve-web", "--web-viewer-port", str(port), _NOTHING], logs, host=host)
@@ -169,6 +177,8 @@ class Viewer:
 
     @classmethod
     def _window(cls, followed: Followed, port: int, logs: Path) -> Viewer:
+        from evedrop.view.growing_recording import feed  # noqa: PLC0415 - only with a view
+
         arguments = ["--port", str(port), *_WINDOW, "-"]
         process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
         assert process.stdin is not None  # noqa: S101 - it is a pipe

@@ -16,13 +16,14 @@ from evedrop.applications.microgrid import privacy
 from evedrop.applications.microgrid.energy import Meter, energy
 from evedrop.cli import main as cli
 from evedrop.errors import ScenarioError
-from evedrop.loading import checked, load
+from evedrop.loading import checked
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.controllers import mpc
+from tests.applications.test_microgrid import part_of_day
 from tests.conftest import Evedrop
 from tests.scenario.test_plant_tables import LOOP
 
-SLOTS = 3600
+SLOTS = 1200
 
 
 def tables(**changes: Any) -> dict[str, Any]:
@@ -104,7 +105,7 @@ def test_a_broken_solver_is_told_in_one_line(
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "osqp", raising=False)
     try:
-        assert cli.main(["check", "microgrid-mpc"]) == 2
+        assert cli.main(["check", "microgrid-mpc", "--set", "slots=200"]) == 2
     finally:
         sys.modules.pop("osqp", None)  # the broken one, which other tests must not find
     told = capsys.readouterr().err
@@ -146,20 +147,10 @@ def test_the_figures_are_those_of_the_tables(tmp_path: Path) -> None:
 
 def test_active_windows_are_the_days(tmp_path: Path) -> None:
     """Their number is that of the load; who has nothing to go by is near a coin, the legitimate estimator far above."""
-    results = montecarlo(
-        "microgrid",
-        trials=2,
-        slots=30_000,
-        out=tmp_path / "x",
-        plan=Plan(workers=1),
-        eavesdroppers__bayesian__strategy="smart",
-    )
-    house = results.summary["household"]
-    scenario = load("microgrid")
-    assert scenario.plant is not None
-    assert scenario.plant.disturbance_values is not None
-    load_power = np.array(scenario.plant.disturbance_values)[: 499 * 60, 1]
-    assert house["windows"] == 499
+    scenario = part_of_day("microgrid", 25_200, 4800, eavesdroppers__bayesian__strategy="smart")
+    house = montecarlo(scenario, trials=2, out=tmp_path / "x", plan=Plan(workers=1)).summary["household"]
+    load_power = np.array(scenario.plant.disturbance_values)[: 79 * 60, 1]
+    assert house["windows"] == 79
     assert house["active_windows"] == int(privacy.active(load_power, 60, 0.7).sum()) > 5
     told = house["receivers"]
     assert told["legitimate"]["activity_area"] > 0.99

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evedrop.applications.microgrid.load_guess import HousePlaces, LoadGuess
-from evedrop.applications.microgrid.perfect import PerfectLoop
+from evedrop.applications.microgrid.household_tally import HousePlaces, LoadGuess, PerfectLoop
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.plant import Plant
 from evedrop.model.process import Process

@@ -39,10 +39,10 @@ def energies(results: Results) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", ["microgrid", "microgrid-mpc"])
 def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
-    """Two hours before noon at μ_d = 0.1: net and total energy differ from perfect knowledge by less than the paper says."""
+    """Forty minutes before noon at μ_d = 0.1: net and total energy differ from perfect knowledge by less than the paper says."""
     if name == "microgrid-mpc":
         pytest.importorskip("osqp", reason="model predictive control needs the extra `microgrid`")
-    scenario = part_of_day(name, 36_000, 7200, **NO_PACKETS)
+    scenario = part_of_day(name, 40_800, 2400, **NO_PACKETS)
     found = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
     assert found["net"] < PAPER
     assert found["total"] < PAPER
@@ -50,13 +50,13 @@ def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
 
 
 def test_what_is_summed_slot_by_slot_depends_on_the_weights(tmp_path: Path) -> None:
-    """The same two hours with a grid power that may change at will: the third measure is beyond what the paper says."""
+    """The same minutes with a grid power that may change at will: the third measure is beyond what the paper says."""
     eager = {
         "controller__input_weights": [0.02, 0.001],
         "controller__rate_weights": [1.0, 0.0],
         "controller__period": 5,
     }
-    scenario = part_of_day("microgrid", 36_000, 7200, **NO_PACKETS, **eager)
+    scenario = part_of_day("microgrid", 40_800, 2400, **NO_PACKETS, **eager)
     found = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
     assert found["net"] < PAPER < found["summed"]
 

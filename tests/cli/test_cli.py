@@ -191,7 +191,7 @@ def test_a_secret_of_its_own_changes_the_schedule_alone(evedrop: Evedrop) -> Non
     assert truths[0] == truths[1] == truths[2]
     done = evedrop(*base, "e", "--secret", "short")
     assert done.status == 2
-    assert "has 31 bytes; expected 32 or more" in done.err
+    assert "short has 31 bytes; expected a file of 32 or more random bytes" in done.err
 
 
 def test_a_scenario_names_a_secret_in_its_own_folder(evedrop: Evedrop) -> None:

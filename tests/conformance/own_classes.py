@@ -33,7 +33,8 @@ link = { quality = 0.8 }
 HEAD = """
 import numpy as np
 from evedrop.extend import (
-    Bernoulli, ConstantDelay, Naive, NoInnovations, Packet, PacketReader, Plain, PlainEncoder, PlainEstimator, Scheme,
+    Bernoulli, ConstantDelay, Naive, NoInnovations, Packet, PacketBlock, PacketReader, Plain, PlainEncoder, PlainEstimator,
+    Scheme,
 )
 
 

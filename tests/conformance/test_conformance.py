@@ -11,7 +11,7 @@ import pytest
 from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
 from evedrop.conformance.examine import examined
 from evedrop.conformance.links import DelayChecks, LossChecks
-from evedrop.conformance.rules import Broken, RuleVerdict
+from evedrop.conformance.rules import Broken
 from evedrop.conformance.schemes import scheme_verdicts
 from evedrop.errors import UsageError
 from evedrop.model.delays import DELAY_MODELS
@@ -29,9 +29,10 @@ from evedrop.model.registry import asked
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.cipher import Cipher, CipherEstimator
 from evedrop.model.schemes.innovation import Innovation, SharedSecret
-from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
-from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme
+from evedrop.model.schemes.plain import PlainEncoder, PlainEstimator
+from evedrop.model.schemes.scheme import Packet, Scheme
 from evedrop.model.theory.covariances import Outcomes
+from tests.conformance.breaking import broken, plain_with
 
 EVERY = [
     (option, name)
@@ -48,12 +49,12 @@ EVERY = [
 @pytest.mark.parametrize(("option", "name"), EVERY)
 def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
     """On the same small problems as anybody's own."""
-    beside = {
+    schemes = {
         "reference": {"scheme": "acknowledged"},
         "selective": {"scheme": "encrypted-schedule"},
         "tracker": {"scheme": "twin-track"},
     }
-    for one in examined({option: name, **(beside.get(name, {}) if option == "eavesdropper" else {})}, {}):
+    for one in examined({option: name, **(schemes.get(name, {}) if option == "eavesdropper" else {})}, {}):
         assert [verdict for verdict in one.verdicts if verdict.broken is not None] == [], one.title
         assert len(one.verdicts) >= 4
 
@@ -128,16 +129,6 @@ class Discards(PlainEstimator):
         return found._replace(action=3 * found.action)
 
 
-def plain_with(encoder: Any = PlainEncoder, estimator: Any = PlainEstimator, **entries: Any) -> type[Scheme]:
-    """The plain scheme with one side replaced."""
-
-    def shared(self: Plain, keys: Any, batch: Any) -> NoInnovations:
-        del keys
-        return NoInnovations(self.process, batch.trials, encoder, lambda: estimator(self.process, batch.trials))
-
-    return type("Mine", (Plain,), {"shared": shared, **entries})
-
-
 class AllInnovations(SharedSecret):  # type: ignore[misc]  # final: nobody should do this
     """Slot 0 as any other."""
 
@@ -189,11 +180,6 @@ SCHEME_RULES: dict[str, tuple[type[Scheme], str, str]] = {
         "or return None",
     ),
 }
-
-
-def broken(verdicts: list[RuleVerdict]) -> dict[str, str]:
-    """Rule → how it is broken, of those that are."""
-    return {verdict.rule: verdict.broken for verdict in verdicts if verdict.broken is not None}
 
 
 @pytest.mark.parametrize("rule", SCHEME_RULES)

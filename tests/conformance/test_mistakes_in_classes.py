@@ -20,7 +20,8 @@ MISTAKES = {
     "pair": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return x, None",
              "slot 0: encode() returned tuple; expected a Packet"),
     "raises": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return 1 / 0",
-               "slot 0: encode() raised ZeroDivisionError: division by zero, case_raises.py line 16"),
+               "slot 0: encode() raised ZeroDivisionError: division by zero, case_raises.py "
+               f"line {len(HEAD.splitlines()) + 4}"),
     "changes": ("scheme", "Mine(Sends):\n    def packet(self, k, x):\n        x += 1.0",
                 "changes in place what it is given"),
     "header": ("scheme", "Mine(Plain):\n    header = ('one',)", "`header` names 1 numbers"),
@@ -42,6 +43,10 @@ MISTAKES = {
     "infinite": ("eavesdropper",
                  "Mine(Naive):\n    def step(self, k, belief, heard): return belief._replace(x_hat=heard.z / 0.0 * 0.0)",
                  "x_hat, trial 0, is nan; expected finite numbers"),
+    "asymmetric": ("eavesdropper",
+                   "Mine(Naive):\n    def step(self, k, belief, heard):\n"
+                   "        return belief._replace(P=belief.P + np.tri(2, k=-1)[:, :, None])",
+                   "P, trial 0, is 0.0 at [0][1] and 1.0 at [1][0]; expected a covariance, which is symmetric except for"),
     "streams": ("eavesdropper", "Mine(Naive):\n    @classmethod\n    def streams(cls, parameters): return ('schedule',)",
                 "knowledge of the schedule, and the scheme plain has none"),
     "fate": ("link", "Mine(Bernoulli):\n    parameters = {}\n    def __init__(self): super().__init__(0.9)\n"

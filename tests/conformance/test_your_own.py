@@ -10,7 +10,7 @@ import pytest
 from evedrop import extend
 from evedrop.errors import ScenarioError
 from evedrop.loading import load
-from evedrop.loading.amended import with_event
+from evedrop.loading.file import with_event
 from evedrop.results.writer import load_results
 from tests.builders import digests_of
 from tests.conformance.own_classes import BLOCK, PAGE
@@ -162,7 +162,7 @@ def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:
 
 
 def test_a_plug_in_needs_one_module(tutorial: Evedrop) -> None:
-    """The tutorial imports `evedrop.extend` and nothing else of Evedrop; every name there is documented and can be had."""
+    """The tutorial imports `evedrop.extend` and nothing else of Evedrop; every name there is documented and importable."""
     text = PAGE.read_text(encoding="utf-8")
     assert set(re.findall(r"^(?:from|import) (evedrop[\w.]*)", text, flags=re.MULTILINE)) == {"evedrop.extend"}
     assert set(re.findall(r"evedrop\.(?:model|kernels|streams|live|memory)[\w.]*", text)) == set()

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.signals import SHOW_STACKS
+from tests.processes import words_of
 
 _STACKS_SECONDS = 1.0
 _SUBREAPER = 36  # PR_SET_CHILD_SUBREAPER
@@ -72,7 +73,7 @@ def descendants() -> Iterator[Process]:
         pid = waiting.pop()
         waiting += children.get(pid, [])
         with suppress(OSError):
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
+            words = words_of(pid)
             yield Process(pid, tuple(words))
 
 

@@ -26,7 +26,7 @@ from tests.fuzz.readers import FILES, MESSAGES, READERS
 CHEAP = {"change", "disturbances", "disturbances-gz", "trace", "trace-parquet", "brief", "control"}
 """Readers of files that take less than a millisecond or two."""
 QUICK = {**dict.fromkeys(READERS, 100), **dict.fromkeys(CHEAP, 200), "scenario": 60, "summary": 30}
-QUICK |= {name: 15 for name in FILES if name.startswith("results-")}
+QUICK |= {name: 15 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
 """How many changed examples `make test` has each reader read."""
 LONG_FILES = {"scenario": 10_000, "change": 20_000, "summary": 5_000}
 LONG_FILES |= {name: 2_000 for name in FILES if name.startswith("results-")}
@@ -55,7 +55,7 @@ def test_examples_are_read(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", READERS)
 def test_changed_bytes_are_read_or_refused(name: str) -> None:
-    """Some hundreds of each reader; always the same ones."""
+    """Tens or hundreds of each reader, by what one costs; always the same ones."""
     failures = campaign(name, seed=0, count=QUICK[name])
     assert not failures, f"{failures[0].data!r:.2000}\n{failures[0].how}"
 

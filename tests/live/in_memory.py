@@ -57,6 +57,13 @@ class FakeInbox:
         """The next message."""
         return self._queue.get(timeout=LIMIT)
 
+    def take(self, most: int) -> list[bytes]:
+        """The next message, and those after it."""
+        found = [self.recv()]
+        while len(found) < most and not self._queue.empty():
+            found.append(self.recv())
+        return found
+
     def __iter__(self) -> Iterator[bytes]:
         while not self._queue.empty():
             yield self.recv()

@@ -10,7 +10,6 @@ import re
 import signal
 import socket
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,6 +18,7 @@ from evedrop.live.launch.ports import RouterEndpoint, meeting_at
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
 from tests.builders import digests_of
+from tests.commands import ForkedCommand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 
 ROLES = ("router", "relay", "sensor", "legitimate", "observer")
@@ -33,9 +33,11 @@ def written(evedrop: Evedrop, *options: str, out: str = "briefs", slots: int = 2
     return {Path(path).stem: path for path in done.out.split()}
 
 
-def begun(evedrop: Evedrop, name: str, path: str, *options: str, **how: Any) -> Live:
-    """A process of a brief, started by hand."""
-    return evedrop.begun(name if name in ROLES else "eavesdropper", path, *options, **how)
+def begun(evedrop: Evedrop, name: str, path: str, *options: str, folder: Path | None = None) -> Live:
+    """A process of a brief, started by hand, perhaps in another folder."""
+    words = (name if name in ROLES else "eavesdropper", path, *options)
+    process = ForkedCommand(words, evedrop.environment, folder or evedrop.folder)
+    return Live(process, evedrop.temporary, evedrop.folder)
 
 
 def closing(done: Done) -> list[str]:
@@ -87,7 +89,7 @@ def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards:
         started.append((number, name, taken, host))
     running = []
     for _, name, taken, host in reversed(started) if backwards else started:
-        running.append((name, begun(evedrop, name, str(taken), cwd=host)))
+        running.append((name, begun(evedrop, name, str(taken), folder=host)))
         if name == "router" and backwards:
             assert running[0][1].process.poll() is None, "everybody waits for the router"
     ended = {name: live.end() for name, live in running}
@@ -120,8 +122,9 @@ def test_a_reader_that_leaves_early_changes_no_exit_status(evedrop: Evedrop) -> 
     """Of an observer whose output nobody reads any more, the status is still that of the run."""
     expect = "expect=[{figure='smart.mean_squared_error', below=0}]"
     briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
+    observer_brief = briefs.pop("observer")
     running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
-    with running.pop("observer").process as observer:
+    with evedrop.start(["-m", "evedrop"], ("observer", observer_brief), {}) as observer:
         assert observer.stdout is not None
         observer.stdout.readline()
         observer.stdout.close()
@@ -312,7 +315,7 @@ def test_the_results_are_where_the_observer_is_told(evedrop: Evedrop) -> None:
     """Relative to where it is started; --out has the last word; a folder with something in it is refused."""
     briefs = written(evedrop, "--listen", "tcp/127.0.0.1:7447", "--wait", "1", "--results", "there/results")
     (evedrop.folder / "host").mkdir()
-    assert begun(evedrop, "observer", "../briefs/observer.json", cwd=evedrop.folder / "host").end().status == 3
+    assert begun(evedrop, "observer", "../briefs/observer.json", folder=evedrop.folder / "host").end().status == 3
     assert (evedrop.folder / "host" / "there" / "results").is_dir()
     (evedrop.folder / "full").mkdir()
     (evedrop.folder / "full" / "old").touch()

@@ -19,8 +19,7 @@ from evedrop.live.launch.children import Children, Exit
 from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.protocol.news import read_news
 from evedrop.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
-from evedrop.results.folder import new_folder
-from evedrop.results.held_folder import HeldFolder
+from evedrop.results.folder import HeldFolder, new_folder
 from tests.conftest import wait_until
 from tests.live.network.bench import scenario_of
 
@@ -143,7 +142,7 @@ def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: E
     ],
 )
 def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, sender: str) -> None:
-    """By the key that the message was put on, whoever complains of it."""
+    """By the key that the message was put on, no matter which process complains."""
     for name in ("legitimate", "router", "sensor", "eve", "observer"):
         bench.children.start(bench.briefs[name])
     said = f"malformed message on evedrop/r1/{key}: 3; expected 4"

@@ -17,6 +17,7 @@ from evedrop.errors import UsageError
 from evedrop.live.network.control_file import Control, read_control
 from tests.builders import digests_of
 from tests.conftest import Done, Evedrop, Live, wait_until
+from tests.steps import stepping
 
 SCENARIO = """
 title = "Steered"
@@ -50,15 +51,15 @@ DELAYED = '[[event]]\nat = 330\nlink = "legitimate"\nset = { delay = { model = "
 
 
 class Steered:
-    """A live run, and the commands that steer it, in this process: so the first of them comes long before the last slot."""
+    """A live run, which begins paused unless it is told otherwise, and the commands that steer it, in this process."""
 
     def __init__(
-        self, evedrop: Evedrop, capsys: pytest.CaptureFixture[str], slots: int, pace: float, events: str
+        self, evedrop: Evedrop, capsys: pytest.CaptureFixture[str], slots: int, pace: float, events: str, *options: str
     ) -> None:
         self._capsys = capsys
         path = evedrop.folder / "steered.toml"
         path.write_text(SCENARIO.format(slots=slots, pace=pace, events=events), encoding="utf-8")
-        self.live: Live = evedrop.live(str(path), "--json")
+        self.live: Live = evedrop.live(str(path), "--json", *options)
         wait_until(self.control.is_file, "a run that can be steered")
 
     @property
@@ -96,7 +97,9 @@ Start = Callable[..., Steered]
 @pytest.fixture
 def steered(evedrop: Evedrop, capsys: pytest.CaptureFixture[str]) -> Start:
     """Starts a run."""
-    return lambda slots=600, pace=0.005, events="": Steered(evedrop, capsys, slots, pace, events)
+    return lambda *options, slots=400, pace=0.0, events="": Steered(
+        evedrop, capsys, slots, pace, events, *(options or ("--paused",))
+    )
 
 
 def slot_of(answer: str) -> int:
@@ -106,9 +109,10 @@ def slot_of(answer: str) -> int:
 
 def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> None:
     """Steered in real time, while a receiver is away too: live and in memory its folder gives the same digests again."""
-    run = steered(slots=800, pace=0.002, events=KILLED + DELAYED)
-    wait_until(lambda: run.status()["slot"] > 60, "a receiver that is down")
-    said = [run("link", "legitimate", "quality=0.6"), run("link", "smart", "cut"), run("pause")]
+    run = steered(slots=500, pace=0.002, events=KILLED + DELAYED)
+    assert run("step", "70") == "slots 0 to 69 passed; held before slot 70"  # the receiver is down
+    with stepping(evedrop, run.live.folder, 150):
+        said = [run("link", "legitimate", "quality=0.6"), run("link", "smart", "cut"), run("pause")]
     said += [
         run(
             "link",
@@ -136,29 +140,32 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
         assert evedrop("diff", folder, str(again)).status == 0
         events = [(one["slot"], one["event"]) for one in load_results(run.live.folder).summary["events"]]
         repeated = [(one["slot"], one["event"]) for one in load_results(again).summary["events"]]
-        theirs = ("pause the run", "resume the run", "step 7 slots", "step 1 slot")
+        theirs = ("pause the run", "resume the run", *(f"step {n} slots" for n in (70, 150, 7)), "step 1 slot")
         assert sorted(repeated) == sorted(one for one in events if one[1] not in theirs)
     run.live.nothing_left()
 
 
-def test_a_paused_run_stands_still(steered: Start) -> None:
+def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
     """No slot passes until it goes on; status and summary tell what was done, and by whom."""
-    run = steered()
-    at = slot_of(run("pause"))
+    run = steered(pace=0.002)
+    with stepping(evedrop, run.live.folder, 300):
+        at = slot_of(run("pause"))
     found = run.status()
-    assert (found["slot"], found["state"], found["slots"]) == (at, "paused", 600)
+    assert (found["slot"], found["state"], found["slots"]) == (at, "paused", 400)
     assert found["processes"] == dict.fromkeys(("router", "sensor", "legitimate", "smart"), True)
     assert found["links"]["smart"]["offered"] == 3 * at
     assert run("pause") == f"held already, before slot {at}"
     assert run("link", "smart", "quality=0.5") == f"from slot {at} on: link smart: quality = 0.5"
     assert run("step", "4") == f"slots {at} to {at + 3} passed; held before slot {at + 4}"
     shown = run("status").splitlines()
-    assert shown[0] == f"slot {at + 4} of 600, 0 slots/s, paused before slot {at + 4}"
+    assert shown[0] == f"slot {at + 4} of 400, 0 slots/s, paused before slot {at + 4}"
     assert shown[-2] == f"event at slot {at}: link smart: quality = 0.5 (by the operator)"
     assert run("resume") == f"the run goes on with slot {at + 4}"
     summary = run.end().summary
     assert summary["ended"] == "complete"
     assert [(one["slot"] - at, one["event"], one["by"]) for one in summary["events"]] == [
+        (-at, "pause the run", "operator"),
+        (-at, "step 300 slots", "operator"),
         (0, "pause the run", "operator"),
         (0, "link smart: quality = 0.5", "operator"),
         (0, "step 4 slots", "operator"),
@@ -169,7 +176,6 @@ def test_a_paused_run_stands_still(steered: Start) -> None:
 def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
     """Every one at once, with exit status 2; what is not a command is refused before the run hears of it."""
     run = steered()
-    run("pause")
     before = (run.live.folder / "scenario.toml").read_text()
     done = run.try_to("link", "legitimate", "quality=1.2", "sluts=3")
     assert done.status == 2
@@ -193,14 +199,14 @@ def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
 def test_a_step_beyond_the_end_ends_the_run(steered: Start) -> None:
     """It is answered with the last slot, and the run is complete."""
     run = steered()
-    at = slot_of(run("pause"))
-    assert run("step", "1000") == f"slots {at} to 599 passed; the run is over"
+    assert run("step", "3") == "slots 0 to 2 passed; held before slot 3"
+    assert run("step", "1000") == "slots 3 to 399 passed; the run is over"
     assert run.end().summary["ended"] == "complete"
 
 
 def test_a_long_slot_is_not_waited_for(steered: Start) -> None:
     """In a run of a slot an hour the hold comes at once, before the slot that is due next."""
-    run = steered(slots=3, pace=3600.0)
+    run = steered("--seed", "11", slots=3, pace=3600.0)
     assert run("pause") == "held before slot 1"
     assert run("link", "smart", "cut") == "from slot 1 on: cut smart"
     run.live.process.send_signal(signal.SIGTERM)
@@ -211,7 +217,7 @@ def test_a_long_slot_is_not_waited_for(steered: Start) -> None:
 def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: Start) -> None:
     """Ctrl-C, or the launcher killed, while the run is held: what was measured and done is on disk, the password is not."""
     run = steered()
-    at = slot_of(run("pause"))
+    at = slot_of(run("step", "40"))
     run("link", "smart", "cut")
     run.live.process.send_signal(number)
     assert run.live.end().status in {130, -signal.SIGKILL}
@@ -219,14 +225,13 @@ def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: St
     assert not run.control.exists()
     summary = run.live.results.summary
     assert (summary["slots"], summary["ended"]) == (at, "interrupted")
-    assert [one["event"] for one in summary["events"]] == ["pause the run", "cut smart"]
+    assert [one["event"] for one in summary["events"]] == ["pause the run", "step 40 slots", "cut smart"]
 
 
 @pytest.mark.parametrize("name", ["sensor", "observer", "router"])
 def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedrop) -> None:
     """A process that is killed while a step goes on ends the step's command too, with status 2; a router comes back."""
-    run = steered(slots=100_000)
-    run("pause")
+    run = steered(slots=100_000, pace=0.005)
     waiting = Live(
         evedrop.start(["-m", "evedrop"], ("step", str(run.live.folder), "90000"), {}),
         evedrop.temporary,

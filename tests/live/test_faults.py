@@ -15,6 +15,7 @@ import pytest
 from evedrop.results.growing_tables import last_round
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 from tests.rogue import with_rogue
+from tests.steps import stepping
 
 ENDLESS = ("--slots", "1000000")
 SECONDS = 30.0
@@ -65,7 +66,7 @@ def test_a_killed_observer_is_named_and_what_it_wrote_is_kept(evedrop: Evedrop) 
 
 ROGUES = {
     "NaN estimate": ("smart", "change(lambda self: dict(x_hat=self.x_hat * float('nan')))", "NaN"),
-    "skipped slot": ("sensor", "packets(lambda k, z: uplink(k + 2, z))", "gap on"),
+    "skipped slot": ("sensor", "packets(lambda k, *rest: uplink(k + 2, *rest))", "gap on"),
     "journal without a link": ("router", "Journal.pack = lambda self: pack({'k': 0, 'c': 1, 'links': {}})", "a map"),
     "wrong progress": ("suspicious", "reporting.progress = lambda k: b''", "not msgpack"),
 }
@@ -187,9 +188,10 @@ def _state(pid: int) -> str:
 
 def test_a_process_deletes_its_brief_when_it_has_read_it(evedrop: Evedrop) -> None:
     """Its keys do not stay on disk: from the first slot on no brief is left, and none after a process was started again."""
-    live = evedrop.live("restart", "--pace", "0")
-    live.running()
-    wait_until(lambda: live.briefs() == {}, "no brief left")
+    live = evedrop.live("restart", "--pace", "0", "--paused")
+    live.held()
+    assert live.briefs() == {}
+    assert evedrop("resume", str(live.folder)).status == 0
     done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()
@@ -252,13 +254,17 @@ def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: 
 
 def test_a_stopped_process_only_slows_the_run(evedrop: Evedrop) -> None:
     """A receiver that stands still loses nothing: everybody waits."""
-    live = evedrop.live("eavesdroppers", "--slots", "20000", "--json")
+    live = evedrop.live("eavesdroppers", "--slots", "3000", "--pace", "0.0005", "--json", "--paused")
+    live.held()
     smart, sensor = live.child("smart"), live.child("sensor")
-    live.running()
-    os.kill(smart, signal.SIGSTOP)
-    stillness = Stillness(sensor)
-    wait_until(lambda: stillness.looks >= 20, "a sensor that waits for it")
-    os.kill(smart, signal.SIGCONT)
+    with stepping(evedrop, live.folder, 2900):
+        os.kill(smart, signal.SIGSTOP)
+        stillness = Stillness(sensor)
+        wait_until(lambda: stillness.looks >= 20, "a sensor that waits for it")
+        slot = evedrop("status", str(live.folder), "--json").summary["slot"]
+        os.kill(smart, signal.SIGCONT)
+        assert slot < 1800, "the sensor must wait for the receiver, and not at the end of the step"
+    assert evedrop("resume", str(live.folder)).status == 0
     done = live.end(60)
     assert done.status == 0
     assert {link["unexplained"] for link in done.summary["links"].values()} == {0}
@@ -291,14 +297,14 @@ def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) 
     live.kill(name, signal.SIGSTOP)
     done = live.end()
     assert done.status == 3
-    assert done.err.startswith(f"evedrop: {name} gave no sign of life any more: hung, stopped or cut off")
+    assert done.err.startswith(f"evedrop: {name} stopped responding: hung, suspended or cut off")
     live.nothing_left()
     tables_whole(live)
 
 
 def test_results_that_cannot_be_written_end_the_run(evedrop: Evedrop) -> None:
     """A full disk, played by a limit on the size of files: one clear line, exit 3, nothing left."""
-    live = evedrop.live("eavesdroppers", "--slots", "3000", largest_file=40_000)
+    live = evedrop.live("eavesdroppers", "--slots", "1000000", "--pace", "0.002", largest_file=200_000)
     done = live.end()
     assert done.status == 3
     assert "the results cannot be written" in done.err.splitlines()[0]

@@ -23,17 +23,18 @@ from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
-from tests.conftest import wait_until
+from tests.conftest import Evedrop, wait_until
 from tests.live.network.bench import is_matched
 from tests.live.test_recovery import ACKNOWLEDGED, INNOVATION, LOOP
 from tests.proxy import cable
 from tests.resets import reset_connections
+from tests.steps import stepping
 
 SEEDS = 50
 GAPS = (0.0, 0.01, 0.03, 0.1)
 SCENARIO = """
 title = "Flapping"
-slots = 1500
+slots = 1100
 seed = 20
 trials = 3
 pace = 0.002
@@ -78,34 +79,32 @@ def scenario_of(folder: Path, kind: dict[str, str]) -> Scenario:
     return load(path)
 
 
-def flaps(seed: int, bursts: int = 2) -> list[float]:
+def flaps(seed: int, bursts: int = 2) -> list[list[float]]:
     """Seconds to wait before each cut: some bursts of 5 to 20."""
     rng = random.Random(seed)  # noqa: S311 - no secret
-    waits: list[float] = []
-    for _ in range(bursts):
-        count = rng.randint(5, 20)
-        waits += [rng.uniform(0.2, 0.6), *(rng.choice(GAPS) for _ in range(count - 1))]
-    return waits
+    return [[rng.uniform(0.2, 0.6), *(rng.choice(GAPS) for _ in range(rng.randint(5, 20) - 1))] for _ in range(bursts)]
 
 
-def disturbed(seed: int, folder: Path, how: str) -> None:
+def disturbed(seed: int, evedrop: Evedrop, how: str) -> None:
     """A run in which all connections with the router are cut in bursts, and back at once, is as if nothing had been."""
+    folder = evedrop.folder
     scenario = scenario_of(folder, KINDS[seed % len(KINDS)])
     port = free_port()
     with ExitStack() as stack:
         wire = stack.enter_context(cable(port))
-        run = stack.enter_context(by_hand(scenario, folder, f"tcp/127.0.0.1:{port}"))
+        run = stack.enter_context(by_hand(scenario, folder, f"tcp/127.0.0.1:{port}", paused=True))
         everybody = ("sensor", *scenario.receivers, "observer")
         run.write(**(dict.fromkeys(everybody, wire.endpoint) if how == "proxy" else {}))
         run.start()
-        run.running(more_than=100)
-        for wait in flaps(seed):
-            time.sleep(wait)  # when it is cut is what is tested
-            if how == "proxy":
-                wire.flap()
-            else:
-                reset_connections(run.processes["router"].pid, port)
-        assert run.done() < scenario.slots, "the run must not end before it is disturbed"
+        for waits in flaps(seed):
+            with stepping(evedrop, run.results, 500):
+                for wait in waits:
+                    time.sleep(wait)  # when it is cut is what is tested
+                    if how == "proxy":
+                        wire.flap()
+                    else:
+                        reset_connections(run.processes["router"].pid, port)
+        assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, folder / "memory")
         assert run.summary["outages"]
@@ -123,25 +122,26 @@ def may_reset() -> bool:
     return True
 
 
-def test_connections_that_flap_change_nothing(tmp_path: Path) -> None:
+def test_connections_that_flap_change_nothing(evedrop: Evedrop) -> None:
     """Cut by a proxy between the router and everybody else: digests and links are those in memory."""
-    disturbed(0, tmp_path, "proxy")
+    disturbed(0, evedrop, "proxy")
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(SEEDS))
-def test_connections_that_are_reset_change_nothing(seed: int, tmp_path: Path) -> None:
+def test_connections_that_are_reset_change_nothing(seed: int, evedrop: Evedrop) -> None:
     """Reset at the router's own end, which makes Zenoh mistake keys most often; by the proxy where that is not permitted."""
-    disturbed(seed, tmp_path, "reset" if may_reset() else "proxy")
+    disturbed(seed, evedrop, "reset" if may_reset() else "proxy")
 
 
-def test_a_message_of_another_key_is_dropped_counted_and_sent_again(tmp_path: Path) -> None:
+def test_a_message_of_another_key_is_dropped_counted_and_sent_again(evedrop: Evedrop, tmp_path: Path) -> None:
     """A delivery that arrives on another receiver's key changes no figure: the summary says who dropped how many."""
     scenario = scenario_of(tmp_path, PLAIN)
-    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}", paused=True) as run:
         run.write()
         run.start()
-        run.running(more_than=100)
+        with stepping(evedrop, run.results, 100):
+            run.running()
         # The observer may write there: its credentials stand in for a connection that takes one key for the other.
         observer = read_brief(tmp_path / "briefs" / "observer.json")
         keys = RunKeys(observer.run)
@@ -151,6 +151,7 @@ def test_a_message_of_another_key_is_dropped_counted_and_sent_again(tmp_path: Pa
                 wait_until(partial(is_matched, publisher), f"{name} to read")
                 publisher.put(enclosed(keys.downlink("legitimate"), End().pack()))
             publisher.put(enclosed(RunKeys("another").control("sensor"), End().pack()))
+        assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert run.summary["misdelivered"]["other"] == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from contextlib import ExitStack
 from functools import partial
@@ -11,12 +10,14 @@ from typing import Any
 
 import pytest
 
+from evedrop.live.launch.starter import StartedProcess
 from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, Live, wait_until
 from tests.proxy import Cable, cable
+from tests.steps import stepping
 
 SCENARIO = """
 title = "Disturbed"
@@ -76,7 +77,7 @@ state = "last"
 def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
     """A scenario with losses in bursts, delays and second copies, and its file."""
     entries = {
-        "slots": 1200, "trials": 3, "pace": 0.0, "longest_outage": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
+        "slots": 700, "trials": 3, "pace": 0.002, "longest_outage": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
         "more_of_legitimate": "", **given,
     }  # fmt: skip
     path = folder / "disturbed.toml"
@@ -87,7 +88,7 @@ def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
 long = pytest.mark.long
 
 RUNS: dict[str, dict[str, Any]] = {
-    "as fast as it goes": {"slots": 8000, "trials": 10},
+    "as fast as it goes": {"slots": 1500, "trials": 10, "pace": 0.0},
     "silent and acknowledged": {
         "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive",
         "more": ACKNOWLEDGED,
@@ -97,10 +98,10 @@ RUNS: dict[str, dict[str, Any]] = {
         "more": ACKNOWLEDGED,
     },
     "in a loop that is told its inputs": {
-        "slots": 3000, "pace": 0.002, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true",
+        "slots": 900, "more": LOOP.format(""), "more_of_legitimate": "knows_input = true",
     },
-    "in a loop over the truth": {"slots": 3000, "pace": 0.002, "more": LOOP.format('period = 7\nacts_on = "truth"')},
-    "paced, with events": {"slots": 2000, "pace": 0.002, "more": CHANGING},
+    "in a loop over the truth": {"slots": 3000, "more": LOOP.format('period = 7\nacts_on = "truth"')},
+    "paced, with events": {"slots": 2000, "more": CHANGING},
 }  # fmt: skip
 RARER = ("silent and acknowledged", "coded and acknowledged", "in a loop over the truth", "paced, with events")
 
@@ -110,7 +111,7 @@ def has_told(live: Live, event: str, times: int) -> bool:
     return live.told(event) == times
 
 
-def has_ended(process: subprocess.Popen[bytes], status: int) -> bool:
+def has_ended(process: StartedProcess, status: int) -> bool:
     """Whether a process has ended with this status."""
     return process.poll() == status
 
@@ -119,12 +120,15 @@ def has_ended(process: subprocess.Popen[bytes], status: int) -> bool:
 def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
     path, scenario = scenario_in(tmp_path, **RUNS[what])
-    live = evedrop.live(str(path), "--json")
+    live = evedrop.live(str(path), "--json", "--paused")
     for times in (1, 2):
-        live.running(more_than=max(live.done(), 100))
-        live.kill("router")
-        # Losses that overlap are one outage: this one must be over before the next.
-        wait_until(partial(has_told, live, "reconnected", times), "a run that goes on")
+        with stepping(evedrop, live.folder, 100):
+            live.running(more_than=0)
+        with stepping(evedrop, live.folder, 300):
+            live.kill("router")
+            # Losses that overlap are one outage: this one must be over before the next.
+            wait_until(partial(has_told, live, "reconnected", times), "a run that goes on")
+    assert evedrop("resume", str(live.folder)).status == 0
     done = live.end(120)
     assert done.status == 0, done.err
     live.nothing_left()
@@ -138,12 +142,14 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
 def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """With a closed loop over both of them: digests and links are those in memory, and the one that was killed is named."""
     more = LOOP.format("period = 2") + "[network]\nrouters = 2"
-    path, scenario = scenario_in(tmp_path, slots=3000, pace=0.002, more=more, more_of_legitimate="knows_input = true")
-    live = evedrop.live(str(path), "--json")
-    live.running(more_than=300)
-    before = live.child(name)
-    live.kill(name)
-    wait_until(lambda: live.children().get(name) not in {None, before}, f"another {name}")
+    path, scenario = scenario_in(tmp_path, more=more, more_of_legitimate="knows_input = true")
+    live = evedrop.live(str(path), "--json", "--paused")
+    with stepping(evedrop, live.folder, 600):
+        live.running(more_than=100)
+        before = live.child(name)
+        live.kill(name)
+        wait_until(lambda: live.children().get(name) not in {None, before}, f"another {name}")
+    assert evedrop("resume", str(live.folder)).status == 0
     done = live.end(120)
     assert done.status == 0, done.err
     live.nothing_left()
@@ -151,17 +157,19 @@ def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop,
     assert [one["process"] for one in done.summary["outages"]] == [name]
 
 
-def test_a_relay_gives_up_an_attempt_that_is_not_answered(tmp_path: Path) -> None:
+def test_a_relay_gives_up_an_attempt_that_is_not_answered(evedrop: Evedrop, tmp_path: Path) -> None:
     """Whose connection was lost while it was being opened. Zenoh's own limit, ten seconds, is longer than this outage may be."""
-    scenario = scenario_in(tmp_path, slots=3000, pace=0.002, longest_outage=8.0, more="[network]\nrouters = 2")[1]
+    scenario = scenario_in(tmp_path, longest_outage=8.0, more="[network]\nrouters = 2")[1]
     ports = [free_port() for _ in range(2)]
     near, far = (f"tcp/127.0.0.1:{port}" for port in ports)
-    with cable(ports[0]) as between, by_hand(scenario, tmp_path, near, relay=far) as run:
+    with cable(ports[0]) as between, by_hand(scenario, tmp_path, near, relay=far, paused=True) as run:
         run.write(relay=between.endpoint)
         run.start()
-        run.running(more_than=300)
-        between.swallow()
-        wait_until(lambda: between.swallowed, "an attempt that is not answered")
+        with stepping(evedrop, run.results, 600):
+            run.running(more_than=100)
+            between.swallow()
+            wait_until(lambda: between.swallowed, "an attempt that is not answered")
+        assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}, run.log("observer").read_text()
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert [one["process"] for one in run.summary["outages"]] == ["router"]
@@ -169,19 +177,19 @@ def test_a_relay_gives_up_an_attempt_that_is_not_answered(tmp_path: Path) -> Non
 
 def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path: Path) -> None:
     """A router that is started while the run is paused knows the changes that were made; the folder gives the same again."""
-    path, _ = scenario_in(tmp_path, slots=3000, pace=0.002, more=CHANGING)
-    live = evedrop.live(str(path), "--json")
-    live.running(more_than=100)
+    path, _ = scenario_in(tmp_path, slots=1000, more=CHANGING)
+    live = evedrop.live(str(path), "--json", "--paused")
     folder = str(live.folder)
+    live.held()
     assert evedrop("link", folder, "legitimate", "quality=0.4").status == 0
-    assert evedrop("pause", folder).status == 0
+    assert evedrop("step", folder, "100").status == 0
     assert evedrop("link", folder, "smart", "cut").status == 0
     before = live.child("router")
     live.kill("router")
     wait_until(lambda: live.children().get("router") not in {None, before}, "another router")
-    wait_until(lambda: evedrop("resume", folder).status == 0, "a router that lets an operator in")
-    live.running(more_than=max(live.done(), 1000))
+    wait_until(lambda: evedrop("step", folder, "100").status == 0, "a router that lets an operator in")
     assert evedrop("link", folder, "smart", "heal").status == 0
+    assert evedrop("resume", folder).status == 0
     done = live.end(60)
     assert done.status == 0, done.err
     assert [one["process"] for one in done.summary["outages"]] == ["router"]
@@ -223,16 +231,18 @@ def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
         assert (outage["process"], outage["until"]) == ("router", None)
 
 
-def test_a_router_that_is_started_again_by_hand(tmp_path: Path) -> None:
+def test_a_router_that_is_started_again_by_hand(evedrop: Evedrop, tmp_path: Path) -> None:
     """The same command again, some seconds later: the run goes on, and all end with status 0."""
-    _, scenario = scenario_in(tmp_path, slots=2000, pace=0.001)
-    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
+    _, scenario = scenario_in(tmp_path)
+    with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}", paused=True) as run:
         run.write()
         run.start()
-        run.running()
-        run.kill("router")
-        time.sleep(3.0)  # how long it is away is what is tested
-        run.start("router")
+        with stepping(evedrop, run.results, 600):
+            run.running()
+            run.kill("router")
+            time.sleep(3.0)  # how long it is away is what is tested
+            run.start("router")
+        assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         (outage,) = run.summary["outages"]
@@ -251,46 +261,48 @@ def test_a_router_that_is_started_again_by_hand(tmp_path: Path) -> None:
         pytest.param("observer", "silent", marks=long),
     ],
 )
-def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, tmp_path: Path) -> None:
+def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Closed for two seconds, or without a word for longer than its lease: who was cut off is listed, and all is as ever."""
     given = {"encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED}
-    _, scenario = scenario_in(tmp_path, slots=800, pace=0.002, **given)
+    _, scenario = scenario_in(tmp_path, **given)
     port = free_port()
     with ExitStack() as stack:
         wire: Cable = stack.enter_context(cable(port))
-        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
+        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}", paused=True))
         run.write(**{name: wire.endpoint})
         run.start()
-        run.running(more_than=100)
-        assert wire.connections
-        if how == "closed":
-            wire.cut()
-            time.sleep(2.0)  # how long it is cut off is what is tested
-        else:
-            wire.silence()
-            time.sleep(7.0)  # the same
-        wire.heal()
+        with stepping(evedrop, run.results, 600):
+            run.running(more_than=100)
+            assert wire.connections
+            if how == "closed":
+                wire.cut()
+                time.sleep(2.0)  # how long it is cut off is what is tested
+            else:
+                wire.silence()
+                time.sleep(7.0)  # the same
+            wire.heal()
+        assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert [one["process"] for one in run.summary["outages"]] == [name]
 
 
 @pytest.mark.parametrize("name", [pytest.param("controller", marks=long), "legitimate"])
-def test_a_loop_is_taken_up_where_it_was_cut(name: str, tmp_path: Path) -> None:
+def test_a_loop_is_taken_up_where_it_was_cut(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Estimates and inputs that were lost on the way are sent again: no process waits for ever, and no input changes."""
-    _, scenario = scenario_in(
-        tmp_path, slots=800, pace=0.002, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true"
-    )
+    _, scenario = scenario_in(tmp_path, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true")
     port = free_port()
     with ExitStack() as stack:
         wire: Cable = stack.enter_context(cable(port))
-        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}"))
+        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}", paused=True))
         run.write(**{name: wire.endpoint})
         run.start()
-        run.running(more_than=100)
-        wire.cut()
-        time.sleep(1.0)  # how long it is cut off is what is tested
-        wire.heal()
+        with stepping(evedrop, run.results, 600):
+            run.running(more_than=100)
+            wire.cut()
+            time.sleep(1.0)  # how long it is cut off is what is tested
+            wire.heal()
+        assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert [one["process"] for one in run.summary["outages"]] == [name]

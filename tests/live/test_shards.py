@@ -279,7 +279,7 @@ def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -
 def test_an_interrupt_before_anything_has_begun_leaves_a_whole_folder_too(evedrop: Evedrop) -> None:
     """With processes that are just being started: empty tables, and a summary that says so."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
-    wait_until(live.left, "a first process")
+    wait_until(live.children, "a first process")
     live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130
     live.nothing_left()
@@ -346,7 +346,7 @@ def test_a_secret_that_is_gone_leaves_no_folder(tmp_path: Path) -> None:
     secret.unlink()
     from evedrop.live.launch.launcher import launch
 
-    with pytest.raises(UsageError, match="--secret"):
+    with pytest.raises(UsageError, match=r"secret_file: .*secret\.bin cannot be read"):
         launch(scenario, tmp_path / "run", "off", None, silent)
     assert not (tmp_path / "run").exists()
 

@@ -62,7 +62,7 @@ class Told:
 class Run:
     """A steered run in a test's hands."""
 
-    def __init__(self, *events: dict[str, Any]) -> None:
+    def __init__(self, *events: dict[str, Any], paused: bool = False) -> None:
         self.conductor = Told()
         self.kept: list[Scenario] = []
         self.news: list[News] = []
@@ -72,6 +72,7 @@ class Run:
             self.conductor,  # type: ignore[arg-type]
             self.news.append,
             self.kept.append,
+            paused=paused,
         )
 
     def asks(self, do: str, reported: int = 0, **fields: Any) -> Asked:
@@ -211,6 +212,22 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
     assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
     assert Held(12) in run.news
+
+
+def test_a_run_may_begin_paused() -> None:
+    """Before slot 0, with the scenario's events of that slot done, until it is resumed or goes on by steps."""
+    run = Run({"at": 0, "cut": "smart"}, paused=True)
+    assert run.holds(0) == []
+    assert (run.steering.paused, run.events) == (True, [(0, "pause the run", "operator"), (0, "cut smart", "scenario")])
+    assert Held(0) in run.news
+    stepped = run.asks("step", slots=3)
+    run.steering.carry_on(0)
+    assert run.conductor.told() == go(0, until=3)
+    assert run.holds(3) == []
+    assert stepped.answers == [Answer(3, "slots 0 to 2 passed; held before slot 3")]
+    run.asks("resume")
+    run.steering.carry_on(3)
+    assert run.conductor.told() == go(3)
 
 
 def test_resuming_a_run_that_goes_on_holds_nothing() -> None:

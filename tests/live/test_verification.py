@@ -15,11 +15,12 @@ from evedrop.errors import Contradiction, MalformedMessage
 from evedrop.live.observer.verification import Verifier
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, read_journal, read_report
-from evedrop.model.digest import BeliefLog, Blocks
+from evedrop.model.digest import BlockDigests, Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.score.slots import ReceiverSlots, Slots
+from tests.builders import mirrored, one_slot
 
 TRIALS, N, SLOTS, RECORDED = 4, 2, 600, 2
 CUTS = (300, 310)
@@ -30,16 +31,16 @@ def beliefs(slots: int = SLOTS, trials: int = TRIALS) -> list[Belief]:
     rng = np.random.default_rng(5)
     P = rng.standard_normal((slots, N, N, trials)) * np.exp(4.0 * rng.standard_normal((slots, 1, 1, trials)))
     x_hat, action = rng.standard_normal((slots, N, trials)), rng.integers(0, 4, (slots, trials), np.uint8)
-    return [Belief(x_hat[k], P[k], action[k]) for k in range(slots)]
+    return [Belief(x_hat[k], mirrored(P[k]), action[k]) for k in range(slots)]
 
 
 def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[Report]:
     """The reports of a receiver that ends them at the ends of batches and of blocks."""
-    log, made, first = BeliefLog(N, trials, SLOTS, CUTS), [], 0
+    log, made, first = BlockDigests(trials, SLOTS, CUTS), [], 0
     found = beliefs(trials=trials)
     for k, belief in enumerate(found):
-        digests = log.add(k, belief)
-        if (k + 1) % batch and k + 1 < SLOTS and digests is None:
+        digests = log.add(range(k, k + 1), one_slot(belief))
+        if (k + 1) % batch and k + 1 < SLOTS and not digests:
             continue
         rows = found[first : k + 1]
         traces = np.array([np.trace(one.P) for one in rows])
@@ -51,7 +52,7 @@ def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[
                 np.ascontiguousarray(np.array([one.P for one in rows])[..., :recorded]),
                 np.stack([traces.sum(axis=1), (traces**2).sum(axis=1)], axis=1),
                 None,
-                {} if digests is None else dict([digests]),
+                digests,
             )
         )
         first = k + 1
@@ -95,7 +96,7 @@ LIES = {
     "P by one bit": (changed(1, P=at((3, 0, 1, 0), lambda x: np.nextafter(x, 9.0))), "slots 0 to 255 of trial 10"),
     "gamma": (changed(0, action=at((0, 0), lambda code: 0 if code else 2)), "slots 0 to 255 of trial 10"),
     "digest": (
-        changed(2, digests=lambda blocks: {k: at((1, 31), lambda byte: byte ^ 1)(one) for k, one in blocks.items()}),
+        changed(2, digests=lambda blocks: {k: at((1, 15), lambda byte: byte ^ 1)(one) for k, one in blocks.items()}),
         "slots 0 to 255 of trial 11",
     ),
     "less squares than are known": (changed(0, trace=lambda trace: trace * [1.0, 1e-9]), "its sums of tr P"),

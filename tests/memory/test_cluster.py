@@ -19,7 +19,11 @@ from evedrop.ports import free_port
 from evedrop.results.writer import load_results
 from tests.conftest import Evedrop, wait_until
 
-pytest.importorskip("distributed")
+
+@pytest.fixture(scope="module", autouse=True)
+def dask() -> None:
+    """Skip these tests without the extra `cluster`; imported only by the process that runs them, since it takes long."""
+    pytest.importorskip("distributed")
 
 
 def answers(port: int) -> bool:
@@ -39,7 +43,16 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     address = f"tcp://127.0.0.1:{port}"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "DASK_TEMPORARY_DIRECTORY": str(folder)}
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--no-dashboard"]
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--host", "127.0.0.1", "--no-dashboard"]
+    worker = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        address,
+        "--host",
+        "127.0.0.1",
+        "--no-dashboard",
+        "--no-nanny",
+    ]
     processes = []
     log = (folder / "log").open("wb")
     try:

@@ -54,7 +54,7 @@ def test_the_report_says_so(evedrop: Evedrop) -> None:
     said = [line for line in done.out.splitlines() if "has infinite variance" in line]
     assert [line.partition(":")[0] for line in said] == ["legitimate", "smart", "equal", "better", "much-better"]
     assert all("in the median" in line and "in nine of ten" in line for line in said)
-    assert "(judged by medians, for the variance is infinite)" in done.out
+    assert "(judged by medians, because the variance is infinite)" in done.out
     done = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "40", "--out", "other")
     assert "infinite" not in done.out
 

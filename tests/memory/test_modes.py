@@ -81,7 +81,7 @@ Arrays = dict[str, dict[str, np.ndarray[Any, Any]]]
 def played(of: Scenario, mode: Mode, trials: int, first: int = 0) -> Arrays:
     """Receiver → error, trace and action of every slot and trial."""
     parts: dict[str, dict[str, list[Any]]] = {name: {"error": [], "trace": [], "action": []} for name in of.receivers}
-    for chunk in Simulation(of, range(first, first + trials), 0, mode).chunks():
+    for chunk in Simulation(of, range(first, first + trials), mode).chunks():
         for name, measured in chunk.receivers.items():
             for what, arrays in parts[name].items():
                 arrays.append(getattr(measured, what).copy())
@@ -129,9 +129,9 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
             super().__init__(key, trials, per_trial)
             self.key = key
 
-        def words(self, slots: range) -> streams.Words:
+        def whole_blocks(self, slots: range) -> streams.Words:
             drawn.add(self.key)
-            return super().words(slots)
+            return super().whole_blocks(slots)
 
     monkeypatch.setattr(streams, "Stream", Watched)
     for receivers, misled in (({"smart": SMART}, False), (ALL, True)):
@@ -141,7 +141,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
         keys = StreamKeys.of(of)
         secret = keys.secret(("schedule", "noise"))
         assert secret["schedule"] in drawn
-        assert all(keys.link(name, of.course(name))[f"link/{name}"] in drawn for name in of.receivers)
+        assert all(keys.link(name, of.schedule(name))[f"link/{name}"] in drawn for name in of.receivers)
         assert (keys.process in drawn) == (mode is Mode.ERROR_COORDINATES)
         assert (secret["noise"] in drawn) == (mode is Mode.ERROR_COORDINATES and misled)
 

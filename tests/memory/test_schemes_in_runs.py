@@ -178,8 +178,9 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
     assert chart_of(scenario) == Chart(acknowledged=0, missing=1, threshold=1)
     detection = Detection(5)
     for chunk in Simulation(scenario, range(5)).chunks():
-        assert chunk.alarms is not None
-        detection.add(chunk.first, chunk.alarms)
+        assert chunk.slots is not None
+        assert chunk.slots.alarms is not None
+        detection.add(chunk.first, chunk.slots.alarms)
     assert np.array_equal(detection.first, np.full(5, 10))
     assert detection.summary(scenario) == DetectionSummary(
         attack_from=10, alarms=5, false_alarms=0, mean_delay=1.0, first_alarm=10

@@ -21,7 +21,8 @@ from evedrop.memory.workers import in_processes
 from evedrop.results.writer import load_results
 from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 
-ENDLESS = ("--slots", "400000", "--trials", "1000")
+SLOTS = 100_000
+ENDLESS = ("--slots", str(SLOTS), "--trials", "1000")
 SCENARIO = load("eavesdroppers", {"slots": 10})
 
 
@@ -60,7 +61,7 @@ def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number:
     no_process_left(live)
     summary = live.results.summary
     assert summary["ended"] == "interrupted"
-    assert 0 < summary["slots"] < 400_000
+    assert 0 < summary["slots"] < SLOTS
     assert {peer["digest"] for peer in summary["peers"].values()} == {None}
     slots = live.results.slots.to_pydict()
     assert max(slots["slot"]) + 1 >= summary["slots"]
@@ -172,7 +173,7 @@ def test_a_full_disk_is_said(evedrop: Evedrop) -> None:
 
 def test_an_interrupted_sweep_keeps_finished_points(evedrop: Evedrop) -> None:
     """The points that were done are in the table, the plot is drawn, exit 130."""
-    points = ("--over", "slots=20,400000")
+    points = ("--over", f"slots=20,{SLOTS}")
     live = evedrop.started("sweep", "eavesdroppers", *points, "--trials", "1000", "--workers", "2")
     live.running(more_than=20 * 1000)  # that is, when the second point is under way
     live.process.send_signal(signal.SIGINT)

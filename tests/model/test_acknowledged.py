@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -218,6 +219,37 @@ def test_a_stable_reference_that_is_too_old_is_let_go() -> None:
         assert not last.P[:, :, heard].any()
 
 
+@pytest.mark.parametrize("a", [0.3, 0.9, 0.9999, 1.0 - 1e-5])
+def test_the_age_at_which_a_reference_drowns_the_state_is_exact(a: float) -> None:
+    """Of one state, L is 1/a: the last m with 2⁻⁵³ a^−m √Σ ≤ 0.01 √Q; of a slow one, found without going slot by slot."""
+    code = ReferenceCode(Process(np.array([[a]]), np.array([[1e-3]]), np.eye(1)))
+    sigma = 1e-3 / (1.0 - a * a)
+    assert float(stationary_covariance(Process(np.array([[a]]), np.array([[1e-3]]), np.eye(1)))[0, 0]) == pytest.approx(
+        sigma
+    )
+    expected = math.floor(math.log(0.01 * 2.0**53 * math.sqrt(1e-3 / sigma)) / -math.log(a))
+    assert abs(code.longest - expected) <= 1 + 1e-6 * expected
+
+
+def test_the_age_of_a_reference_is_the_last_slot_within_the_limit() -> None:
+    """Of several states, against powers of L one after the other; a process that is not stable has no such age."""
+    for process in (STABLE, Process(np.array([[0.95, 0.2], [0.0, 0.6]]), np.diag([1.0, 1e-3]), np.eye(2))):
+        code, sigma = ReferenceCode(process), stationary_covariance(process)
+        limit = (0.01 * 2.0**53) ** 2 * process.Q.diagonal().min()
+        traces = [
+            np.trace(np.linalg.matrix_power(code.L, m) @ sigma @ np.linalg.matrix_power(code.L, m).T)
+            for m in range(400)
+        ]
+        assert code.longest == sum(trace <= limit for trace in traces) - 1
+    assert ReferenceCode(UNSTABLE).longest > 10**15
+
+
+def test_the_action_of_a_reader_of_references_is_not_known_from_its_link() -> None:
+    """It depends on the header."""
+    with pytest.raises(NotImplementedError, match="depends on the packet's header"):
+        ReferenceReceiver(UNSTABLE, 3).act(0, np.ones(3, bool))
+
+
 def test_a_header_that_names_what_nobody_has_is_discarded() -> None:
     """Slots to come, forgotten ones and nonsense are not decoded, and change nothing but the packet's fate."""
     receiver = ReferenceReceiver(UNSTABLE, 3)
@@ -241,3 +273,20 @@ def test_acknowledgements_must_be_of_the_slot_just_sent() -> None:
     encoder.encode(1, x, x)
     with pytest.raises(ValueError, match="acknowledgements of slot 0 after slot 1 was sent"):
         encoder.acknowledged(0, np.ones(1, bool))
+
+
+def test_a_betrayed_state_is_a_reference_like_any_other() -> None:
+    """An eavesdropper that learns x_3 reads every packet with a reference to slot 3, exactly."""
+    batch, learns_at = Batch(8, 2), 3
+    parameters = {"reads_as": "reference", "learns_at": learns_at}
+    spy = STRATEGIES["replay-informed"](Knowledge(UNSTABLE, 1.0, parameters, {}), batch)
+    x = np.random.default_rng(2).normal(size=(8, 2, 2))
+    belief, nothing = spy.prior(), np.zeros(2, bool)
+    for k in range(learns_at + 2):
+        belief = spy.step(k, belief, Reception(nothing, x[k], truth=x[k] if k == learns_at else None))
+        assert (k == learns_at) == np.array_equal(belief.x_hat, x[k])
+    k = learns_at + 2
+    z = x[k] - np.linalg.matrix_power(UNSTABLE.A, k - learns_at) @ x[learns_at]
+    belief = spy.step(k, belief, Reception(~nothing, z, np.full((1, 2), learns_at)))
+    assert np.allclose(belief.x_hat, x[k], rtol=1e-12)
+    assert not belief.P.any()

@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 from evedrop.model.acknowledgements import ATTACKS, AckChannel, rates_of
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.numeric.detection import Chart, chart_for
+from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.streams import Batch, stream_key
@@ -99,6 +99,7 @@ def simulated(chart: Chart, rate: float, trials: int, packets: int) -> np.ndarra
 
 
 @pytest.mark.parametrize(("normal", "attacked"), [(0.9, 0.81), (0.9, 0.0), (0.6, 0.36), (0.7, 1.0), (0.5, 0.8)])
+@pytest.mark.thorough
 def test_run_lengths_are_exact(normal: float, attacked: float) -> None:
     """Before and after a change, the mean simulated run length is the chain's, at 5 standard errors."""
     chart = chart_for(normal, attacked, 200.0)
@@ -194,3 +195,22 @@ def test_a_promise_that_no_chart_keeps_is_refused() -> None:
     """Rates too close for so few states."""
     with pytest.raises(ValueError, match="no chart of 1024 states"):
         chart_for(0.5, 0.4999, 1e9)
+
+
+def test_a_chart_over_a_batch_alarms_once_in_each_trial() -> None:
+    """In the slot in which its sum reaches the threshold, counted by hand; slots without a packet do not count."""
+    watch = CusumBatch(Chart(-1, 2, 4), 3)
+    acknowledged = np.array([[0, 1, 0], [0, 0, 1], [0, 0, 0], [1, 0, 0]], bool)
+    sent = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 1]], bool)
+    # S: 2 4 | 0 2 4 | 2 1 1 3, with an alarm at 4.
+    alarms = [watch.take(*pair).tolist() for pair in zip(acknowledged, sent, strict=True)]
+    assert alarms == [[False, False, False], [True, False, False], [False, True, False], [False, False, False]]
+    always = CusumBatch(Chart(-1, 2, 4), 1)
+    assert [always.take(np.zeros(1, bool)).tolist() for _ in range(3)] == [[False], [True], [False]]
+
+
+def test_a_chart_that_can_never_alarm_takes_for_ever() -> None:
+    """Where no packet is evidence, or evidence never comes."""
+    assert Chart(-1, 1, 3).run_length(1.0) == math.inf
+    assert Chart(0, 1, 3).run_length(1.0) == math.inf
+    assert Chart(-1, 1, 3).run_length(0.0) == 3.0

@@ -50,6 +50,7 @@ def test_the_constant_one_knows_what_is_public() -> None:
     [(MICROGRID, 0.5, 0.6, 300), (EXAMPLE, 0.7, 0.9, 61)],
     ids=["microgrid", "numerical"],
 )
+@pytest.mark.thorough
 def test_a_hard_test_locks_on_to_false_tracks(process: Process, mu_d: float, mu_e: float, count: int) -> None:
     """Ten of 300 trials and more end with an error 100 times smart's median, and it believes in a tenth of it or less.
 

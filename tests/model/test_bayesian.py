@@ -104,6 +104,7 @@ def test_it_is_the_posterior_over_all_type_words(
             assert belief.action[0] == (Action.STATE if state > 0.5 else Action.INNOVATION)
 
 
+@pytest.mark.thorough
 def test_it_believes_the_truth() -> None:
     """Its believed trace is the mean of its squared error given what it heard: at every tenth slot, at 4.5 standard errors."""
     batch = Batch(101, 4000)
@@ -151,6 +152,7 @@ def test_it_becomes_the_genie_in_the_numerical_example(mu_d: float, genie: float
     ],
     ids=["numerical", "marginal", "microgrid", "dark"],
 )
+@pytest.mark.thorough
 def test_twice_the_components_change_nothing(
     process: Process, mu_d: float, mu_e: float, count: int, tolerance: float
 ) -> None:
@@ -197,12 +199,13 @@ def test_certain_types(mu_d: float) -> None:
         assert np.allclose(beliefs["bayesian"].P, beliefs[twin].P, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_it_may_come_late_and_stays_itself() -> None:
-    """The last 1400 slots of a day of the microgrid, by one who heard nothing before: it finds the state.
+    """Slots 28 600 to 30 000 of the microgrid, by one who heard nothing before: it finds the state.
 
     Weights and P are in order, and the error is what it must be, 4.67e-5 within a fifth.
     """
-    process, late, batch = MICROGRID, 85_000, Batch(86_400, 20)
+    process, late, batch = MICROGRID, 28_600, Batch(30_000, 20)
     one = Bayesian(Knowledge(process, 0.5, {}, {}), batch)
     belief, errors = one.prior(late), []
     for slot in slots(process, 0.5, 0.6, batch):

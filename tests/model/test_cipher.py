@@ -105,3 +105,15 @@ def test_taking_a_masked_packet_for_the_state_is_finite_nonsense() -> None:
         expected = np.trace(sigma[k]) + (H * H).sum() / 3.0
         assert abs(found[k].mean() - expected) < 5.0 * found[k].std() / np.sqrt(trials)
         assert expected > 80.0 * np.trace(sigma[k])
+
+
+def test_an_earlier_slot_may_be_asked_for_again() -> None:
+    """Its range starts again from Σ0: states, masked states and grid are those of a mask that has not moved before."""
+    batch = Batch(40, 2)
+    mask = Mask(UNSTABLE, KEY, batch)
+    x = np.array([[0.5, -0.25], [1.0, 0.125]])
+    for k in (0, 39, 3, 20):
+        fresh = Mask(UNSTABLE, KEY, batch)
+        assert np.array_equal(mask.steps(k), fresh.steps(k))
+        assert np.array_equal(mask.hide(k, x), fresh.hide(k, x))
+        assert np.allclose(mask.reveal(k, mask.hide(k, x)), x, rtol=0, atol=float(fresh.steps(k).max()))

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,7 @@ def test_numerical_illustration(
     assert against.perfect == (pytest.approx((LOW, 0.565630), abs=1e-6) if mu_e == 0.85 else None)
 
 
+@pytest.mark.thorough
 def test_optima_are_no_worse_than_any_other_choice() -> None:
     """A plain search over a grid finds no larger J_r, nor J_r/J, than the optima."""
     for mu_e in (0.95, 0.99, 1.0):
@@ -203,6 +205,7 @@ def test_marginally_stable_process() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.1, 0.7, 2.0])
+@pytest.mark.thorough
 def test_rounded_eigenvalues_count_as_marginal(angle: float) -> None:
     """A rotation, and a double eigenvalue in a rotated basis, are marginally stable however their eigenvalues round."""
     c, s = math.cos(angle), math.sin(angle)
@@ -241,3 +244,36 @@ def test_dictionary_is_strict_json() -> None:
     assert data["eavesdroppers"]["smart"]["perfect"] == pytest.approx([LOW, 0.565630], abs=1e-6)
     asked = design(UNSTABLE, 0.9, 0.6, [], slots=80, max_trace=0.01).as_dict()
     assert asked["legitimate"]["minimum"] == pytest.approx(0.540427, abs=1e-6)
+
+
+def test_a_genie_is_designed_for_by_its_leak() -> None:
+    """Known from its outcomes at μ_d = 1/2: it has the bound of smart, and uses the leak at every μ_d."""
+    genie = Adversary.with_outcomes("genie", 0.8, Outcomes.genie(1.0, 0.5))
+    assert (genie.use_state, genie.use_innovation, genie.reads_leak) == (1.0, 0.0, True)
+    assert genie.outcomes(0.3) == Outcomes.genie(0.8, 0.3)
+    taker = Adversary.with_outcomes("taker", 0.8, Outcomes.eavesdropper(1.0, 0.5, 0.9, 0.2))
+    assert (taker.use_state, taker.use_innovation) == pytest.approx((0.9, 0.2))
+    assert not taker.reads_leak
+    assert taker.outcomes(0.3) == Outcomes.eavesdropper(0.8, 0.3, taker.use_state, taker.use_innovation)
+
+
+def test_eavesdroppers_without_a_closed_form_are_named() -> None:
+    """They cannot be designed for; what is known of a genie holds for them."""
+    found = design(UNSTABLE, 0.9, 0.6, [], slots=80)
+    assert found.omission is None
+    assert "left_out" not in found.as_dict()
+    other = replace(found, left_out={"eve": "bayesian", "mallory": "likelihood"})
+    assert other.omission == (
+        "left out: eve (bayesian), mallory (likelihood): no closed form of its error is known; what holds against a genie "
+        "holds against all"
+    )
+    assert other.as_dict()["left_out"] == {"eve": "bayesian", "mallory": "likelihood"}
+
+
+def test_a_link_just_above_the_bound_leaves_just_one_interval() -> None:
+    """The first points above it are unbounded to rounding: they are no advantage, and the interval begins right after them."""
+    mu = (1.0 - UNSTABLE.spectral_radius**-2) * (1.0 + 1e-5)
+    ((low, high),) = relative_secrecy(UNSTABLE, mu, smart(0.4))
+    assert high == 1.0
+    assert low == pytest.approx(stability_bound(UNSTABLE, mu), abs=1e-6)
+    assert 0.99 < low < 1.0

@@ -111,6 +111,7 @@ def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, f
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.thorough
 def test_a_trial_alone_is_the_same_trial(name: str) -> None:
     """Beliefs of a trial are the same bits alone, among 6 and among 400."""
     gamma, z = events(300, 400)
@@ -239,3 +240,17 @@ def test_certain_suspicion_is_smart_or_naive() -> None:
         for k, expected in enumerate(beliefs(twin, Batch(50, 20), gamma, z)):
             belief = one.step(k, belief, Reception(gamma[k], z[k]))
             assert all(np.array_equal(left, right) for left, right in zip(parts(belief), parts(expected), strict=True))
+
+
+def test_a_betrayed_state_is_asked_for_by_its_slot() -> None:
+    """By the replay-informed one alone."""
+    assert {name: STRATEGIES[name].betrayed(PARAMETERS[name]) for name in STRATEGIES} == {
+        **dict.fromkeys(STRATEGIES, None),
+        "replay-informed": LEARNS_AT,
+    }
+
+
+def test_closed_forms_of_readers_are_known_or_not() -> None:
+    """A taker has one by definition, the genie by its leak; a delegate has its reader's."""
+    known = {name for name in STRATEGIES if STRATEGIES[name].outcomes(PARAMETERS[name], MU_D) is not None}
+    assert known == {*TAKERS, "genie", "colluding"}

@@ -113,6 +113,7 @@ def test_item_2_base_case_of_the_proof() -> None:
     assert printed != pytest.approx(truth, rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_item_3_interchanged_numbers() -> None:
     """Printed optimum and upper end of 0.95 are those of 0.99 and the reverse; the last digits are off as well."""
     for mu_e, printed_best, printed_high, best, high in (
@@ -140,6 +141,7 @@ def test_item_3_lower_ends() -> None:
             assert np.sign(limit_trace(EXAMPLE, smart.outcomes(mu_d)) - ours) == sign
 
 
+@pytest.mark.thorough
 def test_item_4_microgrid() -> None:
     """Smart is at most 2.35 times worse than the legitimate estimator, nowhere near 10³; naive with ± 50 % is."""
     legitimate, smart, naive = microgrid.theory(microgrid.DAY, [0.1, 0.5, 0.9])
@@ -221,6 +223,7 @@ def test_item_7_kalman_innovations_can_be_singular_and_betray_the_type() -> None
 
 
 @pytest.mark.parametrize(("mu_e", "last"), [(0.95, 86), (0.99, 58)])
+@pytest.mark.thorough
 def test_item_8_every_slot_fails_early(mu_e: float, last: int) -> None:
     """At each μ_d* with Σ0 = I the better eavesdropper is ahead up to slot 86 (0.95) or 58 (0.99)."""
     smart = Adversary("smart", mu_e, 1.0, 0.0)

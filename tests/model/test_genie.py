@@ -213,3 +213,11 @@ def test_it_bounds_every_strategy() -> None:
         for name, error in errors.items():
             excess = error - errors["genie"]
             assert excess.mean() >= -SURE * excess.std(ddof=1) / np.sqrt(2000) - 1e-15, (slot.k, name)
+
+
+def test_nothing_is_left_to_leak_of_a_process_without_stable_directions() -> None:
+    """In the limit Σ grows without bound in every direction, so that an innovation says nothing of the noise."""
+    unstable = Process(np.array([[1.2, 0.3], [0.0, 1.1]]), 0.1 * np.eye(2) + 0.02, np.eye(2))
+    assert np.array_equal(remaining_limit(unstable), unstable.Q)
+    stable = Process(0.5 * np.eye(2), unstable.Q, np.eye(2))
+    assert np.linalg.eigvalsh(stable.Q - remaining_limit(stable))[0] > 0.0

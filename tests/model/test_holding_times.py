@@ -19,10 +19,10 @@ from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.scheduled import Scheduled
 from evedrop.model.theory import closed_forms
 from evedrop.model.theory.covariances import limit
-from evedrop.model.theory.transmission_design import best_policy
 from evedrop.streams import Batch, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, Played, coins, play
+from tests.model.transmission_design import best_policy
 
 MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 READERS = {"scheduled": "naive", "encrypted-schedule": "selective"}

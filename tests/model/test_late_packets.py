@@ -15,11 +15,12 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.links.link import Fate
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Receiver, Reception, prior
+from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.account import COUNTED_BURSTS, Accountant
-from evedrop.model.slot.intermittent_receiver import Absence, Follower
 from evedrop.model.slot.link import Fates, Link, LinkSchedule, streams_of
-from evedrop.model.slot.transit import Arrival, Late, Transit
+from evedrop.model.slot.receiver import Absence, ReceiverCore
+from evedrop.model.slot.transit import Arrival, Arrivals, Late, Transit
 from evedrop.streams import Batch
 from tests.builders import stream_keys
 
@@ -44,6 +45,26 @@ def receivers() -> Mapping[str, Receiver]:
     return made
 
 
+class OneByOne:
+    """A receiver's core that is given one slot at a time."""
+
+    def __init__(self, receiver: Receiver, window: int) -> None:
+        self.core = ReceiverCore(receiver, window)
+        self.late = np.zeros(receiver.trials, np.uint16)
+
+    def take(self, k: int, arrival: Arrival) -> Belief:
+        """The belief after a slot."""
+        heard = arrival.heard
+        header = None if heard.header is None else heard.header[None]
+        found = self.core.take(
+            range(k, k + 1),
+            Arrivals(heard.gamma[None], heard.z[None], header, {0: arrival.late} if arrival.late else {}),
+        )
+        self.late = np.zeros_like(self.late) if found.late is None else found.late[0, 0]
+        assert same(found.beliefs.last, self.core.belief)
+        return self.core.belief
+
+
 def packets() -> list[np.ndarray]:
     """What the sensor sends."""
     encoder, trajectory = Innovation(PROCESS, MU_D).encoder(KEYS, BATCH), Trajectory(PROCESS, KEYS["process"], BATCH)
@@ -52,8 +73,8 @@ def packets() -> list[np.ndarray]:
 
 def fates(window: int) -> Fates:
     """Of a link that loses, delays and duplicates."""
-    course = LinkSchedule(FULL, window)
-    return Link(course, "it", stream_keys(6, streams_of("it", course)), BATCH).fates(range(BATCH.slots))
+    schedule = LinkSchedule(FULL, window)
+    return Link(schedule, "it", stream_keys(6, streams_of("it", schedule)), BATCH).fates(range(BATCH.slots))
 
 
 def same(one: Belief, other: Belief) -> bool:
@@ -65,18 +86,18 @@ def same(one: Belief, other: Belief) -> bool:
 @pytest.mark.parametrize("window", [0, 1, 4])
 def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) -> None:
     """After every slot the belief is that of a receiver that was given at once all that has arrived by then."""
-    one, z, course = receivers()[name], packets(), fates(window)
-    follower, transit = Follower(one, window), Transit()
-    assert course.delays is not None
-    there = course.codes == Fate.DELIVERED
+    one, z, fate = receivers()[name], packets(), fates(window)
+    follower, transit = OneByOne(one, window), Transit()
+    assert fate.delays is not None
+    there = fate.codes == Fate.DELIVERED
     late_seen = 0
     for k in range(BATCH.slots):
-        belief = follower.take(k, transit.arrival(k, course, k, z[k]))
+        belief = follower.take(k, transit.arrival(k, fate, k, z[k]))
         expected = one.prior()
         for j in range(k + 1):
-            expected = one.step(j, expected, Reception(there[j] & (j + course.delays[j] <= k), z[j]))
+            expected = one.step(j, expected, Reception(there[j] & (j + fate.delays[j] <= k), z[j]))
         assert same(belief, expected), k
-        arrivals = [there[j] & (j + course.delays[j] == k) for j in range(k)]
+        arrivals = [there[j] & (j + fate.delays[j] == k) for j in range(k)]
         counts = np.sum(arrivals, axis=0) if arrivals else np.zeros(BATCH.trials)
         assert np.array_equal(follower.late, counts)
         late_seen += int(counts.sum())
@@ -87,7 +108,7 @@ def test_duplicates_change_nothing() -> None:
     """A second copy, of this slot or an earlier one, is no news."""
     one, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
-    plain, twice = Follower(one, 3), Follower(one, 3)
+    plain, twice = OneByOne(one, 3), OneByOne(one, 3)
     for k in range(6):
         heard = Reception(everybody, z[k])
         copies = tuple(Late(j, Reception(everybody, z[j]), copy=True) for j in range(max(0, k - 3), k + 1))
@@ -100,7 +121,7 @@ def test_what_is_older_than_the_window_changes_nothing() -> None:
     one, z = receivers()["legitimate"], packets()
     nobody, everybody = np.zeros(BATCH.trials, bool), np.ones(BATCH.trials, bool)
     for age, news in ((3, True), (4, False)):
-        plain, given_ = Follower(one, 3), Follower(one, 3)
+        plain, given_ = OneByOne(one, 3), OneByOne(one, 3)
         for k in range(8):
             late = (Late(k - age, Reception(everybody, z[k - age])),) if k == 7 else ()
             before = plain.take(k, Arrival(Reception(nobody, z[k])))
@@ -114,11 +135,12 @@ def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
     nothing = Reception(np.zeros(BATCH.trials, bool), np.zeros((2, BATCH.trials)))
     for first in (0, 1, 7):
         absence, belief = Absence(PROCESS, prior(PROCESS, BATCH.trials, first)), one.prior(first)
-        for k in range(first, first + 5):
-            belief = one.step(k, belief, nothing)
-            found = absence.next(k)
-            assert same(found, belief)
-            assert np.array_equal(found.action, np.full(BATCH.trials, Action.LOST))
+        for slots in (range(first, first + 1), range(first + 1, first + 5)):
+            found = absence.take(slots)
+            for row, k in enumerate(slots):
+                belief = one.step(k, belief, nothing)
+                assert same(Belief(found.x_hat[row], found.P[row], found.action[row]), belief)
+                assert np.array_equal(found.action[row], np.full(BATCH.trials, Action.LOST))
 
 
 def test_the_prior_of_a_slot_is_the_state_covariance() -> None:
@@ -151,8 +173,8 @@ def test_bursts_are_runs_of_losses(lost: list[list[bool]], piece: int) -> None:
 @pytest.mark.parametrize("window", [0, 2, 6])
 def test_every_packet_is_accounted_for(window: int) -> None:
     """Delivered in time, delivered late or lost for one reason: they add up, and late ones arrive where they should."""
-    course, transit, accountant = fates(window), Transit(), Accountant(window, BATCH.trials)
-    parts = [accountant.account(range(a, b), course.part(slice(a, b))) for a, b in ((0, 7), (7, 8), (8, 40))]
+    fate, transit, accountant = fates(window), Transit(), Accountant(window, BATCH.trials)
+    parts = [accountant.account(range(a, b), fate.part(slice(a, b))) for a, b in ((0, 7), (7, 8), (8, 40))]
     in_time = sum(int(part.delivered.sum()) for part in parts)
     lost = sum(int(counts.sum()) for part in parts for counts in part.lost.values())
     late = sum(0 if part.late is None else int(part.late.sum()) for part in parts)
@@ -160,6 +182,79 @@ def test_every_packet_is_accounted_for(window: int) -> None:
     z = np.zeros((2, BATCH.trials))
     rows = np.concatenate([part.late for part in parts if part.late is not None]) if window else None
     for k in range(BATCH.slots):
-        arrival = transit.arrival(k, course, k, z)
+        arrival = transit.arrival(k, fate, k, z)
         counts = sum((one.heard.gamma.astype(int) for one in arrival.late if not one.copy), np.zeros(BATCH.trials, int))
         assert np.array_equal(counts, np.zeros(BATCH.trials) if rows is None else rows[k])
+
+
+def test_slots_that_a_receiver_was_away_are_lost_and_end_its_window() -> None:
+    """It predicts through them, and a packet from before them is no news any more."""
+    one, z = receivers()["legitimate"], packets()
+    everybody = np.ones(BATCH.trials, bool)
+    follower, expected = OneByOne(one, 3), one.prior()
+    for k in range(2):
+        follower.take(k, Arrival(Reception(~everybody, z[k])))
+    follower.core.miss(range(2, 5))
+    for k in range(5):
+        expected = one.step(k, expected, Reception(~everybody, z[k]))
+    assert same(follower.core.belief, expected)
+    after = follower.take(5, Arrival(Reception(~everybody, z[5]), (Late(1, Reception(everybody, z[1])),)))
+    assert same(after, one.step(5, expected, Reception(~everybody, z[5])))
+    assert not follower.late.any()
+
+
+@pytest.mark.parametrize("with_header", [True, False])
+def test_a_late_packet_has_its_own_header(with_header: bool) -> None:
+    """In the trials in which it is news, whether or not the slot had one before."""
+    process, slots = Process(np.eye(2), np.eye(2), np.eye(2)), 3
+    keys = stream_keys(2, ("mask",))
+    scheme = EncryptedSchedule(process, 1)
+    batch = Batch(slots, 2)
+    encoder, states = scheme.encoder(keys, batch), np.random.default_rng(1).normal(size=(slots, 2, 2))
+    sent = [encoder.encode(k, states[k], states[k]) for k in range(slots)]
+    both, first = np.ones(2, bool), np.array([True, False])
+    receptions = [Reception(first, one.z, one.header if with_header else None) for one in sent]
+    follower = OneByOne(scheme.estimator(keys, batch), 2)
+    follower.take(0, Arrival(Reception(~both, sent[0].z)))
+    follower.take(1, Arrival(receptions[1] if with_header else Reception(~both, sent[1].z)))
+    late = Late(1, Reception(both, sent[1].z, sent[1].header))
+    found = follower.take(2, Arrival(Reception(~both, sent[2].z, sent[2].header), (late,)))
+    assert np.allclose(found.x_hat, states[1], atol=1e-9)
+    assert follower.late.tolist() == ([0, 1] if with_header else [1, 1])
+
+
+def test_second_copies_without_delays_arrive_in_their_slot() -> None:
+    """And nothing stays under way."""
+    transit, z = Transit(), np.ones((2, 3))
+    delivered = Fates(np.array([[0, 1, 0]], np.uint8), None, np.array([[True, False, False]]))
+    assert not transit.busy
+    arrival = transit.arrival(4, delivered, 0, z)
+    assert not transit.busy
+    ((k, heard, copy),) = arrival.late
+    assert (k, copy, heard.gamma.tolist()) == (4, True, [True, False, False])
+    assert arrival.heard.gamma.tolist() == [True, False, True]
+
+
+def test_packets_are_under_way_until_they_arrive() -> None:
+    """With their own numbers, whatever becomes of the array that held them."""
+    transit, z = Transit(), np.array([[5.0]])
+    transit.arrival(0, Fates(np.zeros((1, 1), np.uint8), np.array([[2]], np.uint32)), 0, z)
+    z[:] = 7.0
+    assert transit.busy
+    nothing = Fates(np.ones((1, 1), np.uint8))
+    assert transit.arrival(1, nothing, 0, z).late == ()
+    ((k, heard, copy),) = transit.arrival(2, nothing, 0, z).late
+    assert (k, copy, heard.z.tolist()) == (0, False, [[5.0]])
+    assert not transit.busy
+
+
+def test_a_link_without_delays_has_all_its_packets_in_time() -> None:
+    """Where packets could be late, none is; those that went through took no slot."""
+    codes = np.array([[Fate.DELIVERED, Fate.LOST], [Fate.DELIVERED, Fate.UNSENT]], np.uint8)
+    found = Accountant(3, 2).account(range(2), Fates(codes))
+    assert found.late is not None
+    assert not found.late.any()
+    assert found.delays.tolist() == [2, 0, 0, 0, 0]
+    assert found.unsent is not None
+    assert found.unsent.tolist() == [0, 1]
+    assert Accountant(0, 2).account(range(1), Fates(codes[:1])).unsent is None

@@ -27,7 +27,7 @@ FULL = {
     "rate": 0.9,
     "queue": 6,
 }
-COURSES = {
+SCHEDULES = {
     "plain": LinkSchedule(PLAIN),
     "bursts": LinkSchedule(BURSTS),
     "everything": LinkSchedule(FULL, window=4),
@@ -41,9 +41,9 @@ COURSES = {
 }
 
 
-def link(course: LinkSchedule, batch: Batch) -> Link:
+def link(schedule: LinkSchedule, batch: Batch) -> Link:
     """A link with the streams of a seed."""
-    return Link(course, "it", {name: stream_key(ROOT, name) for name in streams_of("it", course)}, batch)
+    return Link(schedule, "it", {name: stream_key(ROOT, name) for name in streams_of("it", schedule)}, batch)
 
 
 def drawn(name: str, width: int, batch: Batch) -> np.ndarray:
@@ -65,27 +65,27 @@ def same(one: Fates, other: Fates) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(whole_of(one), whole_of(other), strict=True))
 
 
-@pytest.mark.parametrize("name", COURSES)
+@pytest.mark.parametrize("name", SCHEDULES)
 def test_bits_do_not_depend_on_pieces_or_on_the_batch(name: str) -> None:
     """However slots are asked for, and alone or among others, a trial's packets have the same fates."""
-    course, batch = COURSES[name], Batch(70, 6, 3)
-    whole = link(course, batch).fates(range(70))
-    one = link(course, batch)
+    schedule, batch = SCHEDULES[name], Batch(70, 6, 3)
+    whole = link(schedule, batch).fates(range(70))
+    one = link(schedule, batch)
     parts = [one.fates(range(a, b)) for a, b in ((0, 1), (1, 20), (20, 21), (21, 55), (55, 70))]
     assert np.array_equal(np.concatenate([part.codes for part in parts]), whole.codes)
-    alone = link(course, Batch(70, 1, 5)).fates(range(70))
+    alone = link(schedule, Batch(70, 1, 5)).fates(range(70))
     assert same(alone, whole.part(trials=slice(2, 3)))
 
 
-def reference(course: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+def reference(schedule: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Codes and delays of a link of independent losses, packet by packet from docs/mathematics.md, links."""
     codes, delays = np.zeros((batch.slots, batch.trials), int), np.zeros((batch.slots, batch.trials), int)
     losses, chances = drawn("link/it", 1, batch), drawn("fate/it", 3, batch)
     words = Stream(stream_key(ROOT, "delay/it"), batch.trial_range, 1).words(range(batch.slots))
     numbers = normals(words)[:, :, 0]
-    setting, cut, free = dict(course.settings), False, 0.0
+    setting, cut, free = dict(schedule.settings), False, 0.0
     for k in range(batch.slots):
-        for change in course.changes:
+        for change in schedule.changes:
             if change.at == k:
                 setting = dict(change.settings) if change.settings is not None else setting
                 cut = cut if change.cut is None else change.cut
@@ -100,13 +100,13 @@ def reference(course: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarra
             if "delay" in setting and not chances[k, 1, r] < setting.get("reorder", 0.0):
                 delay += max(0.0, setting["delay"]["mean"] + setting["delay"]["deviation"] * numbers[k, r])
             delays[k, r] = arrives = math.floor(delay)
-            away = [one.reason for one in course.outages if k < one.stop and k + arrives >= one.start]
+            away = [one.reason for one in schedule.outages if k < one.stop and k + arrives >= one.start]
             stops = (
                 (full, Fate.OVERFLOW),
                 (cut, Fate.CUT),
                 (losses[k, 0, r] >= setting["loss"]["quality"], Fate.LOST),
                 (chances[k, 0, r] < setting.get("corrupt", 0.0), Fate.CORRUPTED),
-                (arrives > course.window, Fate.LATE),
+                (arrives > schedule.window, Fate.LATE),
                 (bool(away), away[0] if away else Fate.DOWN),
                 (k + arrives >= batch.slots, Fate.UNDERWAY),
             )
@@ -115,7 +115,7 @@ def reference(course: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarra
 
 
 @pytest.mark.parametrize(
-    "course",
+    "schedule",
     [
         LinkSchedule(PLAIN),
         LinkSchedule(FULL, window=4),
@@ -127,11 +127,11 @@ def reference(course: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarra
         LinkSchedule(PLAIN, 0, (Change(5, {"loss": {"model": "bernoulli", "quality": 0.1}}), Change(6, PLAIN))),
     ],
 )
-def test_fates_are_those_of_the_reference(course: LinkSchedule) -> None:
+def test_fates_are_those_of_the_reference(schedule: LinkSchedule) -> None:
     """What befalls a packet, in the documented order, from the documented streams."""
     batch = Batch(80, 7, 11)
-    fates = link(course, batch).fates(range(80))
-    codes, delays = reference(course, batch)
+    fates = link(schedule, batch).fates(range(80))
+    codes, delays = reference(schedule, batch)
     assert np.array_equal(fates.codes, codes)
     if fates.delays is not None:
         delivered = codes == Fate.DELIVERED
@@ -139,15 +139,17 @@ def test_fates_are_those_of_the_reference(course: LinkSchedule) -> None:
 
 
 @settings(deadline=None, max_examples=30)
-@given(at=st.integers(1, 59), kind=st.sampled_from(["cut", "loss", "all"]), name=st.sampled_from(sorted(COURSES)))
+@given(at=st.integers(1, 59), kind=st.sampled_from(["cut", "loss", "all"]), name=st.sampled_from(sorted(SCHEDULES)))
 def test_a_change_known_late_is_one_known_early(at: int, kind: str, name: str) -> None:
     """Amended in the middle of what was planned, a link goes on as one that knew of the change from the start."""
-    course, batch = COURSES[name], Batch(60, 3)
+    schedule, batch = SCHEDULES[name], Batch(60, 3)
     change = {"cut": Change(at, cut=True), "loss": Change(at, BURSTS), "all": Change(at, FULL)}[kind]
-    earlier = tuple(one for one in course.changes if one.at < at)
-    knowing = LinkSchedule(course.settings, course.window, (*earlier, change), course.outages, course.correlation)
+    earlier = tuple(one for one in schedule.changes if one.at < at)
+    knowing = LinkSchedule(
+        schedule.settings, schedule.window, (*earlier, change), schedule.outages, schedule.correlation
+    )
     expected = link(knowing, batch).fates(range(60))
-    one = link(course, batch)
+    one = link(schedule, batch)
     start = at - at % 7
     before = one.fates(range(start)) if start else None
     planned = one.planned(range(start, 60)).part(slice(0, at - start))
@@ -163,8 +165,8 @@ def test_correlation_ties_losses_and_leaves_each_link_alone() -> None:
     key = {"link/it": stream_key(ROOT, "link/other")}
     other = Link(LinkSchedule(settings_), "it", key, batch).fates(range(400)).in_time
     for strength in (0.0, 0.35, 1.0):
-        course = LinkSchedule(settings_, correlation=("other", strength))
-        found = link(course, batch).fates(range(400)).in_time
+        schedule = LinkSchedule(settings_, correlation=("other", strength))
+        found = link(schedule, batch).fates(range(400)).in_time
         assert abs(found.mean() - q) < 5 * math.sqrt(q * (1 - q) / found.size)
         correlation = np.corrcoef(found.ravel(), other.ravel())[0, 1]
         assert abs(correlation - strength) < 5 / math.sqrt(found.size)
@@ -183,8 +185,8 @@ SPECS: dict[str, dict[str, Any]] = {
 def test_delays_have_the_law_they_say(name: str) -> None:
     """The fraction of packets that are there after each lag is as the model says, within 5 standard errors."""
     batch = Batch(300, 300)
-    course = LinkSchedule({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": SPECS[name]}, window=20)
-    fates = link(course, batch).fates(range(300))
+    schedule = LinkSchedule({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": SPECS[name]}, window=20)
+    fates = link(schedule, batch).fates(range(300))
     assert fates.delays is not None
     model = delay_of(SPECS[name])
     for lag in range(8):
@@ -211,3 +213,30 @@ def test_wrong_delays_are_named(model: str, given_: dict[str, Any], entries: lis
     found = DELAY_MODELS[model].mistakes(given_)
     assert [entry for entry, _ in found] == entries
     assert all("expected" in what for _, what in found)
+
+
+def test_fates_of_packets_that_are_not_sent() -> None:
+    """Silenced in a copy; a packet that is not sent has no second copy either, and all others keep their fates."""
+    codes = np.array([[Fate.DELIVERED, Fate.LOST, Fate.DELIVERED]], np.uint8)
+    again = np.array([[True, False, True]])
+    sent = np.array([True, False, False])
+    for delays, in_time in ((None, [True, False, False]), (np.array([[1, 0, 0]], np.uint32), [False, False, False])):
+        for copies in (None, again.copy()):
+            whole = Fates(codes.copy(), delays, copies)
+            silenced = whole.copied()
+            silenced.silence(0, sent)
+            assert silenced.codes.tolist() == [[Fate.DELIVERED, Fate.UNSENT, Fate.UNSENT]]
+            assert silenced.in_time[0].tolist() == in_time
+            assert copies is None or (silenced.again is not None and silenced.again.tolist() == [[True, False, False]])
+            assert np.array_equal(whole.codes, codes)
+            assert copies is None or np.array_equal(copies, again)
+
+
+def test_an_outage_of_other_slots_loses_nothing() -> None:
+    """Before it and after it; all packets of its own slots are lost to it."""
+    course = LinkSchedule(
+        {"loss": {"model": "bernoulli", "quality": 1.0}}, outages=(ReceiverOutage(10, 12, Fate.DOWN),)
+    )
+    one = link(course, Batch(20, 2))
+    codes = [one.fates(slots).codes for slots in (range(10), range(10, 12), range(12, 20))]
+    assert [sorted(set(part.ravel().tolist())) for part in codes] == [[Fate.DELIVERED], [Fate.DOWN], [Fate.DELIVERED]]

@@ -1,4 +1,4 @@
-"""A link whose course is changed while it runs decides as if all changes had been known before."""
+"""A link whose schedule is changed while it runs decides as if all changes had been known before."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Changes = tuple[Change, ...]
 
 def link(*changes: Change) -> Link:
     """A link in bursts with some changes known."""
-    course = LinkSchedule({"loss": BURSTS}, window=3, changes=changes)
-    keys = {name: bytes(31) + bytes([i]) for i, name in enumerate(streams_of("it", course))}
-    return Link(course, "it", keys, Batch(SLOTS, 4))
+    schedule = LinkSchedule({"loss": BURSTS}, window=3, changes=changes)
+    keys = {name: bytes(31) + bytes([i]) for i, name in enumerate(streams_of("it", schedule))}
+    return Link(schedule, "it", keys, Batch(SLOTS, 4))
 
 
 def steered(known: Changes, orders: dict[int, list[Changes]]) -> list[Fates]:

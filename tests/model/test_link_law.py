@@ -41,9 +41,9 @@ def aged(quality: Callable[[int], float], there: Callable[[int], float], window:
     return found
 
 
-def traces(course: LinkSchedule) -> np.ndarray:
+def traces(schedule: LinkSchedule) -> np.ndarray:
     """What theory says."""
-    return Expectation(WALK, law_of(course), Outcomes.plain).traces(SLOTS)
+    return Expectation(WALK, law_of(schedule), Outcomes.plain).traces(SLOTS)
 
 
 PLAIN: dict[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.6}}
@@ -58,12 +58,12 @@ DELAYS = (
 @pytest.mark.parametrize("delay", DELAYS, ids=lambda delay: delay["model"])
 def test_late_packets(delay: dict[str, Any], window: int) -> None:
     """With delays, reordering and corruption, the expectation and its limit, to 1e-12."""
-    course = LinkSchedule({**PLAIN, "delay": delay, "reorder": 0.2, "corrupt": 0.1}, window)
+    schedule = LinkSchedule({**PLAIN, "delay": delay, "reorder": 0.2, "corrupt": 0.1}, window)
     model = delay_of(delay)
     there = [0.2 + 0.8 * (model.arrived(lag) or 0.0) for lag in range(window + 1)]
     expected = aged(lambda _: 0.6 * 0.9, lambda lag: there[lag], window)
-    np.testing.assert_allclose(traces(course), expected, rtol=1e-12)
-    law = law_of(course)
+    np.testing.assert_allclose(traces(schedule), expected, rtol=1e-12)
+    law = law_of(schedule)
     assert law is not None
     settled = Expectation(WALK, law, Outcomes.plain).traces(900)[-1]
     assert limit_of(WALK, law, Outcomes.plain) == pytest.approx(settled, rel=1e-9)
@@ -72,12 +72,14 @@ def test_late_packets(delay: dict[str, Any], window: int) -> None:
 def test_links_that_change() -> None:
     """Other qualities and other delays from some slot on, and a cut in between."""
     later = {"loss": {"model": "bernoulli", "quality": 0.9}}
-    course = LinkSchedule(PLAIN, 0, (Change(15, later), Change(20, cut=True), Change(30, cut=False), Change(40, PLAIN)))
+    schedule = LinkSchedule(
+        PLAIN, 0, (Change(15, later), Change(20, cut=True), Change(30, cut=False), Change(40, PLAIN))
+    )
 
     def quality(k: int) -> float:
         return 0.0 if 20 <= k < 30 else 0.9 if 15 <= k < 40 else 0.6
 
-    np.testing.assert_allclose(traces(course), aged(quality, lambda _: 1.0, 0), rtol=1e-12)
+    np.testing.assert_allclose(traces(schedule), aged(quality, lambda _: 1.0, 0), rtol=1e-12)
 
 
 def test_a_quality_that_differs_from_slot_to_slot() -> None:
@@ -99,7 +101,7 @@ def test_a_quality_that_differs_from_slot_to_slot() -> None:
 @pytest.mark.parametrize(("start", "stop"), [(0, 5), (10, 25), (30, NEVER)])
 def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
     """Its last estimate is carried on, or it starts from 0 and Σ."""
-    course = LinkSchedule(PLAIN, 0, (), (Away(start, stop, Fate.DOWN, keeps),))
+    schedule = LinkSchedule(PLAIN, 0, (), (Away(start, stop, Fate.DOWN, keeps),))
     if keeps:
         expected = aged(lambda k: 0.0 if start <= k < stop else 0.6, lambda _: 1.0, 0)
     else:
@@ -108,7 +110,7 @@ def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
             heard = max(0, k - stop + 1)
             newest = sum(0.4**age * 0.6 * 0.3 * age for age in range(heard))
             expected.append(newest + 0.4**heard * (2.0 + 0.3 * k))
-    np.testing.assert_allclose(traces(course), expected, rtol=1e-12)
+    np.testing.assert_allclose(traces(schedule), expected, rtol=1e-12)
 
 
 def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
@@ -124,16 +126,16 @@ def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
 
 def test_slots_may_be_asked_for_in_any_pieces() -> None:
     """The same numbers."""
-    course = LinkSchedule({**PLAIN, "delay": DELAYS[1]}, 3, (Change(17, {**PLAIN, "delay": DELAYS[0]}),))
-    law = law_of(course)
+    schedule = LinkSchedule({**PLAIN, "delay": DELAYS[1]}, 3, (Change(17, {**PLAIN, "delay": DELAYS[0]}),))
+    law = law_of(schedule)
     assert law is not None
     stream = ModulatedCovariance(WALK, law, Outcomes.plain)
     parts = [stream.next_traces(count) for count in (1, 16, 1, 1, 20, 21)]
-    assert np.array_equal(np.concatenate(parts), traces(course))
+    assert np.array_equal(np.concatenate(parts), traces(schedule))
 
 
 @pytest.mark.parametrize(
-    "course",
+    "schedule",
     [
         LinkSchedule({**PLAIN, "rate": 0.5, "queue": 5}),
         LinkSchedule({**PLAIN, "delay": {"model": "trace", "values": [1.0]}}, 2),
@@ -143,8 +145,8 @@ def test_slots_may_be_asked_for_in_any_pieces() -> None:
     ],
     ids=["queue", "recorded delays", "away while packets are under way", "memory", "no limit"],
 )
-def test_what_theory_does_not_know(course: LinkSchedule) -> None:
+def test_what_theory_does_not_know(schedule: LinkSchedule) -> None:
     """There is no number then."""
-    assert law_of(course) is None
-    assert np.isnan(traces(course)).all()
+    assert law_of(schedule) is None
+    assert np.isnan(traces(schedule)).all()
     assert math.isnan(Expectation(WALK, None, Outcomes.plain).limit)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evedrop.model.links import LOSS_MODELS
-from evedrop.model.links.link import Fate, losses
-from evedrop.model.slot.link import link_of
+from evedrop.model.links.link import Fate
+from evedrop.model.slot.account import Accountant
+from evedrop.model.slot.link import Fates, link_of
 from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(8), "link/eve")
@@ -92,7 +93,7 @@ def test_links_are_independent() -> None:
 def test_losses_account_for_every_packet(slots: int, trials: int, seed: int) -> None:
     """Delivered and the losses of all reasons add up to what was offered, slot by slot."""
     fates = np.random.default_rng(seed).integers(0, int(Fate.UNSENT), (slots, trials), np.uint8)
-    counted = losses(fates)
+    counted = Accountant(0, trials).account(range(slots), Fates(fates)).lost
     assert set(counted) == {fate.name.lower() for fate in Fate} - {"delivered", "unsent"}
     assert np.array_equal((fates == Fate.DELIVERED).sum(axis=1) + sum(counted.values()), np.full(slots, trials))
     assert all(counts.dtype == np.uint32 for counts in counted.values())

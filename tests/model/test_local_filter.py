@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
@@ -90,3 +92,47 @@ def test_a_filter_without_an_end_is_refused(C: np.ndarray, noise: np.ndarray) ->
     """Its covariance grows for ever, or it trusts no measurement any more."""
     with pytest.raises(ValueError, match="does not settle"):
         settled(PROCESS, plant(C, np.array([[0.01]]), noise))
+
+
+def test_a_settled_filter_stays_as_it_is() -> None:
+    """The same step in every slot from then on."""
+    steps = Steps(PROCESS, ONE)
+    while not steps.settled:
+        last = steps.next()
+    assert steps.next() is last
+    assert steps.next() is last
+
+
+def test_a_plant_that_is_not_measured_has_no_filter() -> None:
+    """Neither step by step, nor its end, nor its estimates."""
+    of = replace(ONE, output_matrix=None, measurement_noise=None)
+    for use in (
+        lambda: Steps(PROCESS, of),
+        lambda: settled(PROCESS, of),
+        lambda: LocalFilter(PROCESS, of, KEYS["measurement"], Batch(2, 1)),
+    ):
+        with pytest.raises(ValueError, match="the plant's states are not measured"):
+            use()
+
+
+@pytest.mark.parametrize(
+    ("A", "noise"),
+    [(np.diag([0.5, 1.5]), W), (np.diag([0.5, 0.25]), np.zeros((2, 2)))],
+    ids=["a state that overflows", "nothing to measure"],
+)
+def test_a_filter_that_ends_in_nothing_is_refused(A: np.ndarray, noise: np.ndarray) -> None:
+    """Its covariance leaves double precision, or it settles on ignoring every measurement; and there is no warning."""
+    with pytest.raises(ValueError, match="does not settle"):
+        settled(Process(A, np.eye(2), np.eye(2)), plant(np.array([[1.0, 0.0]]), np.array([[0.01]]), noise))
+
+
+def test_a_filter_of_many_states_is_given_up_sooner() -> None:
+    """Of five states, one of which is never seen and drifts away."""
+    five = np.eye(5)
+    none = np.full(5, np.inf)
+    of = Plant(
+        np.zeros((5, 1)), np.zeros((5, 0)), 1e-3 * five, np.zeros(5), np.zeros(1), np.zeros(1), -none, none,
+        five[:1], np.array([[0.01]]),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="does not settle"):
+        settled(Process(five, five, five), of)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.model.process import Process
+from evedrop.model.theory.closed_forms import in_sync_probability, step_probabilities, word_probability
 from evedrop.model.theory.covariances import Outcomes, limit
-from evedrop.model.theory.estimator_chain import in_sync_probability, step_probabilities, word_probability
 from evedrop.paper import chain
 
 inner = st.floats(0.05, 0.95)

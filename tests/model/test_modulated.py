@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain
-from evedrop.model.modulated import ModulatedCovariance, limit_trace, tail_outcomes
+from evedrop.model.modulated import ModulatedCovariance, limit_of, limit_trace, tail_outcomes
 from evedrop.model.process import Floats, Process
-from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.slot.link_law import LinkLaw, Segment
 from evedrop.model.theory.covariances import (
     Outcomes,
     expected_traces,
@@ -245,3 +245,97 @@ def test_blocks_of_slots_are_what_slot_by_slot_gives(
     stream = ModulatedCovariance(process, law, outcomes_at)
     parts = [stream.next_traces(count) for count in (0, 1, 2, 130, 17, 300)]
     assert np.array_equal(np.concatenate(parts), whole)
+
+
+def late(process: Process, law: LinkLaw, outcomes_at: Callable[[float], Outcomes], slots: int) -> Floats:
+    """The same with late packets, two segments and an outage: each slot from what is settled, (slots,).
+
+    A packet of slot j counts in slot k with the probability that it has arrived by then.
+    """
+    window, f = law.window, misled_covariances(process, slots)
+    found: list[float] = []
+
+    def after(states: list[Floats] | None, j: int, k: int) -> list[Floats]:
+        segment = [one for one in law.segments if one.start <= j][-1]
+        away = any(start <= j < stop for start, stop, _ in law.outages)
+        reached = 0.0 if away else segment.passes * float(segment.arrived[k - j])
+        odds = [outcomes_at(reached * float(quality)) for quality in segment.chain.quality]
+        pi = segment.chain.law
+        if states is None:
+            return [p * one.initial * process.initial_covariance for p, one in zip(pi, odds, strict=True)]
+        fresh = j == segment.start
+        weights = [pi[s] * np.ones(len(states)) if fresh else segment.chain.transitions[:, s] for s in range(len(pi))]
+        return [
+            one.kept * process.A @ sum(T * E for T, E in zip(weights[s], states, strict=True)) @ process.A.T
+            + pi[s] * (one.predicted * process.Q + one.misled * f[j])
+            for s, one in enumerate(odds)
+        ]
+
+    settled: list[Floats] | None = None
+    for k in range(slots):
+        if k >= window:
+            settled = after(settled, k - window, k)
+        states = settled
+        for j in range(max(0, k - window + 1), k + 1):
+            states = after(states, j, k)
+        found.append(float(np.trace(sum(states or []))))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("process", "receiver"), [*((MARGINAL, one) for one in RECEIVERS), (UNSTABLE, "naive"), (STABLE, "legitimate")]
+)
+def test_blocks_of_slots_with_late_packets_are_what_slot_by_slot_gives(process: Process, receiver: str) -> None:
+    """Over several blocks, around a change of the link and before an outage, to 1e-12; in any pieces to the bit."""
+    slots, arrived, outcomes_at = 540, np.array([0.3, 0.6, 0.8, 0.9]), RECEIVERS[receiver]
+    segments = (
+        Segment(0, bursts(0.05, 0.3, 0.02, 0.7), 0.9, arrived),
+        Segment(270, bursts(0.2, 0.4), 1.0, np.array([0.5, 0.5, 1.0, 1.0])),
+    )
+    law = LinkLaw(segments, ((530, 532, True),))
+    whole = ModulatedCovariance(process, law, outcomes_at).next_traces(slots)
+    expected = late(process, law, outcomes_at, slots)
+    known = np.isfinite(expected)
+    np.testing.assert_allclose(whole[known], expected[known], rtol=1e-12)
+    stream = ModulatedCovariance(process, law, outcomes_at)
+    assert np.array_equal(np.concatenate([stream.next_traces(count) for count in (1, 2, 130, 17, 390)]), whole)
+
+
+def test_errors_beyond_double_precision_are_infinite_from_there_on() -> None:
+    """Within a block that overflows slots are taken one by one: up to there the traces are those of the recursion."""
+    process = Process(np.diag([1.5, 0.5]), np.eye(2), np.eye(2))
+    chain = bursts(0.1, 0.4)
+    covariance = ModulatedCovariance(process, LinkLaw.steady(chain), Outcomes.plain)
+    traces = covariance.next_traces(3000)
+    first = int(np.argmax(np.isinf(traces)))
+    assert np.isinf(traces[first:]).all()
+    assert np.isfinite(traces[:first]).all()
+    assert traces[first - 1] > 1e306
+    growth = traces[first - 10 : first] / traces[first - 11 : first - 1]
+    slow = ModulatedCovariance(process, LinkLaw.steady(chain), Outcomes.plain)
+    assert np.array_equal(np.concatenate([slow.next_traces(7) for _ in range(400)])[:first], traces[:first])
+    assert np.allclose(growth, growth[0], rtol=1e-6)
+    assert growth[0] > 1.0
+
+
+def test_limits_that_are_too_large_to_compute_are_not_a_number() -> None:
+    """And a receiver without a limit has an infinite one."""
+    many = Process(0.5 * np.eye(17), np.eye(17), np.eye(17))
+    assert math.isnan(limit_of(many, LinkLaw.steady(bursts(0.1, 0.4)), Outcomes.plain))
+    assert math.isinf(limit_of(UNSTABLE, LinkLaw.steady(bursts(0.9, 0.1)), Outcomes.plain))
+    assert limit_of(STABLE, LinkLaw.steady(bursts(0.1, 0.4)), Outcomes.plain) == pytest.approx(
+        limit_trace(STABLE, bursts(0.1, 0.4), Outcomes.plain)
+    )
+
+
+def test_many_states_are_followed_slot_by_slot() -> None:
+    """Where an operator of whole blocks would be too large: nine states without any coupling are nine processes of one."""
+    rates = np.linspace(0.5, 1.05, 9)
+    chain = bursts(0.2, 0.5)
+    many = Process(np.diag(rates), np.eye(9), 2.0 * np.eye(9))
+    found = ModulatedCovariance(many, LinkLaw.steady(chain), Outcomes.plain).next_traces(400)
+    one_by_one = [
+        ModulatedCovariance(Process(np.array([[a]]), np.eye(1), 2.0 * np.eye(1)), LinkLaw.steady(chain), Outcomes.plain)
+        for a in rates
+    ]
+    assert np.allclose(found, sum(one.next_traces(400) for one in one_by_one), rtol=1e-10)

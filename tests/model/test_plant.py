@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
@@ -15,6 +17,7 @@ from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Reception
 from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.controller import ControllerCore
 from evedrop.streams import Batch, root_of_seed, stream_key
 from tests.builders import stream_keys
 
@@ -102,6 +105,20 @@ def test_a_trial_alone_is_steered_as_among_others(strategy: str) -> None:
         assert not many.failed.any()
 
 
+def test_the_core_of_the_controller_decides_as_its_strategy() -> None:
+    """From the disturbances of the slot; it says what failed, and how long the decision took."""
+    asked, random = assignment(np.eye(2), plant(), period=3, limit=0.1), np.random.default_rng(6)
+    disturbances = np.zeros((10, 0))
+    core, strategy = ControllerCore("lqr", asked, disturbances, 5), CONTROLLERS["lqr"](asked, 5)
+    assert core.period == 3
+    for k in (0, 3, 6):
+        x_hat = random.normal(size=(2, 5))
+        decision = core.decide(k, x_hat)
+        assert np.array_equal(decision.u, strategy.decide(k, x_hat, disturbances[k]))
+        assert decision.failed.tolist() == [False] * 5
+        assert decision.seconds >= 0.0
+
+
 def test_states_are_moved_by_inputs_disturbances_and_noise() -> None:
     """x_0 = start + L0 ξ, then A x + w + B u + B_d d with u within its limits: against plain matrix products."""
     A, noise = np.array([[1.0, 0.2], [0.0, 0.9]]), np.array([[4e-4, 2e-4], [2e-4, 1e-4]])
@@ -186,3 +203,23 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
     known = np.array(errors)[60:]
     assert known[:, 0].max() < 1e-9, "without noise, who knows the inputs and has had one state knows all"
     assert known[:, 1].max() > 1e-3
+
+
+def test_a_riccati_equation_without_a_solution_is_said_to_have_none() -> None:
+    """A drifting state that no input reaches but that is weighed, and numbers in which the equation loses all its digits."""
+    unreached = assignment(np.eye(2), plant(np.array([[1.0], [0.0]])))
+    large = replace(assignment(np.eye(2), plant(np.full((2, 1), 1e12))), state_weights=np.ones(2))
+    for asked in (unreached, large):
+        with pytest.raises(ValueError, match="the Riccati equation has no solution"):
+            gain(asked)
+        ((entry, what),) = Lqr.objections(asked)
+        assert (entry, what.partition(":")[0]) == ("state_weights", "weigh a state that no input can keep from growing")
+
+
+def test_the_inputs_change_nothing_of_what_an_estimator_does() -> None:
+    """Its action is that of the estimator without them."""
+    process, batch = Process(np.eye(2), np.eye(2), np.eye(2)), Batch(3, 4)
+    scheme = scheme_of(process, {"scheme": "plain"})
+    aware = InputAwareEstimator(scheme.estimator({}, batch), plant())
+    gamma = np.array([True, False, True, False])
+    assert np.array_equal(aware.act(1, gamma), [Action.STATE, Action.LOST, Action.STATE, Action.LOST])

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.model.process import Process, StateFactors, Trajectory, mistakes_of, product
+from evedrop.model.process import MOST_STATES, Process, StateFactors, Trajectory, mistakes_of, product
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.model.theory.horizon import horizon
 from evedrop.streams import Batch, root_of_seed, stream_key
@@ -118,10 +118,14 @@ def test_factors_are_of_the_covariances(process: Process) -> None:
     factors = StateFactors(process)
     covariances = state_covariances(process, 30)
     for k in (1, 2, 3, 29, 5, 1, 12):
-        F = np.array(factors.carried(k))
+        F = factors.carried(k)
         expected = process.A @ covariances[k - 1] @ process.A.T
         assert np.allclose(F @ F.T, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
-        assert F.tolist() == StateFactors(process).carried(k)
+        assert np.array_equal(F, StateFactors(process).carried(k))
+    for slots in (range(3), range(3, 12), range(4, 6), range(20, 30), range(1)):
+        found = factors.block(slots)
+        for row, k in enumerate(slots):
+            assert np.array_equal(found[row], StateFactors(process).carried(k) if k else np.zeros(process.A.shape))
 
 
 def test_factors_hold_where_cholesky_fails() -> None:
@@ -137,7 +141,7 @@ def test_factors_hold_where_cholesky_fails() -> None:
         exact = times(times(A_, exact), transposed)
         if k < 60:
             exact = [[exact[i][j] + Q_[i][j] for j in range(2)] for i in range(2)]
-    F = [[Fraction(v) for v in row] for row in StateFactors(UNSTABLE).carried(60)]
+    F = [[Fraction(v) for v in row] for row in StateFactors(UNSTABLE).carried(60).tolist()]
     found = times(F, [list(row) for row in zip(*F, strict=True)])
     for i in range(2):
         for j in range(2):
@@ -175,3 +179,67 @@ def test_mistakes_are_named(name: str) -> None:
 def test_a_process_has_no_mistakes(process: Process) -> None:
     """The examples pass."""
     assert mistakes_of(process.A, process.Q, process.initial_covariance) == []
+
+
+def test_a_process_of_too_many_states_is_refused() -> None:
+    """Before anything is computed of it."""
+    ((entry, what),) = mistakes_of(np.eye(MOST_STATES + 1), np.eye(2), np.eye(2))
+    assert entry == "A"
+    assert what.startswith(f"has {MOST_STATES + 1} rows; expected at most {MOST_STATES} states")
+
+
+def test_noise_that_may_be_singular_is_still_a_covariance() -> None:
+    """Of rank one it is accepted, with a negative eigenvalue it is not."""
+    assert mistakes_of(np.eye(2), np.ones((2, 2)), np.eye(2), singular_noise=True) == []
+    assert mistakes_of(np.eye(2), np.diag([1.0, -1.0]), np.eye(2), singular_noise=True) == [
+        ("Q", "has an eigenvalue below 0; expected a covariance")
+    ]
+
+
+def slot_by_slot(process: Process, slots: int) -> int | None:
+    """The horizon by its definition."""
+    limit = (0.01 * 2.0**53) ** 2 * float(np.linalg.eigvalsh(process.Q)[0])
+    sigma = process.initial_covariance
+    for k in range(slots):
+        if np.linalg.eigvalsh(sigma)[-1] > limit:
+            return k - 1
+        sigma = process.A @ sigma @ process.A.T + process.Q
+    return None
+
+
+ROTATION = np.array([[0.6, -0.8], [0.8, 0.6]])
+
+
+@pytest.mark.parametrize(
+    ("process", "slots"),
+    [
+        (UNSTABLE, 500),
+        (UNSTABLE, 20),
+        (Process(0.5 * np.eye(2), np.eye(2), np.eye(2)), 10**8),
+        (Process(1.001 * ROTATION, np.diag([1e-20, 1.0]), 1e-3 * np.eye(2)), 5000),
+        (Process(np.array([[1.0, 0.0], [0.0, 1.2]]), np.diag([1.0, 1.0]), np.diag([3e27, 3e27])), 200),
+    ],
+    ids=["unstable", "short", "stable", "slow", "close"],
+)
+def test_the_horizon_is_the_last_slot_within_reach(process: Process, slots: int) -> None:
+    """By its definition, slot by slot; a covariance that no longer changes has no horizon."""
+    expected = None if process.spectral_radius < 1.0 else slot_by_slot(process, slots)
+    assert horizon(process, slots) == expected
+
+
+def test_the_horizon_of_a_long_run_is_bisected() -> None:
+    """A random walk has Σ_k = 1 + k: it is within reach until k + 1 exceeds (0.01 · 2⁵³)² q."""
+    q = 1e-20
+    walk = Process(np.eye(1), np.array([[q]]), np.array([[1e-3]]))
+    limit = (0.01 * 2.0**53) ** 2 * q
+    assert slot_by_slot(walk, 2) is None
+    assert horizon(walk, 10**7) is None
+    grows = Process(np.array([[1.000001]]), np.array([[1.0]]), np.array([[1.0]]))
+    found = horizon(grows, 10**8)
+    # Σ_k = a^2k + (a^2k − 1)/(a² − 1)
+    a2 = 1.000001**2
+    expected = np.log(((0.01 * 2.0**53) ** 2 * (a2 - 1) + 1) / a2) / np.log(a2)
+    assert found is not None
+    assert found > 4 * 2**20
+    assert abs(found - expected) < 2 + 1e-6 * expected
+    assert limit > 1.0

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from evedrop.model.process import Process
-from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.cipher import Cipher
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.schemes.twin_track import TwinTrack
+from evedrop.streams import Batch
 
 PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))
 
@@ -50,3 +51,43 @@ def test_a_scheme_with_its_own_start_is_known_by_its_method() -> None:
     assert {name for name in SCHEMES if SCHEMES[name].decides_initial_state()} == {"twin-track"}
     other: type[Scheme] = type("Other", (TwinTrack,), {})
     assert other.decides_initial_state()
+
+
+def test_a_scheme_without_innovations_shares_neither_types_nor_noise() -> None:
+    """ν and χ are 0 in every slot and trial; sender and estimator are those of the scheme."""
+    shared = Plain(PROCESS).shared({}, Batch(4, 3))
+    for k in (0, 3):
+        assert shared.nu(k).tolist() == [False] * 3
+        assert np.array_equal(shared.chi(k), np.zeros((2, 3)))
+    packet = shared.encoder().encode(0, np.ones((2, 3)), np.zeros((2, 3)))
+    assert np.array_equal(packet.z, np.ones((2, 3)))
+    assert shared.estimator().act(0, np.ones(3, np.bool_)).tolist() == [1, 1, 1]
+
+
+def test_the_bits_of_packets_and_secrets_are_counted() -> None:
+    """64 for each number: of two states, headers, and words of shared secret."""
+    found = {
+        name: (one.packet_bits, one.secret_bits, one.initial_secret_bits)
+        for name in SCHEMES
+        for one in [scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters})]
+    }
+    assert found == {
+        "acknowledged": (192, 0, 0),
+        "cipher": (128, 128, 0),
+        "encrypted-schedule": (192, 128, 0),
+        "innovation": (128, 192, 0),
+        "plain": (128, 0, 0),
+        "scheduled": (128, 0, 0),
+        "twin-track": (128, 64, 256),
+        "withholding": (128, 0, 0),
+    }
+
+
+def test_a_scheme_that_says_nothing_of_eavesdroppers_has_no_closed_form() -> None:
+    """Its slots differ, or what the eavesdropper makes of its packets depends on more than their type."""
+    known = {
+        name
+        for name in SCHEMES
+        if scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters}).eavesdropper_outcomes(0.5, 1.0, 0.0)
+    }
+    assert known == {"innovation", "plain", "withholding"}

@@ -114,3 +114,19 @@ def test_outcomes_that_are_no_probabilities_are_refused(change: dict[str, Any], 
     with pytest.raises(NoAnswer) as refused:
         stand_in(at={**OUTCOMES, **change}).outcomes(GIVEN, 0.5)(0.25)
     assert said in str(refused.value)
+
+
+def test_a_class_that_cannot_be_asked_is_not_registered() -> None:
+    """With the reason why it gave no answer, or with what is wrong with its answer."""
+
+    class Silent:
+        """No class answers."""
+
+        def ask(self, *_: object) -> Any:
+            """Never."""
+            raise NoAnswer("it did not answer within 60 s")
+
+    silent: Any = Silent()
+    with pytest.raises(NotRegistered) as refused:
+        StandIns(silent, REGISTRY)(NAME)
+    assert refused.value.why == (", and it did not answer within 60 s; expected a class that can be asked about itself")

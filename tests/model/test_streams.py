@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.streams import Batch, BlockReader, Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.streams import Ahead, Batch, BlockReader, Stream, normals, root_of_seed, stream_key, uniforms
 
 KEY = bytes(range(32))
 SLOTS = st.integers(0, 2**45)
@@ -76,7 +77,6 @@ def test_reader_gives_the_same_numbers_in_any_order(
         stop = data.draw(st.integers(start + 1, slots))
         assert np.array_equal(reader.normals(range(start, stop)), whole[0][start:stop])
         assert np.array_equal(reader.uniforms(range(start, stop)), whole[1][start:stop])
-        assert start in reader.block(start)
     alone = data.draw(st.integers(0, trials - 1))
     other = BlockReader(KEY, Batch(slots, 1, first + alone), per_trial)
     assert np.array_equal(other.normals(range(slots))[:, :, 0], whole[0][:, :, alone])
@@ -93,14 +93,29 @@ def test_what_was_drawn_stays() -> None:
         assert all(np.array_equal(one, was) for one, was in zip(first, before, strict=True))
 
 
-def test_blocks_cover_all_slots_once() -> None:
-    """The reader's blocks are aligned, and each slot of the run is in exactly one."""
-    for slots, trials in ((1, 1), (255, 1), (600, 1), (600, 1000), (5, 100_000)):
-        reader = BlockReader(KEY, Batch(slots, trials), 2)
-        seen: list[int] = []
-        while len(seen) < slots:
-            seen += reader.block(len(seen))
-        assert seen == list(range(slots))
+@given(st.data(), st.sampled_from([(1, 1), (30, 1), (255, 1), (600, 1), (600, 1000), (40, 100_000)]))
+def test_what_is_drawn_ahead_is_drawn_once_and_in_order(data: st.DataObject, shape: tuple[int, int]) -> None:
+    """However many slots are read at a time, in order; another order gives the same values."""
+    slots, trials = shape
+    made: list[int] = []
+
+    def make(some: range) -> np.ndarray[Any, np.dtype[np.int64]]:
+        made.extend(some)
+        return np.array(some)
+
+    ahead = Ahead(BlockReader(KEY, Batch(slots, trials), 2), make)
+    k = 0
+    while k < slots:
+        stop = data.draw(st.integers(k + 1, slots))
+        assert ahead.of(range(k, stop)).tolist() == list(range(k, stop))
+        assert ahead.at(stop - 1) == stop - 1
+        k = stop
+    assert made == list(range(slots))
+    for _ in range(3):
+        start = data.draw(st.integers(0, slots - 1))
+        stop = data.draw(st.integers(start + 1, slots))
+        assert ahead.of(range(start, stop)).tolist() == list(range(start, stop))
+        assert ahead.at(start) == start
 
 
 def test_extreme_words() -> None:

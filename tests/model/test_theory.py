@@ -204,6 +204,7 @@ def test_noise_has_the_covariance_of_the_carried_state() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e60, 1e200])
+@pytest.mark.thorough
 def test_overflow_is_infinite_and_silent(scale: float) -> None:
     """Beyond double precision every expectation is inf, from then on, never nan and without a warning."""
     process = Process(scale * np.array([[1.0, -0.9], [0.3, -1.2]]), np.eye(2), np.eye(2))
@@ -360,3 +361,29 @@ def test_who_never_uses_a_state_has_no_heavy_tail() -> None:
         assert math.isinf(tail_index(UNSTABLE, outcomes))
         assert not has_infinite_variance(UNSTABLE, outcomes)
         assert expected_traces(UNSTABLE, NOBODY, 200)[-1] < 10.0 * expected_traces(UNSTABLE, outcomes, 200)[-1]
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.7, 2.0])
+def test_a_limit_that_rounding_destroys_is_infinite(angle: float) -> None:
+    """Of a double eigenvalue 1 in a rotated basis, ever nearer to the bound: a covariance, or no limit at all."""
+    c, s = math.cos(angle), math.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    process = Process(turn @ np.array([[1.0, 0.1], [0.0, 1.0]]) @ turn.T, np.eye(2), np.eye(2))
+    for kept in (1.0 - 10.0 ** -(e / 2) for e in range(4, 26)):
+        S = lyapunov(process, kept)
+        if np.isinf(S).any():
+            assert kept > 1.0 - 1e-3
+            assert np.isposinf(S).all()
+        else:
+            assert np.linalg.eigvalsh(0.5 * (S + S.T))[0] >= -1e-9 * np.abs(S).max()
+
+
+@pytest.mark.parametrize("n", [1, 9, 10, 12])
+def test_the_limit_of_few_states_and_of_many_solves_its_equation(n: int) -> None:
+    """S = kept · A S Aᵀ + Q, however many equations that is: to 1e-12 of its largest entry."""
+    rng = np.random.default_rng(n)
+    A = rng.normal(size=(n, n))
+    process = Process(1.1 * A / np.abs(np.linalg.eigvals(A)).max(), np.eye(n), np.eye(n))
+    S = lyapunov(process, 0.7)
+    assert np.allclose(S, 0.7 * process.A @ S @ process.A.T + process.Q, rtol=0, atol=1e-12 * np.abs(S).max())
+    assert np.isinf(lyapunov(process, 0.9)).all()

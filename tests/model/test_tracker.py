@@ -140,6 +140,7 @@ def test_it_is_the_exact_posterior(process: Process, learns_at: int) -> None:
 
 
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING], ids=["unstable", "drifting"])
+@pytest.mark.thorough
 def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> None:
     """At least ½ tr A^k Σ0 A^kᵀ in the mean and, as soon as it has heard both tracks, no more; at five standard errors."""
     batch = Batch(15, 4000)
@@ -150,6 +151,7 @@ def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> 
     assert not found[14].any()
 
 
+@pytest.mark.thorough
 def test_one_betrayed_state_breaks_twin_tracks() -> None:
     """Beside a drifting process its mean error is below 1.5 times the user's after the leak, at five standard errors.
 
@@ -193,6 +195,7 @@ def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
     assert late[~on_twin].mean() > 0.99
 
 
+@pytest.mark.thorough
 def test_what_it_believes_is_true() -> None:
     """Before and after the leak tr P is its squared error in the mean, at five standard errors, where nothing is plain."""
     batch = Batch(30, 3000)
@@ -223,6 +226,7 @@ def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
             assert np.array_equal(one.action, other.action[part])
 
 
+@pytest.mark.thorough
 def test_more_room_changes_little() -> None:
     """Where the tracks stay within a slot's noise, twice as many histories change its mean error by less than 2 %."""
     batch, gamma, means = Batch(60, 200), coins(0.9, 60, 200), []
@@ -237,3 +241,19 @@ def test_more_room_changes_little() -> None:
             assert len(belief.memory[0]) <= capacity
         means.append(total)
     assert means[0] == pytest.approx(means[1], rel=0.02)
+
+
+def test_a_tracker_that_begins_later_has_the_same_prior() -> None:
+    """A belief from slot 4 on is that of one that heard nothing before: after the next packets, too."""
+    batch, first = Batch(8, 3), 4
+    one, other = (Tracker(Knowledge(UNSTABLE, 1.0, {}, {}), batch) for _ in range(2))
+    gamma = np.zeros((8, 3), bool)
+    gamma[first:] = [[True, False, True], [True, True, False], [False, True, True], [True, True, True]]
+    waiting, late = one.prior(), other.prior(first)
+    for slot in slots(UNSTABLE, batch, gamma):
+        heard = Reception(slot.gamma, slot.z)
+        waiting = one.step(slot.k, waiting, heard)
+        if slot.k >= first:
+            late = other.step(slot.k, late, heard)
+            assert np.allclose(late.x_hat, waiting.x_hat, rtol=1e-9)
+            assert np.allclose(late.P, waiting.P, rtol=1e-9)

@@ -126,3 +126,38 @@ def test_one_state_that_leaks_breaks_it() -> None:
     assert np.array_equal(guessed, on_twin)
     back = np.linalg.matrix_power(np.linalg.inv(UNSTABLE.A), 4) @ (played.packets[4].z - played.x[4])
     assert np.allclose(back[:, guessed], TwinTracks(UNSTABLE, KEYS, batch).distance(0)[:, guessed], atol=1e-6)
+
+
+def test_slots_may_be_asked_for_in_any_order() -> None:
+    """Distance and coin are those of tracks that were asked in order."""
+    batch = Batch(30, 4)
+    tracks, ordered = (TwinTracks(UNSTABLE, KEYS, batch) for _ in range(2))
+    expected = [(ordered.distance(k).copy(), ordered.on_twin(k).copy()) for k in range(30)]
+    for k in (29, 3, 0, 17, 17):
+        assert np.array_equal(tracks.distance(k), expected[k][0])
+        assert np.array_equal(tracks.on_twin(k), expected[k][1])
+
+
+def test_an_estimator_that_begins_later_knows_the_start() -> None:
+    """Before slot k, x̂ = A^{k−1} x_0 with the error of k − 1 slots of noise."""
+    batch = Batch(9, 3)
+    estimator = TwinTrack(DRIFTING).estimator(KEYS, batch)
+    x_0 = TwinTracks(DRIFTING, KEYS, batch).initial
+    for first, moves in ((0, 0), (1, 0), (2, 1), (6, 5)):
+        belief = estimator.prior(first)
+        power = np.linalg.matrix_power
+        spread = sum(power(DRIFTING.A, j) @ DRIFTING.Q @ power(DRIFTING.A, j).T for j in range(moves)) + np.zeros(
+            (3, 3)
+        )
+        assert np.allclose(belief.x_hat, power(DRIFTING.A, moves) @ x_0, rtol=1e-12)
+        assert np.allclose(belief.P, spread[:, :, None], rtol=1e-12)
+
+
+def test_the_floor_grows_where_the_powers_of_the_process_do() -> None:
+    """Half of what is not known of x_0; of an unstable or drifting process it has no bound."""
+    for process, grows in ((UNSTABLE, True), (STABLE, False), (Process(np.eye(2), np.eye(2), np.eye(2)), False)):
+        floor, without_bound = TwinTrack(process).error_floor(5)
+        assert np.allclose(floor, [0.5 * np.trace(spread(process, k)) for k in range(5)], rtol=1e-12)
+        assert without_bound is grows
+    drifting = Process(np.array([[1.0, 1.0], [0.0, 1.0]]), np.eye(2), np.eye(2))
+    assert TwinTrack(drifting).error_floor(2)[1]

@@ -16,7 +16,7 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.loading import load
-from evedrop.model.digest import BeliefLog, Blocks, Digests, RunDigest
+from evedrop.model.digest import BlockDigests, Blocks, Digests, RunDigest
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
@@ -25,7 +25,7 @@ from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import Batch
-from tests.builders import DRIFTING, process_table
+from tests.builders import DRIFTING, one_slot, process_table
 from tests.conftest import LIMIT
 from tests.peers.independent_legitimate import Estimator
 
@@ -68,7 +68,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
     secret = keys.secret(("schedule", "noise"))
     encoder = SCHEMES["innovation"](model, 0.4).encoder(secret, batch)
     estimator = SCHEMES["innovation"](model, 0.4).estimator(secret, batch)
-    belief, log, digest = estimator.prior(), BeliefLog(model.n, 9, slots), RunDigest()
+    belief, log, digest = estimator.prior(), BlockDigests(9, slots), RunDigest()
     gammas = np.random.default_rng(1).random((slots, 9)) < 0.7
     beliefs = []
     blocks: dict[int, Digests] = {}
@@ -76,9 +76,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
         z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
         belief = estimator.step(k, belief, Reception(gamma, z))
         beliefs.append(belief)
-        digests = log.add(k, belief)
-        if digests is not None:
-            blocks |= dict([digests])
+        blocks |= log.add(range(k, k + 1), one_slot(belief))
         peer.receive(packets.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
     extent = telemetry.Extent(slots, slots, model.n, 9, 2)
     report = telemetry.read_report(wire.Reader("telemetry", peer.report()), 0, extent, Blocks(slots))

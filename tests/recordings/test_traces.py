@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from evedrop.api import montecarlo
 from evedrop.errors import ScenarioError, TraceError
 from evedrop.loading import load
-from evedrop.model.links.checks import as_toml
+from evedrop.model.checks import as_toml
 from evedrop.recordings import link_recording as traces
 from evedrop.recordings.link_recording import LinkRecording
 from tests.builders import scalar_tables

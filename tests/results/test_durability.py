@@ -26,6 +26,7 @@ from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 from tests.rogue import with_rogue
+from tests.steps import stepping
 
 ENDLESS = ("--slots", "1000000")
 WAITS_FOR_OTHERS = """
@@ -132,9 +133,12 @@ def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
 
 def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
     """All results are in it, whole, and the command says where it is."""
-    live = evedrop.live("eavesdroppers", "--slots", "4000")
-    wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
+    live = evedrop.live("eavesdroppers", "--slots", "600", "--pace", "0.001", "--paused")
+    live.held()
+    with stepping(evedrop, live.folder, 500):
+        wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
     other = live.folder.rename(evedrop.folder / "other")
+    assert evedrop("resume", str(other)).status == 0
     done = live.end()
     assert done.status == 0, done.err
     assert f"the results folder was renamed while the run went on; it is {other}" in done.err
@@ -143,7 +147,7 @@ def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
     assert not live.folder.exists()
     results = load_results(other)
     assert results.summary["ended"] == "complete"
-    assert results.trials.num_rows == results.journal.num_rows == 4 * 4000
+    assert results.trials.num_rows == results.journal.num_rows == 4 * 600
     assert {path.name for path in other.iterdir()} == {
         "scenario.toml", "summary.json", "slots.parquet", "trials.parquet", "journal.parquet", "digests.parquet", "logs",
     }  # fmt: skip
@@ -152,7 +156,7 @@ def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
 @pytest.mark.long
 def test_a_folder_that_is_removed_is_an_error_that_says_so(evedrop: Evedrop) -> None:
     """Exit 3 with the folder and what to do, no traceback, nothing left."""
-    live = evedrop.live("eavesdroppers", "--slots", "4000")
+    live = evedrop.live("eavesdroppers", *ENDLESS)
     wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
     shutil.rmtree(live.folder.rename(evedrop.folder / "gone"))
     done = live.end()

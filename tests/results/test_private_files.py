@@ -20,7 +20,7 @@ from evedrop.results.resolved_scenario import resolved
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 
-OPEN = {"umask": 0o000}
+OPEN: dict[str, Any] = {"umask": 0o000}
 """Options of a process whose files are for everybody, unless it says otherwise."""
 LOOK = """
 import os, sys

@@ -43,11 +43,11 @@ def test_what_cannot_be_read_is_no_scenario(tmp_path: Path) -> None:
     assert not any(is_scenario(tmp_path / f"{name}.toml") for name in "abc")
 
 
-@pytest.mark.parametrize("beside", ["summary.json", "slots.parquet", "unfinished"])
-def test_the_copy_in_a_results_folder_is_none(tmp_path: Path, beside: str) -> None:
+@pytest.mark.parametrize("neighbour", ["summary.json", "slots.parquet", "unfinished"])
+def test_the_copy_in_a_results_folder_is_none(tmp_path: Path, neighbour: str) -> None:
     """Of a run that ended, and of one that goes on."""
     (tmp_path / "scenario.toml").write_text(SCENARIO, encoding="utf-8")
-    (tmp_path / beside).touch()
+    (tmp_path / neighbour).touch()
     assert not is_scenario(tmp_path / "scenario.toml")
 
 

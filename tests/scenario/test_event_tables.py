@@ -90,7 +90,7 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
     ),
     "back and gone at once": (
         [{"from": 1, "to": 5, "kill": "eve"}, {"at": 5, "pause": "eve"}],
-        "event.1.pause: eve is back in slot 5 only; expected a later slot",
+        "event.1.pause: eve comes back only in slot 5; expected a later slot",
     ),
     "state of nobody": (
         [{"at": 1, "cut": "eve", "state": "last"}],
@@ -194,7 +194,7 @@ def test_what_events_come_to() -> None:
         {"at": 90, "pause": "eve"},
         {"at": 5, "note": "here we go"},
     )
-    eve = scenario.course("eve")
+    eve = scenario.schedule("eve")
     half, whole = ({"model": "bernoulli", "quality": quality} for quality in (0.5, 0.9))
     assert [(one.at, one.settings, one.cut) for one in eve.changes] == [
         (10, {"loss": half}, None),

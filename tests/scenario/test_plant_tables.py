@@ -14,7 +14,7 @@ from evedrop.errors import ScenarioError
 from evedrop.loading import checked, load
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario import Scenario
-from evedrop.scenario.disturbances import disturbances_of
+from evedrop.scenario.input_files import disturbances_of
 
 LOOP: dict[str, Any] = {
     "title": "Loop",
@@ -92,12 +92,12 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "a name twice": ({"plant__inputs": ["P", "P"]}, 'plant.inputs: has "P" twice'),
     "limits of inputs": (
         {"plant__input_lower": [2.0, -3.0]},
-        "plant.input_lower: entry 0 is 2.0, above that of input_upper, which is 1.5; exchange them",
+        "plant.input_lower: entry 0 is 2.0, above that of input_upper, which is 1.5; swap them",
     ),
     "how many limits": ({"plant__input_upper": [1.0]}, "plant.input_upper: has 1 entries; expected 2, one for each of"),
     "limits of states": (
         {"plant__state_lower": [95.0, 10.0]},
-        "plant.state_lower: entry 0 is 95.0, above that of state_upper, which is 90.0; exchange them",
+        "plant.state_lower: entry 0 is 95.0, above that of state_upper, which is 90.0; swap them",
     ),
     "start": (
         {"plant__start": [95.0, 50.0]},
@@ -143,7 +143,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "knows nothing": (
         {"plant": None, "controller": None},
-        "legitimate.knows_input: is true, but nothing has inputs; expected a [plant] and a [controller], or no such line",
+        "legitimate.knows_input: is true, but there are no inputs; add a [plant] and a [controller], or remove the line",
     ),
     "strategy": ({"controller__strategy": "pid"}, 'controller.strategy: is "pid"; expected lqr'),
     "parameter": (
@@ -172,7 +172,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "killed although told": (
         {"event": [{"from": 1, "to": 2, "pause": "legitimate"}], "controller__acts_on": "truth"},
-        "event.0.pause: is legitimate, but it is told the inputs, and the loop would stand still; expected a cut",
+        "event.0.pause: is legitimate, but it waits for the inputs, and the loop would stand still; expected a cut",
     ),
     "no filter": (
         {"process__Q": "filter"},

@@ -11,7 +11,7 @@ from evedrop.model.slot.account import Accountant
 from evedrop.model.slot.link import Link
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.score.channel import CONFIDENCE, interval, link_summary_of
+from evedrop.score.channel import RATE_CONFIDENCE, interval, link_summary_of
 from evedrop.score.sums import Tally
 from evedrop.streams import Batch
 from tests.builders import scalar_tables
@@ -57,9 +57,9 @@ def scenario(seed: int, events: list[dict[str, Any]] | None = None) -> Scenario:
 
 def tally_of(one: Scenario, name: str) -> Tally:
     """What a run would have counted."""
-    course = one.course(name)
-    batch, accountant = Batch(one.slots, one.trials), Accountant(course.window, one.trials)
-    fates = Link(course, name, StreamKeys.of(one).link(name, course), batch).fates(range(one.slots))
+    schedule = one.schedule(name)
+    batch, accountant = Batch(one.slots, one.trials), Accountant(schedule.window, one.trials)
+    fates = Link(schedule, name, StreamKeys.of(one).link(name, schedule), batch).fates(range(one.slots))
     account = accountant.account(range(one.slots), fates)
     tally = Tally(one.slots, one.trials, done=one.slots, offered=one.slots * one.trials)
     tally.account(account.delivered, (account.delivered).astype(np.uint8), account.lost)
@@ -97,7 +97,7 @@ def test_the_interval_is_clopper_and_pearsons() -> None:
 
     count, received, expected = 200, 150, 0.8
     low, high = interval(received / count, expected, expected * (1 - expected) / count)
-    tail = (1 - CONFIDENCE) / 2
+    tail = (1 - RATE_CONFIDENCE) / 2
     assert binom.sf(received - 1, count, low) == pytest.approx(tail, rel=1e-6)
     assert binom.cdf(received, count, high) == pytest.approx(tail, rel=1e-6)
     assert interval(0.75, 0.75, 0.0) == (0.75, 0.75)

@@ -17,7 +17,7 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.results.comparison import Comparison
-from evedrop.score.kept import SecrecyKept
+from evedrop.score.verdict import SecrecyKept
 from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
 from tests.conftest import Evedrop
 

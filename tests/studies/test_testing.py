@@ -29,6 +29,7 @@ SCENARIO = (
     .replace("slots = ", "slots = 60 #")
 )
 HOLDS = SCENARIO + '[[expect]]\nfigure = "legitimate.mean_squared_error"\nbelow = 0.1\n'
+ENDLESS = HOLDS.replace("slots = 60", "slots = 1000000").replace("pace = 0.0", "pace = 0.01")
 FAILS = HOLDS + '[[expect]]\nfigure = "smart.received_fraction"\nslots = [10, 60]\nabove = 2\n'
 WRONG = SCENARIO.replace("slots = ", "sluts = ").replace("seed = ", "seed = -")
 
@@ -170,7 +171,7 @@ def test_a_report_holds_what_xml_cannot() -> None:
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, jobs: str) -> None:
     """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
-    written(evedrop.folder / "cases", a=HOLDS, b=HOLDS.replace("slots = 60", "slots = 200000"))
+    written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
     process = subprocess.Popen(
         [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", jobs, "--junit", "report.xml"],
         cwd=evedrop.folder,
@@ -195,7 +196,7 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
 
 def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:
     """Kill -9 of `evedrop test` while two run: their processes end too."""
-    written(evedrop.folder / "cases", a=HOLDS.replace("slots = 60", "slots = 200000"), b=HOLDS)
+    written(evedrop.folder / "cases", a=ENDLESS, b=HOLDS)
     process = subprocess.Popen(
         [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", "2"],
         cwd=evedrop.folder,

@@ -17,7 +17,7 @@ NAMES = ("numerical", "microgrid", "strategies", "chain")
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """figures.md of a small set of figures, made by the command in a directory that did not exist."""
-    small = Size(microgrid_trials=20, microgrid_slots=1000, strategy_trials=2000, chain_trials=50, chain_slots=300)
+    small = Size(microgrid_trials=20, microgrid_slots=1000, strategy_trials=400, chain_trials=50, chain_slots=300)
     folder = tmp_path_factory.mktemp("figures") / "new" / "folder"
     out, err = io.StringIO(), io.StringIO()
     with patch.object(figures, "Size", lambda **_: small), redirect_stdout(out), redirect_stderr(err):
@@ -81,7 +81,7 @@ def test_captions_state_the_size(report: Path) -> None:
     """What was simulated, how often, and how sure it is stands beside the figure."""
     text = report.read_text(encoding="utf-8")
     assert "mean over 1000 slots of one second and 20 trials" in text
-    assert "2000 trials of the real model" in text
+    assert "400 trials of the real model" in text
     assert "50 trials × 300 slots" in text
 
 

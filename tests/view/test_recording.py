@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from evedrop.view import plane
+from evedrop.view.panels.state_plane import frames, stride
 from evedrop.view.recording import Scene, ViewRecording
 from tests.conftest import LIMIT
 from tests.view.read_back import lane, rows
@@ -129,11 +129,11 @@ def test_one_state_is_drawn_over_time(simulated: Callable[..., Simulated], tmp_p
 def test_long_runs_have_bounded_frames() -> None:
     """200 000 slots as fast as they go have some thousand frames, the last slot among them; real time has 30 a second."""
     fast = Scene("", "r", 200_000, 1, 2, 0.0, (), 1.0)
-    offsets = np.concatenate([first + plane.frames(fast, first, 1000) for first in range(0, 200_000, 1000)])
+    offsets = np.concatenate([first + frames(fast, first, 1000) for first in range(0, 200_000, 1000)])
     assert len(offsets) <= 4001
     assert offsets[-1] == 199_999
-    assert plane.stride(Scene("", "r", 3000, 1, 2, 0.02, (), 1.0)) == 2
-    assert plane.stride(Scene("", "r", 300, 1, 2, 0.0, (), 1.0)) == 1
+    assert stride(Scene("", "r", 3000, 1, 2, 0.02, (), 1.0)) == 2
+    assert stride(Scene("", "r", 300, 1, 2, 0.0, (), 1.0)) == 1
 
 
 def test_place_that_cannot_be_written_is_told(run: Simulated, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -39,22 +38,9 @@ def test_a_live_run_shows_what_was_done_to_it(evedrop: Any) -> None:
     """The scenario's events and the operator's, at their slots, in the recording that was made while it went on."""
     scenario = evedrop.folder / "shown.toml"
     evedrop("new", str(scenario))
-    changes = (
-        "--slots",
-        "60",
-        "--pace",
-        "0.05",
-        "--set",
-        'event=[{ at = 3, cut = "legitimate" }]',
-        "--set",
-        "expect=[]",
-    )
-    live = evedrop.live(str(scenario), *changes, "--view", "web")
-    deadline = time.monotonic() + 60.0
-    while not (live.folder / "control.json").is_file():
-        assert time.monotonic() < deadline, "no run that can be steered"
-        time.sleep(0.01)
-    assert main(["pause", str(live.folder)]) == 0
+    changes = ("--slots", "60", "--set", 'event=[{ at = 3, cut = "legitimate" }]', "--set", "expect=[]")
+    live = evedrop.live(str(scenario), *changes, "--view", "web", "--paused")
+    live.held()
     assert main(["step", str(live.folder), "8"]) == 0
     assert main(["link", str(live.folder), "legitimate", "quality=0.5"]) == 0
     assert main(["resume", str(live.folder)]) == 0

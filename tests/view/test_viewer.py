@@ -322,7 +322,7 @@ def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
         assert data_of(viewer).startswith(f"http://127.0.0.1:{stand.port + 1}/")
         with urllib.request.urlopen(f"http://127.0.0.1:{stand.port}/") as page:
             assert page.status == 200
-        with pytest.raises(UsageError, match=f":{stand.port} cannot be had"):
+        with pytest.raises(UsageError, match=f":{stand.port} cannot be used"):
             Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
     finally:
         viewer.stop()

@@ -170,7 +170,7 @@ class Comfort(Application):
                 _DISCOMFORT,
                 "Discomfort that each believes (K h)",
                 tuple(PanelCurve(name, width=1.2) for name in loop.receivers),
-                beside=True,
+                with_beliefs=True,
             ),
         )
 

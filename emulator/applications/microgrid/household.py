@@ -83,7 +83,7 @@ class Household(Application):
                 f"{loop.disturbance_labels[loop.disturbance(house.load)]}, and what each would guess from its estimate",
                 (PanelCurve("truth", TRUTH, "steps", 1.4), *guesses),
                 (-0.1 * most, 1.15 * most),
-                beside=True,
+                with_beliefs=True,
             ),
         )
 

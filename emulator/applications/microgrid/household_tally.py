@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass
 from typing import Annotated, Any, Self, final
 
 import numpy as np
@@ -14,9 +15,10 @@ from pydantic import Field
 
 from evedrop.applications.microgrid import privacy
 from evedrop.applications.microgrid.energy import Meter, energy
-from evedrop.applications.microgrid.load_guess import HousePlaces, LoadGuess
-from evedrop.applications.microgrid.perfect import PerfectLoop
-from evedrop.model.process import Floats
+from evedrop.model.controllers import Assignment, Controller
+from evedrop.model.controllers.lqr import held
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process, product
 from evedrop.scenario.application import ApplicationTally, ControlledPlant
 from evedrop.scenario.table import Table
 
@@ -140,3 +142,79 @@ def _mean(values: Floats) -> float | None:
     """The mean over trials; None if a trial has no value."""
     mean = float(np.mean(values))
     return mean if np.isfinite(mean) else None
+
+
+@final
+class PerfectLoop:
+    """The other loop, slot by slot; slots come in order from 0.
+
+    controller: a new one, used by nothing else; period: slots between its decisions; disturbances: (slots, q).
+    """
+
+    def __init__(
+        self, process: Process, plant: Plant, controller: Controller, period: int, disturbances: Floats
+    ) -> None:
+        self._process = process
+        self._plant, self._controller, self._period = plant, controller, period
+        self._disturbances = disturbances
+        self._next = 0
+        self._e: Floats = np.zeros((process.n, controller.trials))
+        self._u: Floats = np.zeros((plant.inputs, controller.trials))
+
+    def follow(self, x: Floats, u: Floats) -> Floats:
+        """The other loop's inputs of the next slot, (m, R), within their limits; x (n, R) and u (m, R): those of this loop."""
+        if self._next % self._period == 0:
+            decided = self._controller.decide(self._next, x - self._e, self._disturbances[self._next])
+            self._u = self._plant.limited(decided)
+        apart = self._plant.moved(u) - self._plant.moved(self._u)
+        self._e = self._process.predict(self._e) + apart
+        self._next += 1
+        return self._u
+
+
+_BELIEVED = 0.9
+"""The share of a guess that the copy of the controller is told. A controller that compensates the load at once leaves no
+trace in the level, and a copy that is told all of a wrong guess would confirm that guess for ever."""
+
+
+@dataclass(frozen=True)
+class HousePlaces:
+    """The places of a house's quantities in its plant: indices of a state and of disturbances."""
+
+    battery: int
+    load: int
+    sun: int | None
+
+
+@final
+class LoadGuess:
+    """Guesses, one for each decision; decisions come in order from slot 0.
+
+    controller: a new copy of the house's; sun: known power in every slot, (slots,).
+    """
+
+    def __init__(self, assignment: Assignment, controller: Controller, house: HousePlaces, sun: Floats) -> None:
+        self._assignment, self._controller, self._house, self._sun = assignment, controller, house, sun
+        self._power, self._driven = held(assignment)
+        self._disturbed = held(assignment, assignment.plant.disturbance_matrix)[1]
+        self._u: Floats = np.zeros((assignment.plant.inputs, controller.trials))
+        self._level: Floats | None = None
+        """The level that would be reached without load, (R,)."""
+
+    def take(self, k: int, x_hat: Floats) -> Floats | None:
+        """Mean load in kW of the period that ends with slot k, (R,); None at slot 0. x_hat: estimate of the state, (n, R)."""
+        house, assignment = self._house, self._assignment
+        guess = None
+        d = np.zeros((assignment.plant.disturbance_matrix.shape[1], x_hat.shape[1]))
+        if self._level is not None:
+            guess = (x_hat[house.battery] - self._level) / self._disturbed[house.battery, house.load]
+            d[house.load] = _BELIEVED * np.maximum(guess, 0.0)
+        shone = self._sun[k : k + assignment.period]
+        if house.sun is not None and len(shone):
+            d[house.sun] = shone[0]
+        self._u = assignment.plant.limited(self._controller.decide(k, x_hat, d))
+        level = product(self._power, x_hat) + product(self._driven, self._u)
+        if house.sun is not None and len(shone):
+            level += self._disturbed[:, house.sun, None] * shone.mean()
+        self._level = level[house.battery]
+        return guess

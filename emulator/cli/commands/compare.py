@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from evedrop.cli.options import changes_of, entries, output, scenario
+from evedrop.cli.options import changes_of, entries, output, scenario, workers
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -64,11 +64,10 @@ def _compares(parser: argparse.ArgumentParser) -> None:
         metavar="SCHEME.PARAMETER=VALUE",
         help="a parameter of a scheme other than the scenario's own; repeatable",
     )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of worker processes; does not affect the results"
-    )
 
 
 COMMANDS = (
-    Command("compare", compare, "every scheme against every adversary", (scenario, entries, output, _compares)),
+    Command(
+        "compare", compare, "every scheme against every adversary", (scenario, entries, output, _compares, workers)
+    ),
 )

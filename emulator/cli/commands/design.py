@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from evedrop.cli.options import changes, changes_of, scenario
+from evedrop.cli.options import as_json, changes, changes_of, scenario
 from evedrop.command import Command
 
 
@@ -26,9 +26,10 @@ def _designs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-trace", type=float, metavar="Ω", help="find the least μ_d whose limiting trace stays below Ω"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 COMMANDS = (
-    Command("design", design, "admissible μ_d, secrecy, optimum, per eavesdropper", (scenario, changes, _designs)),
+    Command(
+        "design", design, "admissible μ_d, secrecy, optimum, per eavesdropper", (scenario, changes, _designs, as_json)
+    ),
 )

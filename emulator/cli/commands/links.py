@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from evedrop.cli.options import argument
+from evedrop.cli.options import argument, as_json
 from evedrop.command import Command
 
 
@@ -28,7 +28,6 @@ def _fits(parser: argparse.ArgumentParser) -> None:
         metavar="C",
         help="the column of delays in slots; default the column named delay, if there is one",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 COMMANDS = (
@@ -36,7 +35,7 @@ COMMANDS = (
         "fit",
         fit_link,
         "the loss model and delays of a recorded link",
-        (argument("trace", "TRACE"), _fits),
+        (argument("trace", "TRACE"), _fits, as_json),
         group="links",
     ),
 )

@@ -34,7 +34,7 @@ def brief(options: argparse.Namespace) -> int:
         raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
     scenario = loaded(options)
     places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
-    for path in write_briefs(scenario, places, options.results, options.out, options.wait):
+    for path in write_briefs(scenario, places, options.results, options.out, options.wait, paused=options.paused):
         print(path)
     return 0
 
@@ -68,10 +68,9 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: AnyBrief, serve: str | None) -> int:
     """Run the process of a brief; returns its exit status. serve: where an observer shows the run to browsers."""
-    from evedrop.errors import NotRegistered
     from evedrop.live.protocol.brief import has_part
     from evedrop.live.protocol.brief_parts import ObserverPart
-    from evedrop.live.protocol.brief_use import expect_usable
+    from evedrop.live.protocol.brief_use import classes_known, expect_usable
 
     if brief.identity is not None:
         from evedrop.live.network.certificates import check_identity
@@ -83,10 +82,8 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _observe(brief, serve)
     expect_usable(brief)
-    try:
+    with classes_known():
         _take_part(brief)
-    except NotRegistered as error:
-        raise BriefError(f"it names {error.name}{error.why or ', which is not a class here'}") from error
     return 0
 
 
@@ -125,6 +122,7 @@ def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
     from pydantic import ValidationError
 
     from evedrop.live.observer.observer import observe
+    from evedrop.live.protocol.brief import WRITE_AGAIN
     from evedrop.scenario import Scenario
     from evedrop.scenario.sentences import sentences
 
@@ -132,7 +130,7 @@ def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
         return observe(brief, _report, serve)
     except ValidationError as error:
         lines = "; ".join(sentences(error, Scenario)[:_MOST_TOLD])
-        raise BriefError(f"part.scenario has mistakes: {lines}; write it again with `evedrop brief`") from error
+        raise BriefError(f"part.scenario has mistakes: {lines}; {WRITE_AGAIN}") from error
 
 
 def _report(folder: Path, status: int, how: str) -> None:
@@ -186,6 +184,9 @@ def _briefs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
+    )
+    parser.add_argument(
+        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
     )
 
 

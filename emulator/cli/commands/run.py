@@ -13,6 +13,7 @@ from evedrop.command import Command
 from evedrop.errors import Interrupted, RunError
 
 if TYPE_CHECKING:
+    from evedrop.live.launch.process_set import Ended
     from evedrop.view.viewer import Viewer
 
 
@@ -24,6 +25,16 @@ def demo(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
+    from evedrop.live.launch.preloading import preloaded
+
+    with preloaded():  # the servers make their imports while the scenario is read
+        ended = _run(options)
+    if ended.viewer is not None:
+        _keep_open(ended.viewer)
+    return ended.status
+
+
+def _run(options: argparse.Namespace) -> Ended:
     from evedrop.cli.report import ProgressLine
     from evedrop.live.launch.launcher import launch
     from evedrop.results.folder import results_folder
@@ -32,15 +43,15 @@ def run(options: argparse.Namespace) -> int:
     with results_folder(options.out, options.scenario) as folder:
         with ProgressLine(scenario.slots, "slots", options.json) as line:
             try:
-                ended = launch(scenario, folder, options.view, options.listen, line.tell, options.relay)
+                ended = launch(
+                    scenario, folder, options.view, options.listen, line.tell, options.relay, paused=options.paused
+                )
             except (RunError, Interrupted):
                 with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
                     print_so_far(line.moved or folder, options.json)
                 raise
         print_so_far(ended.folder, options.json)
-    if ended.viewer is not None:
-        _keep_open(ended.viewer)
-    return ended.status
+    return ended
 
 
 def _keep_open(viewer: Viewer) -> None:
@@ -59,6 +70,9 @@ def _live(parser: argparse.ArgumentParser) -> None:
         "--listen", metavar="ENDPOINT", help="the router's endpoint: tcp/127.0.0.1:PORT or tls/127.0.0.1:PORT"
     )
     parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
+    parser.add_argument(
+        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
+    )
 
 
 _LIVE = (entries, output, _live)

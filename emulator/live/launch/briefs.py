@@ -10,8 +10,7 @@ from typing import Any
 
 from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.closed_loop_briefs import LoopBriefs
-from evedrop.live.launch.ports import RouterEndpoints, places_at
-from evedrop.live.launch.routers import Routers, identities_of
+from evedrop.live.launch.ports import RouterEndpoints, Routers, identities_of, places_at
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model
 from evedrop.live.protocol.brief_parts import (
     EavesdropperPart,
@@ -35,13 +34,13 @@ from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.acknowledging import chart_of, way_back_of
 
 _WINDOW_BYTES = 64 * 2**20
-_MOST_SLOTS_AHEAD = 1024
+_MOST_SLOTS_AHEAD = 4096
 _REPORT_SECONDS = 0.04
 _LAUNCHED_PATIENCE = 30  # seconds
 
 
 def flow_of(scenario: Scenario) -> Flow:
-    """The flow control: a window of at most 1024 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms."""
+    """The flow control: a window of at most 4096 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms."""
     receivers = len(scenario.receivers)
     slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
     window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
@@ -88,6 +87,8 @@ class ObserverTask:
     recording: bool
     shard: bool = False
     """Whether the run is a shard of a larger one: its score will be merged, and it cannot be steered."""
+    paused: bool = False
+    """Whether the run is held before slot 0, until the operator lets it go on."""
 
 
 def briefs_of(
@@ -146,12 +147,12 @@ def briefs_of(
             identity=identities.get(process),
         )
 
-    courses = {name: scenario.course(name) for name in scenario.receivers}
-    link_keys = keys.links(courses)
+    schedules = {name: scenario.schedule(name) for name in scenario.receivers}
+    link_keys = keys.links(schedules)
     if back is not None:
         link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.way_back
     router = RouterPart(
-        links={name: LinkEntry.of(course) for name, course in courses.items()},
+        links={name: LinkEntry.of(schedule) for name, schedule in schedules.items()},
         pace=scenario.pace,
         users=routers.at_router,
         leaks=leaks,
@@ -170,7 +171,9 @@ def briefs_of(
         scheme=spec,
         pace=scenario.pace,
         receivers=scenario.receivers,
-        holds=sorted(slot for slot in scenario.timeline.holds if slot < scenario.slots),
+        holds=sorted(
+            {slot for slot in scenario.timeline.holds if slot < scenario.slots} | ({0} if observation.paused else set())
+        ),
         history=history_of(scenario),
         leaks=leaks,
         chart=chart,
@@ -193,6 +196,7 @@ def briefs_of(
         recording=observation.recording,
         operator=users[OPERATOR],
         shard=observation.shard,
+        paused=observation.paused,
         operator_identity=identities.get(OPERATOR),
         classes=_answers(scenario),
     )
@@ -234,18 +238,23 @@ def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:
     return [(one.start, one.stop, one.keeps_state) for one in scenario.timeline.outages[receiver]]
 
 
-def write_briefs(scenario: Scenario, places: RouterEndpoints, results: Path, folder: Path, patience: int) -> list[Path]:
+def write_briefs(
+    scenario: Scenario, places: RouterEndpoints, results: Path, folder: Path, patience: int, *, paused: bool = False
+) -> list[Path]:
     """Write the briefs into a folder, for processes that are started by hand, on any hosts.
 
     results: the observer's folder, on its host, relative to its working directory. patience: how many seconds processes
-    wait for each other. Raises UsageError if the folder is not empty or cannot be written, and for a scenario in shards.
+    wait for each other. paused: as in `ObserverTask`. Raises UsageError if the folder is not empty or cannot be
+    written, and for a scenario in shards.
     """
     if scenario.shards > 1:
         raise UsageError(
             f"shards = {scenario.shards}: briefs belong to one run; give --set shards=1, or write the briefs of each shard "
             "separately, with its own --first-trial and --trials"
         )
-    made = briefs_of(scenario, places, ObserverTask(results, True), ends_with_stdin=False, patience=patience)
+    made = briefs_of(
+        scenario, places, ObserverTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
+    )
     try:
         new_folder(folder)
         return [brief.write(folder) for brief in made.values()]

@@ -13,7 +13,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import final
 
-from evedrop.environment import lock_step_environment, own_environment
+from evedrop.environment import SINGLE_THREADED, lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.starter import StartedProcess, Starter, start_process
@@ -23,8 +23,7 @@ from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.news import News, RunEnded, Started, Tell
-from evedrop.results.folder import private_opener
-from evedrop.results.held_folder import HeldFolder
+from evedrop.results.folder import HeldFolder, private_opener
 from evedrop.signals import SHOW_STACKS, held_back
 
 GRACE_SECONDS = 3.0  # for all processes to leave
@@ -124,9 +123,7 @@ class Children:
         environment = {
             **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-            "PYTHONUNBUFFERED": "1",
+            **SINGLE_THREADED,
         }
         if isinstance(brief.part, RoutingPart):
             environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
@@ -274,7 +271,7 @@ class Children:
             words = reversed(self._log(first.process))
             why = next((line for line in words if line.startswith(_COMPLAINT)), "")
         elif suspects:
-            named, head = suspects, f"{', '.join(suspects)} gave no sign of life any more: hung, stopped or cut off"
+            named, head = suspects, f"{', '.join(suspects)} stopped responding: hung, suspended or cut off"
         else:
             named, head = [], f"the run failed: {why}"
         at_fault = _sender(why)

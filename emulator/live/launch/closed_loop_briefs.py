@@ -18,7 +18,7 @@ from evedrop.live.protocol.brief_closed_loop import (
 )
 from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.scenario import Scenario
-from evedrop.scenario.disturbances import disturbances_of
+from evedrop.scenario.input_files import disturbances_of
 
 if TYPE_CHECKING:
     from evedrop.scenario.stream_keys import StreamKeys

@@ -89,14 +89,14 @@ def _digest(scenario: Scenario, name: str, shards: Sequence[Shard], writer: Resu
                 writer.digest_rows(shard.trials.start, {name: {block: own[block]}})
     digest = RunDigest()
     for own in blocks:
-        if sorted(own) != block_starts(scenario.slots, scenario.cuts(name)):
+        if sorted(own) != block_starts(scenario.slots, scenario.outage_bounds(name)):
             return None
         digest.add(own)
     return digest.hexadecimal
 
 
 def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
-    """First slot of a block → digests of the shard's trials, (R, 32), of one peer."""
+    """First slot of a block → digests of the shard's trials, (R, 16), of one peer."""
     batches = parquet_or_stream(shard.folder, "digests")
     table = pa.Table.from_batches(batches, DIGESTS).filter(pc.field("peer") == name)
     starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())

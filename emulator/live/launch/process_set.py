@@ -19,20 +19,17 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
 from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
+from evedrop.live.launch.starter import Starter
 from evedrop.live.network.control_file import remove_control
 from evedrop.names import OBSERVER
 from evedrop.news import FolderMoved, RunEnded, Tell, ViewOpened
-from evedrop.results.folder import make_private, new_folder
-from evedrop.results.held_folder import HeldFolder
+from evedrop.results.folder import HeldFolder, make_private, new_folder
 from evedrop.scenario import Scenario
+from evedrop.signals import AFTERTHOUGHT_SECONDS
 from evedrop.view.viewer import Viewer
 
-_INTERRUPTED = "interrupted; the results so far are in the results folder"
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
-_AFTERTHOUGHT_SECONDS = (
-    0.5  # a signal that ended a child may be about to reach the launcher: a closing terminal hangs up on all
-)
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,10 @@ def launch_one(
     places: RouterEndpoints,
     tell: Tell,
     stop: threading.Event,
+    starter: Starter,
+    *,
     shard: bool = False,
+    paused: bool = False,
 ) -> Ended:
     """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
 
@@ -64,9 +64,9 @@ def launch_one(
         make_private(folder / "logs")
         viewer = None
         try:
-            briefs = briefs_of(scenario, places, ObserverTask(folder.absolute(), view != "off", shard))
+            briefs = briefs_of(scenario, places, ObserverTask(folder.absolute(), view != "off", shard, paused))
             observer = briefs.pop(OBSERVER)
-            with Children(held, private, scenario.controller is not None) as children:
+            with Children(held, private, scenario.controller is not None, starter) as children:
                 for brief in briefs.values():
                     children.start(brief)
                 # The other processes start up at the same time as the viewer.
@@ -174,7 +174,7 @@ def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
         if ending is not None:
             break
     if ending.status == Interrupted.exit_status:
-        raise Interrupted(_INTERRUPTED)
+        raise Interrupted
     if not ending.well:
         raise RunError(children.failure_report(None, ending))
     children.wait_all()
@@ -185,10 +185,10 @@ def _stopped(children: Children, tell: Tell) -> RunEnded:
     """End the run after a signal; returns its end if it was complete before. Raises Interrupted otherwise."""
     ending = children.conclude(tell)
     if ending is None or not ending.well:
-        raise Interrupted(_INTERRUPTED)
+        raise Interrupted
     return ending
 
 
 def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
     """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
-    return ended.status == INTERRUPTED and stop.wait(_AFTERTHOUGHT_SECONDS)
+    return ended.status == INTERRUPTED and stop.wait(AFTERTHOUGHT_SECONDS)

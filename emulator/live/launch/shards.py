@@ -20,9 +20,9 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.ports import RouterEndpoints, loopback_places
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
+from evedrop.live.launch.starter import Starter
 from evedrop.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started, Tell
-from evedrop.results.folder import new_folder
-from evedrop.results.held_folder import HeldFolder
+from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.scenario import Scenario
 from evedrop.view.viewer import Viewer
 
@@ -91,10 +91,18 @@ class _Course:
     """In order of time."""
     viewer: Viewer | None = None
 
-    def launched(self, shard: Shard, at: RouterEndpoints, tell: Tell, view: str, stop: threading.Event) -> None:
+    def launched(
+        self,
+        shard: Shard,
+        at: RouterEndpoints,
+        tell: Tell,
+        view: str,
+        stop: threading.Event,
+        starter: Starter,
+    ) -> None:
         """Run one shard to its end, its routers at these endpoints; if it ends early, all shards end."""
         try:
-            ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, shard=True)
+            ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, starter, shard=True)
         except BaseException as error:
             self.failures.append((shard, error))
             stop.set()
@@ -114,6 +122,7 @@ def launch_shards(
     view: str,
     tell: Tell,
     stop: threading.Event,
+    starter: Starter,
 ) -> Ended:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
 
@@ -124,11 +133,11 @@ def launch_shards(
     shards = shards_of(scenario, folder)
     progress, course = OneProgress(shards, tell), _Course()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, places, strict=True)]
-    threads = [threading.Thread(target=course.launched, args=(*one, "off", stop)) for one in others]
+    threads = [threading.Thread(target=course.launched, args=(*one, "off", stop, starter)) for one in others]
     for thread in threads:
         thread.start()
     # On this thread, not on another one: a viewer ends with the thread that started it.
-    course.launched(*first, view, stop)
+    course.launched(*first, view, stop, starter)
     for thread in threads:
         thread.join()
     try:

@@ -2,7 +2,13 @@
 
 Readers name every key they read: exact rules do not cover a wildcard subscription, so it receives nothing.
 
-Source: docs/protocol.md, keys.
+With two linked routers, the table also says which process connects to which, and which keys cross between them:
+
+    sensor ── router ═════ relay ── receivers, observer, operator
+
+The router, at the sensor's site, decides every fate; the relay, at the receivers' site, only passes messages on.
+
+Source: docs/protocol.md, keys and two routers.
 """
 
 from __future__ import annotations
@@ -11,8 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from evedrop.live.protocol.brief_closed_loop import Wiring
-from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.zenoh_config import ZenohConfig
+from evedrop.live.protocol.keys import RunKeys, ZenohConfig
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
 
 
@@ -148,3 +153,50 @@ def _rules(grant: Grant) -> Iterator[ZenohConfig]:
                 "messages": [message],
                 "key_exprs": list(keys),
             }
+
+
+_NEAR = frozenset({SENSOR, ROUTER})
+
+
+def at_router(run: str, table: list[Grant]) -> list[Grant]:
+    """The grants at the router, when there is a relay: processes of its own site, and the relay on behalf of all others."""
+    to_router, from_router = _crossing(table)
+    near, far = _sites(table)
+    relay = Grant(
+        RELAY, to_router, from_router, None, (RunKeys(run).alive(ROUTER), *_tokens(near)), further_tokens=_tokens(far)
+    )
+    return [*near, relay]
+
+
+def at_relay(run: str, table: list[Grant], zid: str) -> list[Grant]:
+    """The grants at the relay: processes of its own site, and the router, known by its Zenoh id, for all others."""
+    to_router, from_router = _crossing(table)
+    near, far = _sites(table)
+    token = RunKeys(run).alive(ROUTER)
+    router = Grant(ROUTER, from_router, to_router, token, _tokens(far), further_tokens=_tokens(near), zid=zid)
+    return [*far, router]
+
+
+def _sites(table: list[Grant]) -> tuple[list[Grant], list[Grant]]:
+    return [one for one in table if one.process in _NEAR], [one for one in table if one.process not in _NEAR]
+
+
+def _tokens(site: list[Grant]) -> tuple[str, ...]:
+    return tuple(grant.token for grant in site if grant.token is not None)
+
+
+def _crossing(table: list[Grant]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The keys of messages that go to the router's site, and of those that come from it."""
+    keys = dict.fromkeys(key for grant in table for key in (*grant.writes, *grant.reads))
+    to_router, from_router = [], []
+    for key in keys:
+        # The router writes the keys that no process in the table writes; it reads those that none reads, except the
+        # relay's control key.
+        writers = {one.process for one in table if key in one.writes} or {ROUTER}
+        other = RELAY if key.endswith(f"/control/{RELAY}") else ROUTER
+        readers = {one.process for one in table if key in one.reads} or {other}
+        if writers - _NEAR and readers & _NEAR:
+            to_router.append(key)
+        if writers & _NEAR and readers - _NEAR:
+            from_router.append(key)
+    return tuple(to_router), tuple(from_router)

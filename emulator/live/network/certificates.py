@@ -15,7 +15,7 @@ from cryptography.x509.oid import NameOID
 
 from evedrop.errors import BriefError
 from evedrop.live.protocol.brief_parts import Identity
-from evedrop.live.protocol.zenoh_config import ZenohConfig
+from evedrop.live.protocol.keys import ZenohConfig
 
 _AGAIN = "write the briefs again with `evedrop brief`, all of them"
 

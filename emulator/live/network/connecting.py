@@ -20,7 +20,7 @@ from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief_parts import Identity
-from evedrop.live.protocol.zenoh_config import ZenohConfig
+from evedrop.live.protocol.keys import ZenohConfig
 
 _WAITING_SECONDS = 3.0  # how often a process says that it still waits for its router
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
@@ -169,7 +169,9 @@ class Failures:
         self._unknown = (self._unknown or now) if unknown else None
         # A listener that hangs up refuses us; one that is slow, or not there, may still answer. Under TLS a connection that ends
         # before there is a certificate was ended by something in between, such as a proxy whose router is down.
-        cut = isinstance(error, ssl.SSLEOFError | ConnectionResetError | BrokenPipeError)
+        # Such an end during the handshake is one error of TLS in some versions of Python, and another in others.
+        ends = ssl.SSLEOFError | ssl.SSLZeroReturnError | ConnectionResetError | BrokenPipeError
+        cut = isinstance(error, ends)
         hung_up = isinstance(error, zenoh.ZError | ssl.SSLError) if not cut else not self._secure
         if hung_up and seconds < _QUICK_SECONDS:
             self._refused, self._refusals = self._refused or now, self._refusals + 1

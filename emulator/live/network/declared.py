@@ -56,6 +56,24 @@ class Inbox:
         self._place.waits = ()
         return payload
 
+    def take(self, most: int) -> list[bytes]:
+        """Wait for the next message; then it, and those that have arrived after it, up to `most` in all.
+
+        Raises InboxClosedError as `recv` does.
+        """
+        found = [self.recv()]
+        while len(found) < most and self._subscriber is not None:
+            try:
+                sample = self._subscriber.try_recv()
+            except zenoh.ZError:  # as for `recv`, which goes on with the next session
+                break
+            if sample is None:
+                break
+            payload = self._dropped.contents(self._key, self._head, sample.payload.to_bytes())
+            if payload is not None:
+                found.append(payload)
+        return found
+
     def _received(self) -> bytes:
         while True:
             if self._subscriber is None:

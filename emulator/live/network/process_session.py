@@ -18,6 +18,9 @@ class Received(Protocol):
     def recv(self) -> bytes:
         """Wait for the next message."""
 
+    def take(self, most: int) -> list[bytes]:
+        """Wait for the next message; then it, and those that have arrived after it, up to `most` in all."""
+
     def __iter__(self) -> Iterator[bytes]: ...
 
 

@@ -5,15 +5,14 @@ Source: docs/protocol.md, two routers.
 
 from __future__ import annotations
 
-from evedrop.live.network.access import access_control, grants
+from evedrop.live.network.access import access_control, at_relay, grants
 from evedrop.live.network.connecting import connected
-from evedrop.live.network.linked_routers import at_relay
 from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import ATTEMPT, Session, client_config, door_of, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
 from evedrop.live.protocol.commands import End
-from evedrop.live.protocol.zenoh_config import ZenohConfig
+from evedrop.live.protocol.keys import ZenohConfig
 
 
 def relay(brief: Brief[RelayPart]) -> None:

@@ -12,13 +12,15 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.kernels.current import kernels
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.closed_loop import Decisions
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.telemetry import Report, Truth
-from evedrop.model.digest import BeliefLog, Digests, InputLog
+from evedrop.model.digest import BlockDigests, Blocks, Digests, InputLog
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Belief, Flags, trace_of
+from evedrop.model.receiver import Beliefs, Flags
+from evedrop.model.slot.sensor import Sent
 
 
 def is_due(brief: AnyBrief, k: int) -> bool:
@@ -55,31 +57,28 @@ class TruthReporter:
 
     def add(
         self,
-        k: int,
-        x: Floats,
-        nu: Flags,
-        sent: Flags | None = None,
+        slots: range,
+        made: Sent,
         alarms: Flags | None = None,
         steered: tuple[Floats, Flags] | None = None,
-        true: Floats | None = None,
     ) -> None:
-        """Add slot k, and report if a report is due.
+        """Add consecutive slots, which do not cross the end of a report; report if one is due with the last of them.
 
-        steered: its inputs (m, R), and the trials in which the decision failed, (R,); true: its true state, (n, R), if x
-        is a filter's.
+        alarms (c, R); steered: the inputs (c, m, R), and the trials in which the decision failed, (c, R).
         """
-        row = k % self._brief.flow.batch
-        self._x[row] = x
-        self._nu[row] = nu
-        for column, values in ((self._sent, sent), (self._alarms, alarms)):
+        row = slots.start % self._brief.flow.batch
+        rows = slice(row, row + len(slots))
+        self._x[rows] = made.x
+        self._nu[rows] = made.packets.nu
+        for column, values in ((self._sent, made.packets.sent), (self._alarms, alarms)):
             if column is not None:
-                column[row] = values
+                column[rows] = values
         if steered is not None and self._u is not None and self._failed is not None:
-            self._u[row], self._failed[row] = steered
-        if true is not None and self._true is not None:
-            self._true[row] = true
-        if is_due(self._brief, k):
-            self.flush(k + 1)
+            self._u[rows], self._failed[rows] = steered
+        if self._true is not None:
+            self._true[rows] = made.true
+        if is_due(self._brief, slots[-1]):
+            self.flush(slots.stop)
 
     def flush(self, end: int) -> None:
         """Report all slots below `end` that are not reported yet."""
@@ -137,47 +136,69 @@ class BeliefReporter:
         self._brief = brief
         self._put = put
         self._put_progress = put_progress
-        self._log = BeliefLog(len(brief.model.A), brief.trials, brief.slots, cuts, first)
-        self._late = np.zeros((2, brief.flow.batch, brief.trials), np.uint16) if counts_late else None
+        self._blocks = Blocks(brief.slots, cuts)
+        self._log = BlockDigests(brief.trials, brief.slots, cuts)
+        self._digests: dict[int, Digests] = {}
+        n, batch = len(brief.model.A), brief.flow.batch
+        self._beliefs = Beliefs(
+            np.empty((batch, n, brief.trials)),
+            np.empty((batch, n, n, brief.recorded)),
+            np.empty((batch, brief.trials), np.uint8),
+        )
+        self._trace = np.empty((batch, 2))
+        self._late = np.zeros((2, batch, brief.trials), np.uint16) if counts_late else None
         self._first = first
 
-    def add(self, k: int, belief: Belief, late: tuple[NDArray[np.uint16], NDArray[np.uint16]] | None = None) -> None:
-        """Add slot k, and report if a report is due: also at the end of a digest's block, where the log starts over.
+    def add(self, slots: range, beliefs: Beliefs, late: NDArray[np.uint16] | None = None) -> None:
+        """Add consecutive slots, and report where a report is due.
 
-        late: how many late packets arrived and how many were used in each trial, (R,) each.
+        late: how many late packets arrived and how many were used, (2, c, R).
         """
+        k, batch = slots.start, self._brief.flow.batch
+        while k < slots.stop:
+            end = min(slots.stop, self._blocks.end(k), k - k % batch + batch)
+            rows = slice(k - slots.start, end - slots.start)
+            self._keep(range(k, end), beliefs.rows(rows), None if late is None else late[:, rows])
+            if is_due(self._brief, end - 1):
+                self.flush(end)
+            k = end
+
+    def _keep(self, slots: range, beliefs: Beliefs, late: NDArray[np.uint16] | None) -> None:
+        """Keep slots that are all in one report and one block of the digest."""
+        row = slots.start % self._brief.flow.batch
+        rows = slice(row, row + len(slots))
+        self._beliefs.x_hat[rows], self._beliefs.action[rows] = beliefs.x_hat, beliefs.action
+        self._beliefs.P[rows] = beliefs.P[..., : self._brief.recorded]
+        trace = kernels.traces(beliefs.P)
+        self._trace[rows, 0], self._trace[rows, 1] = trace.sum(axis=1), (trace * trace).sum(axis=1)
         if self._late is not None:
-            self._late[:, k % self._brief.flow.batch] = 0 if late is None else late
-        digests = self._log.add(k, belief)
-        if digests is not None or is_due(self._brief, k):
-            self._report(k + 1, {} if digests is None else dict([digests]))
-        if is_due(self._brief, k):
-            self._put_progress(k, progress(k + 1))
+            self._late[:, rows] = 0 if late is None else late
+        self._digests.update(self._log.add(slots, beliefs))
 
     def flush(self, end: int) -> None:
         """Report all slots below `end`, and the progress to there."""
-        self._report(end, {})
+        self._report(end)
         self._put_progress(end - 1, progress(end))
 
     def skip(self, end: int) -> None:
         """Go on from slot `end`: the observer reports the slots before it, in which this receiver was absent."""
         self._first = end
 
-    def _report(self, end: int, digests: dict[int, Digests]) -> None:
+    def _report(self, end: int) -> None:
         if end == self._first:
             return
-        log = self._log.rows(self._first, end)
-        trace = trace_of(log.P.transpose(1, 2, 0, 3))
         row = self._first % self._brief.flow.batch
+        rows = slice(row, row + end - self._first)
+        late = None if self._late is None else self._late[:, rows]
         report = Report(
             self._first,
-            log.x_hat,
-            log.action,
-            np.ascontiguousarray(log.P[..., : self._brief.recorded]),
-            np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
-            None if self._late is None else self._late[0, row : row + end - self._first],
-            digests,
-            None if self._late is None else self._late[1, row : row + end - self._first],
+            self._beliefs.x_hat[rows],
+            self._beliefs.action[rows],
+            self._beliefs.P[rows],
+            self._trace[rows],
+            None if late is None else late[0],
+            self._digests,
+            None if late is None else late[1],
         )
         self._put(end - 1, report.pack())
-        self._first = end
+        self._first, self._digests = end, {}

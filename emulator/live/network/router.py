@@ -11,7 +11,7 @@ packets are sent again, the router routes them again, with the same fates, as a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import final
@@ -19,9 +19,10 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import NotRegistered
-from evedrop.live.network.access import access_control, grants
+from evedrop.kernels.current import kernels
+from evedrop.live.network.access import access_control, at_router, grants
 from evedrop.live.network.delayed_sender import DelayedSender
-from evedrop.live.network.linked_routers import at_router
+from evedrop.live.network.pending import Pending, most_slots
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.router_commands import Commands, ReplayRequested
@@ -32,8 +33,9 @@ from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.brief_parts import RouterPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Go, LinkChange
+from evedrop.live.protocol.keys import ZenohConfig
+from evedrop.live.protocol.packet_blocks import Uplinked, read_uplinks
 from evedrop.live.protocol.packets import (
-    PacketExtras,
     acknowledgement,
     barrier,
     delivery,
@@ -41,19 +43,16 @@ from evedrop.live.protocol.packets import (
     is_resend,
     packed_header,
     read_acknowledgement,
-    read_beside,
     read_resend,
-    read_uplink,
 )
 from evedrop.live.protocol.telemetry import Journal
-from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.model.acknowledgements import AckChannel, WayBackSpec
 from evedrop.model.flag_bits import packed_flags
-from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
-from evedrop.model.slot.link import Change, Fates, Link, LinkSchedule, streams_of
-from evedrop.model.slot.transit import Late, Transit
+from evedrop.model.slot.link import Change, LinkSchedule, streams_of
+from evedrop.model.slot.link_core import LinkCore
+from evedrop.model.slot.transit import Late
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
 
 
@@ -62,100 +61,89 @@ class Downlink:
     """One receiver's link, whose fates are decided a batch of slots ahead, and its outlet."""
 
     def __init__(
-        self, name: str, course: LinkSchedule, brief: Brief[RouterPart], put: Callable[[bytes, float], None]
+        self, name: str, schedule: LinkSchedule, brief: Brief[RouterPart], put: Callable[[bytes, float], None]
     ) -> None:
-        self._course = course
-        keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, self._course)}
-        self._link = Link(self._course, name, keys, brief.batch)
-        self._accountant = Accountant(self._course.window, brief.trials)
-        self._transit = Transit()
+        keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
+        self._core = LinkCore(schedule, name, keys, brief.batch)
+        self._schedule = schedule
+        self._accountant = Accountant(schedule.window, brief.trials)
         self._put = put
         self._pace = brief.part.pace
         self._rests: dict[int, float] = {}
         """Slot → the fraction of a slot that the first trial's packet takes in addition, for packets that may still arrive."""
         self._leak = brief.part.leaks.get(name)
-        self._slots = range(0)
-        self._fates: Fates
-        self._own = False
         self._masks: list[bytes]
         self._received: list[int]
 
     def plan(self, slots: range) -> None:
         """Decide the fates of the next batch of slots."""
-        self._take(slots, self._link.planned(slots))
+        self._core.plan(slots)
+        self._masks, self._received = self._described(slots)
 
     def amend(self, at: int, changes: Iterable[Change]) -> None:
         """Decide the slots of the batch from `at` on again, with these changes; none of them may have been journaled."""
-        self._take(range(at, self._slots.stop), self._link.amended(at, changes))
+        self._core.amend(at, changes)
+        self._masks, self._received = self._described(self._core.slots)
 
-    def _take(self, slots: range, fates: Fates) -> None:
-        self._slots, self._fates, self._in_time, self._own = slots, fates, fates.in_time, False
-        self._masks = [mask.tobytes() for mask in packed_flags(self._in_time)]
-        self._received = np.count_nonzero(self._in_time, axis=1).tolist()
+    def _described(self, slots: range) -> tuple[list[bytes], list[int]]:
+        """For each slot, the mask of the trials that receive in time, and how many they are."""
+        in_time = self._core.in_time[self._core.rows(slots)]
+        return [mask.tobytes() for mask in packed_flags(in_time)], np.count_nonzero(in_time, axis=1).tolist()
 
     def account(self, slots: range) -> Account:
         """The fates of the packets of the next slots, which belong to the current batch."""
-        rows = slice(slots.start - self._slots.start, slots.stop - self._slots.start)
-        return self._accountant.account(slots, self._fates.part(rows))
+        return self._accountant.account(slots, self._core.part(slots))
 
     def present(self, k: int) -> bool:
         """Whether the receiver is present in slot k."""
-        return not any(away.start <= k < away.stop for away in self._course.outages)
+        return self._core.present(k)
 
     def gamma(self, k: int) -> Flags:
         """γ of slot k, which belongs to the current batch and was delivered, (R,)."""
-        in_time: Flags = self._in_time[k - self._slots.start]
-        return in_time
+        return self._core.gamma(k)
 
-    def _silence(self, row: int, sent: Flags) -> None:
-        """Remove the packets that were not sent from the account."""
-        if not self._own:
-            self._fates, self._own = self._fates.copied(), True
-        self._fates.silence(row, sent)
-        self._in_time[row] &= sent
-        self._masks[row] = packed_flags(self._in_time[row]).tobytes()
-        self._received[row] = int(np.count_nonzero(self._in_time[row]))
+    def deliver(self, slots: range, packets: Uplinked, known: bool = False) -> None:
+        """Send the deliveries of consecutive slots of the batch: the packets that arrive in each.
 
-    def deliver(self, k: int, z: Floats, whole: bytes, beside: PacketExtras, known: bool = False) -> None:
-        """Send slot k's delivery: the packets of z (n, R) that arrive in the slot.
-
-        whole: z as bytes, for a slot in which all packets arrive.
-        known: the receiver has the delivery; only update the packets under way.
+        known: the receiver has these deliveries; only update the packets under way.
         """
-        row = k - self._slots.start
-        if beside.sent is not None:
-            self._silence(row, beside.sent)
-        late: tuple[Late, ...] = ()
-        if self._fates.delays is not None or self._fates.again is not None or self._transit.busy:
-            late = self._transit.arrival(k, self._fates, row, z, beside.header).late
-        if known or not self.present(k):
+        core = self._core
+        if packets.sent is not None:
+            core.silence(slots, packets.sent)
+            rows = core.rows(slots)
+            self._masks[rows], self._received[rows] = self._described(slots)
+        arrivals = core.arrivals(slots, packets.z, packets.header)
+        if known:
             return
-        received = self._received[row]
-        payload = (
-            whole
-            if received == z.shape[1]
-            else np.compress(self._in_time[row], z, axis=1).tobytes()
-            if received
-            else b""
-        )
-        header = packed_header(beside.header, self._in_time[row]) if beside.header is not None else b""
-        truth = beside.truth.tobytes() if beside.truth is not None and k == self._leak else b""
-        self._put(delivery(k, self._masks[row], payload, late, header, truth), self._rest(k, row, late) * self._pace)
+        first, trials = core.rows(slots).start, packets.z.shape[2]
+        late, rests, put = arrivals.late, bool(self._rests) or core.fates.rests is not None, self._put
+        for row, k in enumerate(slots):
+            if self._schedule.outages and not core.present(k):
+                continue
+            received, z = self._received[first + row], b""
+            if received == trials:
+                z = packets.whole[row]
+            elif received:
+                z = kernels.gather(arrivals.gamma[row], packets.z[row]).tobytes()
+            header = b"" if packets.header is None else packed_header(packets.header[row], arrivals.gamma[row])
+            truth = packets.truth[row].tobytes() if k == self._leak and row in packets.truth else b""
+            arrived = late.get(row, ()) if late else ()
+            message = delivery(k, self._masks[first + row], z, arrived, header, truth)
+            put(message, self._rest(k, arrivals.gamma[row], arrived) if rests else 0.0)
 
-    def _rest(self, k: int, row: int, late: tuple[Late, ...]) -> float:
-        """The fraction of a slot by which to delay slot k's delivery: the longest among the first trial's packets in it."""
-        if self._fates.rests is not None:
-            self._rests[k] = float(self._fates.rests[row])
-        if not self._rests:
-            return 0.0
-        arrived = [one.k for one in late if one.heard.gamma[0]] + [k] * bool(self._in_time[row, 0])
-        rest = max((self._rests.get(slot, 0.0) for slot in arrived), default=0.0)
-        self._rests.pop(k - self._course.window, None)
-        return rest
+    def _rest(self, k: int, gamma: Flags, late: tuple[Late, ...]) -> float:
+        """The seconds by which to delay slot k's delivery: the longest rest among the first trial's packets in it."""
+        rest = self._core.rest(k)
+        if rest is not None:
+            self._rests[k] = rest
+        arrived = [one.k for one in late if one.heard.gamma[0]] + [k] * bool(gamma[0])
+        longest = max((self._rests.get(slot, 0.0) for slot in arrived), default=0.0)
+        self._rests.pop(k - self._schedule.window, None)
+        return longest * self._pace
 
     def mark(self, k: int) -> None:
         """Pass a barrier on, if the receiver is present."""
-        if not any(away.start < k <= away.stop for away in self._course.outages):
+        if not any(away.start < k <= away.stop for away in self._schedule.outages):
             self._put(barrier(k), 0.0)
 
 
@@ -240,30 +228,30 @@ class Routing:
     def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
-        self._uplink = session.inbox(session.keys.uplink)
+        self._uplink = Pending(session.inbox(session.keys.uplink), session.keys.uplink, most_slots(brief))
         self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
         postman = DelayedSender() if brief.part.pace else None
         self._bursts: list[Burst] = []
 
-        def outlet(name: str, course: LinkSchedule) -> Callable[[bytes, float], None]:
+        def outlet(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
             wiring = brief.part.controller
             if postman is None and wiring is not None and not self._is_waited_for(name, wiring):
                 self._bursts.append(Burst(put))
                 return self._bursts[-1].hold
-            delays = any("delay" in (one or {}) for one in (course.settings, *(c.settings for c in course.changes)))
+            delays = any("delay" in (one or {}) for one in (schedule.settings, *(c.settings for c in schedule.changes)))
             return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
 
-        self._courses = {name: entry.schedule for name, entry in brief.part.links.items()}
-        self._outlets = {name: outlet(name, course) for name, course in self._courses.items()}
+        self._schedules = {name: entry.schedule for name, entry in brief.part.links.items()}
+        self._outlets = {name: outlet(name, schedule) for name, schedule in self._schedules.items()}
         acknowledgements = brief.part.acknowledgements
         self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
         waiting = [] if self._way_back is None else [self._way_back.sent]
         self._commands = Commands(
-            session, tuple(self._courses), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
+            session, tuple(self._schedules), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
         )
         self._stale = False
         """Whether to ignore packets until the resend begins."""
@@ -280,7 +268,7 @@ class Routing:
         self._session.appear()
         while not self._commands.over():
             try:
-                self._take(Reader(self._session.keys.uplink, self._uplink.recv()))
+                self._take()
             except ReplayRequested:
                 self._stale = True
 
@@ -293,7 +281,8 @@ class Routing:
         self._flush()  # nobody needs these messages, but they must not mix with the following ones
         self._k, self._done, self._journaled = start, done, start
         self._downlinks = {
-            name: Downlink(name, course, self._brief, self._outlets[name]) for name, course in self._courses.items()
+            name: Downlink(name, schedule, self._brief, self._outlets[name])
+            for name, schedule in self._schedules.items()
         }
         for first in range(0, start + 1, self._brief.flow.batch):
             slots = self._plan(first)
@@ -310,40 +299,44 @@ class Routing:
                 downlink.plan(self._slots)
         return self._slots
 
-    def _take(self, message: Reader) -> None:
-        """Handle a message of the sensor: a packet, a barrier, or the announcement of a resend."""
+    def _take(self) -> None:
+        """Handle the sensor's next messages: packets, a barrier, or the announcement of a resend."""
+        message = self._uplink.peek()
         if is_resend(message):
+            self._uplink.drop()
             self._resend(message)
             return
         k = message.integer("k")
-        if self._stale or k == self._brief.slots:
-            return
-        if k != self._k:
-            self._due.missed(self._k, k)
+        if self._stale or k == self._brief.slots or k != self._k:
+            self._uplink.drop()
+            if not self._stale and k != self._brief.slots:
+                self._due.missed(self._k, k)
             return
         if k == self._done:
             self._journal(k)
         if is_barrier(message):
+            self._uplink.drop()
             if k >= self._done:
                 self._journal(k)
                 self._hold(k)
             return
-        self._route(k, message)
-        if k + 1 == self._slots.stop:
+        stop = self._slots.stop if k >= self._done else min(self._slots.stop, self._done)
+        self._route(k, self._uplink.take(k, 1 if self._way_back is not None else stop - k))
+        if self._k == self._slots.stop:
             self._flush()
-            self._journal(k + 1)
-            self._plan(k + 1)
+            self._journal(self._k)
+            self._plan(self._k)
 
-    def _route(self, k: int, message: Reader) -> None:
-        """Deliver the packet of slot k, unless it is known to have been delivered."""
-        z = read_uplink(message, k, self._shape)
-        beside = read_beside(message, self._shape, self._brief.model.header)
-        whole, known = z.tobytes(), k < self._done
+    def _route(self, first: int, messages: Sequence[Reader]) -> None:
+        """Deliver the packets of consecutive slots, unless it is known that they have been delivered."""
+        packets = read_uplinks(messages, first, self._shape, self._brief.model.header)
+        slots, known = range(first, first + len(messages)), first < self._done
         for downlink in self._downlinks.values():
-            downlink.deliver(k, z, whole, beside, known)
+            downlink.deliver(slots, packets, known)
         if self._way_back is not None and not known:
-            self._way_back.carry(k, beside.sent, self._downlinks, self._commands)
-        self._k = self._session.place.slot = k + 1
+            sent = None if packets.sent is None else packets.sent[0]
+            self._way_back.carry(first, sent, self._downlinks, self._commands)
+        self._k = self._session.place.slot = slots.stop
 
     def _flush(self) -> None:
         for burst in self._bursts:
@@ -357,7 +350,7 @@ class Routing:
             self._stale = True
             return
         for name, changes in (again.links or {}).items():
-            self._courses[name] = replace(self._courses[name], changes=changes)
+            self._schedules[name] = replace(self._schedules[name], changes=changes)
         self._begin(start, done)
 
     def _journal(self, end: int) -> None:
@@ -389,8 +382,8 @@ class Routing:
         except (KeyError, TypeError, ValueError, NotRegistered) as error:
             message = Reader(self._session.keys.control(ROUTER), command.pack())
             raise message.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
-        course = self._courses[name]
-        self._courses[name] = replace(course, changes=(*(one for one in course.changes if one.at < k), *changes))
+        schedule = self._schedules[name]
+        self._schedules[name] = replace(schedule, changes=(*(one for one in schedule.changes if one.at < k), *changes))
 
 
 def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:

@@ -39,10 +39,9 @@ from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, over, refusal
 from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, End, Where, read_command
 from evedrop.live.protocol.envelope import Dropped
-from evedrop.live.protocol.keys import RunKeys, reader_of
+from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.whereabouts import Place
-from evedrop.live.protocol.zenoh_config import ZenohConfig
 from evedrop.names import OBSERVER, ROUTER
 
 READY_SECONDS = 30.0

@@ -16,8 +16,8 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
 from evedrop.live.protocol.commands import Abandon, ControlCommand, End, Start
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.signals import AFTERTHOUGHT_SECONDS
 
-_AFTERTHOUGHT_SECONDS = 0.5  # the user who ended a process may be about to end the observer: then the run did not fail
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
 _LOOK_SECONDS = 0.05  # how soon a signal is noticed
 _END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
@@ -40,7 +40,7 @@ class Stop:
         while not (asked := self.wanted or self._orphaned()) and self._clock.monotonic() < deadline:
             self._clock.sleep(0.01)
         if asked:
-            raise Interrupted("interrupted; the results so far are in the results folder")
+            raise Interrupted
 
 
 @final
@@ -140,9 +140,9 @@ class Conductor:
             return None
         return news[0], news[1]
 
-    def despair(self, names: Collection[str], patience: float) -> NoReturn:
+    def fail_cut_off(self, names: Collection[str], patience: float) -> NoReturn:
         """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if told to end now."""
-        self._stop.check(_AFTERTHOUGHT_SECONDS)
+        self._stop.check(AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
     def command(self, name: str, command: ControlCommand) -> None:

@@ -46,7 +46,7 @@ class Joiner:
         self._reports = {name: _Column[Report]() for name in windows}
         self._done = 0
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
-        """Receiver or controller → first slot of a block → its digests, (R, 32)."""
+        """Receiver or controller → first slot of a block → its digests, (R, 16)."""
         if period is not None:
             self.digests[CONTROLLER] = {}
 

@@ -38,7 +38,7 @@ from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.news import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
-from evedrop.results.held_folder import HeldFolder
+from evedrop.results.folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.rows import DigestRows, write_rows
 from evedrop.results.shard_score import dump_score
@@ -79,7 +79,7 @@ class ObservedRun:
         self._by_hand = by_hand
         self._scenario = scenario
         windows = {name: scenario.window(name) for name in scenario.receivers}
-        blocks = {name: Blocks(scenario.slots, scenario.cuts(name)) for name in scenario.digested}
+        blocks = {name: Blocks(scenario.slots, scenario.outage_bounds(name)) for name in scenario.digested}
         table = scenario.controller
         self._extent = extent_of(scenario, brief.flow.batch)
         self._verifier = Verifier(blocks, scenario.record_trials, scenario.first_trial)
@@ -135,7 +135,7 @@ class ObservedRun:
                 self._recording = open_recording(
                     self._scenario, self._brief.run, path, lambda text: tell(ViewOpened(None, text))
                 )
-            self._steering = Steering(self._scenario, conductor, tell, self._keep)
+            self._steering = Steering(self._scenario, conductor, tell, self._keep, paused=self._brief.part.paused)
             patience = self._brief.flow.longest_outage
             self._due = {source: GapDetector(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
@@ -182,9 +182,9 @@ class ObservedRun:
         done, at = self._joiner.done, self._steering.at
         held = at is not None and done >= at
         present = set(self._scenario.digested) - conductor.absent
-        beside = (CONTROLLER,) if done < self._scenario.slots else ()
+        unneeded = (CONTROLLER,) if done < self._scenario.slots else ()
         missing = bool(conductor.missing)
-        self._stall.look(done, lambda: self._joiner.places(present), beside, held=held, missing=missing)
+        self._stall.look(done, lambda: self._joiner.places(present), unneeded, held=held, missing=missing)
 
     @property
     def _control(self) -> Control:

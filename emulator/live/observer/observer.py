@@ -51,7 +51,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
     ANSWERS.learn(brief.part.classes)  # so that the observer need not import the classes themselves
-    scenario = Scenario.model_validate(brief.part.scenario)
+    scenario = Scenario.read(brief.part.scenario)
     observation = ObservedRun(brief, scenario, confirmations, by_hand)
     if by_hand:
         # Connect before writing to the folder: files left by a brief that does not fit would block the next attempt.

@@ -118,7 +118,7 @@ class Recovery:
             # Without the router no other process can be seen.
             gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
             self.give_up(done)
-            self._conductor.despair(gone, self._flow.longest_outage)
+            self._conductor.fail_cut_off(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
         found = self._missing

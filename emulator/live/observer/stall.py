@@ -55,14 +55,14 @@ class Stall:
         self,
         done: int,
         reported: Callable[[], Mapping[str, int]],
-        beside: Collection[str] = (),
+        unneeded: Collection[str] = (),
         *,
         held: bool,
         missing: bool,
     ) -> None:
         """Check whether the run goes on; all slots below `done` are joined. Raises Silence if a process has held it up too long.
 
-        reported: process → the first slot that it has not reported; beside: processes whose reports are not needed to join
+        reported: process → the first slot that it has not reported; unneeded: processes whose reports are not needed to join
         slots. held: the run is held, and no process has anything to do; missing: some process is not on the network, which
         is handled elsewhere.
         """
@@ -93,10 +93,10 @@ class Stall:
             self._asked = self._stalled
             self._ask()
         if self._stalled > self._patience + 2.0 * self._patience / 10.0:
-            self._judge(places, beside)
+            self._judge(places, unneeded)
 
-    def _judge(self, places: Mapping[str, int], beside: Collection[str]) -> None:
-        silent = tuple(silent_of(places, self._answers, beside))
+    def _judge(self, places: Mapping[str, int], unneeded: Collection[str]) -> None:
+        silent = tuple(silent_of(places, self._answers, unneeded))
         still = self._stalled - max(self._moved[name][1] for name in silent)
         if still > self._patience:
             what = " and ".join(_described(name, self._answers.get(name)) for name in silent)
@@ -115,13 +115,15 @@ def _described(name: str, where: Whereabouts | None) -> str:
     return f"{name} says that it is at slot {where.slot} and waits on {', '.join(where.waits[:3])}"
 
 
-def silent_of(places: Mapping[str, int], answers: Mapping[str, Whereabouts], beside: Collection[str] = ()) -> list[str]:
+def silent_of(
+    places: Mapping[str, int], answers: Mapping[str, Whereabouts], unneeded: Collection[str] = ()
+) -> list[str]:
     """The processes that a run waits for when it stands still.
 
-    places: process → the first slot that it has not reported; answers: of the processes that have answered; beside:
+    places: process → the first slot that it has not reported; answers: of the processes that have answered; unneeded:
     processes whose reports are not needed to join slots.
     """
-    joined = {name: k for name, k in places.items() if name not in beside}
+    joined = {name: k for name, k in places.items() if name not in unneeded}
     behind = [name for name, k in joined.items() if k == min(joined.values())]
     seen, chain = set(behind), list(behind)
     idle, mute = [], []

@@ -11,7 +11,7 @@ from typing import final
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.model.receiver import Belief, prior
-from evedrop.model.slot.intermittent_receiver import Absence
+from evedrop.model.slot.receiver import Absence
 from evedrop.scenario import Scenario
 from evedrop.scenario.timeline import Away
 
@@ -29,7 +29,7 @@ class StandIn:
         process = scenario.process.process
         fresh = prior(process, scenario.trials, away.start)
         self._absence = Absence(process, left if away.keeps_state else fresh)
-        cuts, late = scenario.cuts(receiver), scenario.window(receiver) > 0
+        cuts, late = scenario.outage_bounds(receiver), scenario.window(receiver) > 0
         self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts, away.start, late)
         self.next = away.start
         """The first slot that has not been reported."""
@@ -42,7 +42,8 @@ class StandIn:
 
     def follow(self, end: int) -> None:
         """Report the slots of the outage below `end`."""
-        for k in range(self.next, min(end, self._stop)):
-            self._reporter.add(k, self._absence.next(k))
-            self.next = k + 1
+        slots = range(self.next, min(end, self._stop))
+        if slots:
+            self._reporter.add(slots, self._absence.take(slots))
+            self.next = slots.stop
         self._reporter.flush(self.next)

@@ -19,7 +19,7 @@ from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.news import ProcessRequest
-from evedrop.loading.amended import with_event
+from evedrop.loading.file import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
 from evedrop.news import Held, RunEvent, Tell
@@ -34,6 +34,7 @@ class Steering:
 
     tell: sends news to the launcher, such as an act on a process, which the launcher confirms; see `done`.
     keep: called with the amended scenario each time the operator has changed it.
+    paused: whether the run begins paused; the sensor's brief then has a hold before slot 0.
     """
 
     def __init__(
@@ -42,6 +43,8 @@ class Steering:
         conductor: Conductor,
         tell: Tell,
         keep: Callable[[Scenario], None],
+        *,
+        paused: bool = False,
     ) -> None:
         self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep
         self._due = scenario.timeline.holds
@@ -59,7 +62,7 @@ class Steering:
         self._changed: set[str] = set()
         self._gone: Go | None = None
         """The last `Go` that was sent to the sensor."""
-        self.paused = False
+        self.paused = paused
         """Whether the run stays held until the operator resumes it."""
         self.events: list[RunEvent] = []
         """The events so far."""
@@ -71,6 +74,8 @@ class Steering:
         self.at, self._last, self._asked = k, k, False
         self._pending = list(self._due.pop(k, []))
         self._since = time.monotonic()
+        if self.paused:  # it began so: whoever else pauses it does so at a hold
+            self._pause(k, "pause the run")
 
     def left(self, name: str, k: int) -> None:
         """Take the news that a receiver has left before slot k, the first slot of its absence."""
@@ -106,11 +111,11 @@ class Steering:
         if self.at is None:
             return
         if reported < self.at:
-            self._despair(f"not every process has reported all slots below {self.at}")
+            self._fail(f"not every process has reported all slots below {self.at}")
             return
         while self._settled():
             if self._pending and not self._may(self._pending[0]):
-                self._despair(f"{self._pending[0].names[0]} has not sent its final belief")
+                self._fail(f"{self._pending[0].names[0]} has not sent its final belief")
                 return
             if self._pending:
                 self._do(self.at, self._pending.pop(0))
@@ -149,10 +154,10 @@ class Steering:
                 self._conductor.absent -= set(act.names)
             self._waiting = None
             return True
-        self._despair(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
+        self._fail(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
         return False
 
-    def _despair(self, what: str) -> None:
+    def _fail(self, what: str) -> None:
         """Raise RunError if the run has been waiting for too long; what: the missing condition."""
         if time.monotonic() - self._since > READY_SECONDS:
             raise RunError(

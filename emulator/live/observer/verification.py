@@ -15,9 +15,10 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import Contradiction
+from evedrop.kernels.current import kernels
 from evedrop.live.protocol.telemetry import Extent, Report
 from evedrop.model.digest import Blocks, PartialDigests
-from evedrop.model.receiver import Action, Belief, trace_of
+from evedrop.model.receiver import Action, Belief
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
 from evedrop.score.slots import ReceiverSlots, Slots
@@ -56,7 +57,7 @@ class Verifier:
             first = stop
 
     def _check_digests(self, name: str, report: Report, start: int, stop: int) -> None:
-        found = self._digests.pop(name).digests()
+        found = self._digests[name].finished()
         claimed = report.digests[start][: self._recorded]
         wrong = (found != claimed).any(axis=1)
         if wrong.any():
@@ -69,7 +70,7 @@ class Verifier:
 
     def _check_traces(self, name: str, report: Report) -> None:
         """Check that the sums of tr P over all trials are possible given the recorded trials; equal, if all are recorded."""
-        traces = trace_of(report.P.transpose(1, 2, 0, 3))
+        traces = kernels.traces(report.P)
         trials, claimed = report.x_hat.shape[2], report.trace
         others = trials - traces.shape[1]
         with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up

@@ -24,9 +24,9 @@ from evedrop.entries import (
     inner,
     key,
     named,
+    not_negative,
     number,
     plain,
-    positive,
     read,
     table_of,
     text,
@@ -40,7 +40,7 @@ from evedrop.streams import MOST_SLOTS, Batch
 
 _MOST_TRIALS, _LAST_TRIAL = 1_000_000, 2**48
 _MOST_BYTES = 2**30  # the observer's brief holds the complete scenario
-_WRITE_AGAIN = "write it again with `evedrop brief`"
+WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Flow:
     """The sensor is at most this far ahead of the slowest receiver and of the observer."""
     batch: int = field(metadata=entry(whole(1)))
     """Telemetry, journal and progress are sent at least this often."""
-    longest_outage: float = field(default=30.0, metadata=entry(positive))
+    longest_outage: float = field(default=30.0, metadata=entry(not_negative))
     """Seconds for which a process may be cut off before that ends the run."""
     largest_message: int = field(default=2**30, metadata=entry(whole(1)))
     """Bytes of the largest message of the run: larger ones are not accepted."""
@@ -147,17 +147,18 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
     """Read and check a brief. Raises BriefError if it is unreadable, readable by others, malformed, or another role's."""
     try:
         with opened(path) as file:
-            if os.fstat(file.fileno()).st_mode & 0o077:
+            status = os.fstat(file.fileno())
+            if status.st_mode & 0o077:
                 raise BriefError(f"{path} is readable by others; a brief holds keys: chmod 600 {path}")
-            found = file.read(_MOST_BYTES + 1)
+            found = file.read(_MOST_BYTES) if status.st_size <= _MOST_BYTES else None
     except (OSError, Unreadable) as error:
         raise BriefError(f"{path}: {why_of(error)}; give the file that `evedrop brief` wrote") from error
     try:
-        if len(found) > _MOST_BYTES:
+        if found is None:
             raise ValueError(f"it has more than {_MOST_BYTES} bytes")
         brief = _parsed(json.loads(found.decode("utf-8")))
     except (ValueError, RecursionError) as error:
-        raise BriefError(f"{path} is not a brief of this version ({error}); {_WRITE_AGAIN}") from error
+        raise BriefError(f"{path} is not a brief of this version ({error}); {WRITE_AGAIN}") from error
     if role is not None and brief.role != role:
         raise BriefError(
             f"{path} is the brief of a {brief.role}; expected one of a {role}: start `evedrop {brief.role}`"

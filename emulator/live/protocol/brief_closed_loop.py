@@ -21,7 +21,7 @@ from evedrop.entries import (
     flag,
     inner,
     named,
-    positive,
+    not_negative,
     text,
     whole,
 )
@@ -105,7 +105,7 @@ class AssignmentEntry:
     """A controller's assignment as plain numbers, without process and plant."""
 
     period: int = field(metadata=entry(whole(1)))
-    slot_seconds: float = field(metadata=entry(positive))
+    slot_seconds: float = field(metadata=entry(not_negative))
     state_weights: Sequence[float] = field(metadata=entry(NUMBERS))
     input_weights: Sequence[float] = field(metadata=entry(NUMBERS))
     rate_weights: Sequence[float] = field(metadata=entry(NUMBERS))

@@ -19,8 +19,8 @@ from evedrop.entries import (
     listed,
     maybe,
     named,
+    not_negative,
     number,
-    positive,
     read,
     row,
     table,
@@ -69,7 +69,7 @@ class Identity:
 
 @dataclass(frozen=True)
 class LinkEntry:
-    """The course of a link as plain values."""
+    """The schedule of a link as plain values."""
 
     settings: Mapping[str, Any] = field(metadata=entry(table({"loss": named(anything)}, strict=False)))
     window: int = field(metadata=entry(_WINDOW))
@@ -104,8 +104,8 @@ class RouterPart:
             named(table_of(LinkEntry)), lambda found: {name: read(LinkEntry, one) for name, one in found.items()}
         )
     )
-    """Receiver → the course of its link."""
-    pace: float = field(metadata=entry(positive))
+    """Receiver → the schedule of its link."""
+    pace: float = field(metadata=entry(not_negative))
     """Seconds per slot; 0: as fast as possible."""
     users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
     """User → password."""
@@ -147,7 +147,7 @@ class SensorPart:
     role: ClassVar[str] = "sensor"
     scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
     """`scheme`, its name, and its parameters."""
-    pace: float = field(metadata=entry(positive))
+    pace: float = field(metadata=entry(not_negative))
     """As the router's."""
     receivers: Sequence[str] = field(metadata=entry(_TEXTS))
     holds: Sequence[int] = field(metadata=entry(listed(SLOT)))
@@ -230,6 +230,8 @@ class ObserverPart:
     """The operator's password."""
     shard: bool = field(metadata=entry(flag))
     """Whether the run is a shard of a larger one."""
+    paused: bool = field(metadata=entry(flag))
+    """Whether it holds the run before slot 0, until the operator lets it go on."""
     operator_identity: Identity | None = field(metadata=inner(Identity, or_null=True))
     classes: Mapping[str, Mapping[str, Any]] = field(metadata=entry(named(named(anything))))
     """Question → answer, of eavesdroppers' classes that are not built in."""

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from evedrop.errors import BriefError, NotRegistered
-from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief import WRITE_AGAIN, AnyBrief
 from evedrop.live.protocol.brief_closed_loop import PlantEntry, decoded
 from evedrop.live.protocol.brief_parts import (
     ControllerPart,
@@ -28,19 +28,20 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Link, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
 
-_WRITE_AGAIN = "write it again with `evedrop brief`"
 
-
-def expect_usable(brief: AnyBrief) -> None:
-    """Raise BriefError if a process cannot work with its brief: a key, a class or a number is missing or unusable."""
+@contextmanager
+def classes_known() -> Iterator[None]:
+    """Turn a NotRegistered of the block into a BriefError: the brief names a class that this process does not have."""
     try:
-        _expect_usable(brief)
+        yield
     except NotRegistered as error:
         name = str(error.name).encode("unicode_escape").decode()
         raise BriefError(f"it names {name}{error.why or ', which is not a class here'}") from error
 
 
-def _expect_usable(brief: AnyBrief) -> None:
+@classes_known()
+def expect_usable(brief: AnyBrief) -> None:
+    """Raise BriefError if a process cannot work with its brief: a key, a class or a number is missing or unusable."""
     match brief.part:
         case RouterPart() as part:
             _expect_links(brief, part)
@@ -58,7 +59,7 @@ def _expect_usable(brief: AnyBrief) -> None:
             kind = STRATEGIES[strategy]
             lacking = sorted(set(kind.parameters) - set(parameters))
             if lacking:
-                raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {_WRITE_AGAIN}")
+                raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {WRITE_AGAIN}")
             with _using("part.parameters"):
                 streams = kind.streams(parameters)
             _expect_keys(brief, streams)
@@ -71,7 +72,7 @@ def _expect_usable(brief: AnyBrief) -> None:
 def _expect_keys(brief: AnyBrief, names: Iterable[str]) -> None:
     for name in names:
         if name not in brief.keys:
-            raise BriefError(f"keys.{name} is missing, and {brief.process} cannot work without it; {_WRITE_AGAIN}")
+            raise BriefError(f"keys.{name} is missing, and {brief.process} cannot work without it; {WRITE_AGAIN}")
 
 
 def _scheme(brief: AnyBrief, part: SensorPart | LegitimatePart) -> Scheme:
@@ -79,7 +80,7 @@ def _scheme(brief: AnyBrief, part: SensorPart | LegitimatePart) -> Scheme:
     kind = SCHEMES[spec["scheme"]]
     for name in sorted(set(kind.parameters) ^ (set(spec) - {"scheme"})):
         what = "missing" if name in kind.parameters else "not a parameter of the scheme"
-        raise BriefError(f"part.scheme.{name} is {what}; {_WRITE_AGAIN}")
+        raise BriefError(f"part.scheme.{name} is {what}; {WRITE_AGAIN}")
     with _using("part.scheme"):
         return scheme_of(brief.model.process, spec)
 
@@ -100,7 +101,7 @@ def _expect_plant(brief: AnyBrief, entry: PlantEntry, disturbances: str | None =
 def _expect_controller(brief: AnyBrief, part: ControllerPart) -> None:
     if part.strategy not in CONTROLLERS:
         known = ", ".join(sorted(CONTROLLERS))
-        raise BriefError(f"part.strategy is {part.strategy:.40}, expected one of {known}; {_WRITE_AGAIN}")
+        raise BriefError(f"part.strategy is {part.strategy:.40}, expected one of {known}; {WRITE_AGAIN}")
     _expect_plant(brief, part.plant, part.disturbances)
     with _using("part.assignment"):
         assignment = part.assignment.assignment(brief.model.process, part.plant.plant)
@@ -112,15 +113,15 @@ def _expect_controller(brief: AnyBrief, part: ControllerPart) -> None:
 def _expect_links(brief: AnyBrief, part: RouterPart) -> None:
     for name, entry in part.links.items():
         with _using(f"part.links.{name}"):
-            course = entry.schedule
-        _expect_keys(brief, streams_of(name, course))
+            schedule = entry.schedule
+        _expect_keys(brief, streams_of(name, schedule))
         with _using(f"part.links.{name}"):
             keys = brief.stream_keys
-            Link(course, name, {stream: keys[stream] for stream in streams_of(name, course)}, brief.batch)
+            Link(schedule, name, {stream: keys[stream] for stream in streams_of(name, schedule)}, brief.batch)
     if part.acknowledgements is not None:
         _expect_keys(brief, [f"link/{ACKNOWLEDGEMENTS}"])
         if part.acknowledgements.attack not in ATTACKS:
-            raise BriefError(f"part.acknowledgements.attack is {part.acknowledgements.attack:.40}; {_WRITE_AGAIN}")
+            raise BriefError(f"part.acknowledgements.attack is {part.acknowledgements.attack:.40}; {WRITE_AGAIN}")
 
 
 @contextmanager
@@ -132,4 +133,4 @@ def _using(path: str) -> Iterator[None]:
         raise
     except Exception as error:
         said = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
-        raise BriefError(f"{path} cannot be used ({said}); {_WRITE_AGAIN}") from error
+        raise BriefError(f"{path} cannot be used ({said}); {WRITE_AGAIN}") from error

@@ -5,6 +5,7 @@ Source: docs/protocol.md, messages.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Collection, Mapping
 from reprlib import Repr
 from typing import Any, final
@@ -27,8 +28,18 @@ _PARTS = 4096  # lists and maps in a message; enough for many processes
 
 def pack(fields: Mapping[str, Any]) -> bytes:
     """Encode a message with these fields."""
-    message: bytes = msgpack.packb(fields, use_bin_type=True)
+    message: bytes = _PACKERS.packer.pack(fields)
     return message
+
+
+class _Packers(threading.local):
+    """A packer for each thread: making one takes longer than packing a small message."""
+
+    def __init__(self) -> None:
+        self.packer = msgpack.Packer(use_bin_type=True)
+
+
+_PACKERS = _Packers()
 
 
 @final
@@ -57,6 +68,11 @@ class Reader:
     def malformed(self, found: str, expected: str) -> MalformedMessage:
         """The error for this message, with what was found in it and what was expected."""
         return MalformedMessage(self.key, found, expected, self._payload, writer_of(self.key))
+
+    @property
+    def fields(self) -> Mapping[Any, Any]:
+        """All fields, as they were sent: nothing about them is checked yet."""
+        return self._fields
 
     def has(self, name: str) -> bool:
         """Whether an optional field is present."""

@@ -6,6 +6,7 @@ Source: docs/protocol.md, keys.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
 
@@ -110,3 +111,7 @@ def writer_of(key: str) -> str:
         "input": CONTROLLER,
     }
     return writers.get(kind, name)
+
+
+ZenohConfig = dict[str, Any]
+"""A JSON object whose entries Zenoh defines."""

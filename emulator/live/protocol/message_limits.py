@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from evedrop.live.protocol.keys import KINDS
-from evedrop.live.protocol.zenoh_config import ZenohConfig
-from evedrop.model.digest import DIGEST_BYTES
+from evedrop.live.protocol.keys import KINDS, ZenohConfig
+from evedrop.model.digest import BLOCK_SLOTS, DIGEST_BYTES
 from evedrop.model.links.link import REASONS
 from evedrop.model.slot.account import COUNTED_BURSTS
 
@@ -44,11 +43,12 @@ class Sizes:
         n, R, c = self.n, self.trials, self.batch
         mask, state = (R + 7) // 8, 8 * n * R
         packet = state + 8 * self.header * R + mask + _NAME_BYTES
-        # Digests of two blocks: one may have a single slot, before an outage.
-        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + 2 * DIGEST_BYTES * R
+        # Blocks of the digest that end in a report: one may have begun before it, and the last may be short.
+        digests = (c // BLOCK_SLOTS + 2) * DIGEST_BYTES * R
+        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + digests
         truth = c * (2 * state + 8 * self.inputs * R + 4 * mask)
         leaving = state + 8 * n * n * R
-        decisions = 8 * (c + self.period) + 2 * DIGEST_BYTES * R
+        decisions = 8 * (c + self.period) + digests + self.period // BLOCK_SLOTS * DIGEST_BYTES * R
         waits = _NAME_BYTES * (self.receivers + 1)
         link = c * (mask + 4 * (len(REASONS) + 1) + 2 * R) + 4 * (COUNTED_BURSTS + self.window + 2) + _FRAME_BYTES
         kinds = {

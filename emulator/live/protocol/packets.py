@@ -29,11 +29,6 @@ class PacketExtras(NamedTuple):
     truth: Floats | None = None
     """x_k (n, R), for the one receiver that learns the true state."""
 
-    @property
-    def given(self) -> dict[str, NDArray[Any]]:
-        """The parts that are not None."""
-        return {name: value for name, value in self._asdict().items() if value is not None}
-
 
 def uplink(
     k: int, z: Floats, header: Headers | None = None, sent: Flags | None = None, truth: Floats | None = None
@@ -55,7 +50,7 @@ def read_uplink(message: Reader, k: int, shape: tuple[int, int]) -> Floats:
     return message.finite("z", shape)
 
 
-def read_beside(message: Reader, shape: tuple[int, int], header: int = 0) -> PacketExtras:
+def read_extras(message: Reader, shape: tuple[int, int], header: int = 0) -> PacketExtras:
     """Decode the parts of a packet other than z; header: how many rows the header of the scheme's packets has."""
     n, trials = shape
     return PacketExtras(

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
-from evedrop.entries import SLOT, entry, flag, listed, maybe, named, positive, read, table_of, text
+from evedrop.entries import SLOT, entry, flag, listed, maybe, named, not_negative, read, table_of, text
 from evedrop.news import RunEvent
 
 
@@ -19,7 +19,7 @@ class LinkStatus:
 
     offered: int = field(metadata=entry(SLOT))
     delivered: int = field(metadata=entry(SLOT))
-    fraction: float | None = field(metadata=entry(maybe(positive)))
+    fraction: float | None = field(metadata=entry(maybe(not_negative)))
     """The fraction of the offered packets that was delivered; None if none was offered."""
 
     @classmethod
@@ -48,7 +48,7 @@ class RunStatus:
     """The first slot that is not scored."""
     slots: int = field(metadata=entry(SLOT))
     """The number of slots of the run."""
-    slots_per_second: float = field(metadata=entry(positive))
+    slots_per_second: float = field(metadata=entry(not_negative))
     state: str = field(metadata=entry(text))
     """`running`, `held` or `paused`."""
     processes: Mapping[str, bool] = field(metadata=entry(named(flag)))

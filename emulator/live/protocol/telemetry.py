@@ -17,7 +17,7 @@ from evedrop.model.digest import DIGEST_BYTES, Blocks, Digests
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Codes, Flags
+from evedrop.model.receiver import Action, Belief, Codes, Flags, asymmetry
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 
 
@@ -117,7 +117,7 @@ def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
 
 
 def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, Digests]:
-    """Decode digests: block, by its first slot → digests, (R, 32); blocks: those that end in the slots of the message."""
+    """Decode digests: block, by its first slot → digests, (R, 16); blocks: those that end in the slots of the message."""
     digests: dict[int, Digests] = {}
     found = message.map("digests")
     for block, value in found.items():
@@ -150,7 +150,7 @@ class Report:
     late: NDArray[np.uint16] | None
     """How many packets of earlier slots arrived within the window, (c, R); None for a receiver without a window."""
     digests: Mapping[int, Digests]
-    """Block, by its first slot → digests, (R, 32), of the blocks that ended in these slots."""
+    """Block, by its first slot → digests, (R, 16), of the blocks that ended in these slots."""
     late_used: NDArray[np.uint16] | None = None
     """How many of the late packets were used, and not discarded, (c, R)."""
 
@@ -195,12 +195,26 @@ def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, win
         first,
         message.finite("x_hat", (c, n, trials)),
         action,
-        message.finite("P", (c, n, n, extent.recorded)),
+        _covariances(message, (c, n, n, extent.recorded)),
         message.finite("trace", (c, 2)),
         late,
         read_digests(message, trials, blocks.ended(first, first + c)),
         used,
     )
+
+
+def _covariances(message: Reader, shape: tuple[int, ...]) -> Floats:
+    """Decode covariances, (…, n, n, R). Digests cover their upper triangles only, so the lower ones must agree with them."""
+    P = message.finite("P", shape)
+    place = asymmetry(P)
+    if place is not None:
+        *before, i, j, r = place
+        other = (*before, j, i, r)
+        raise message.malformed(
+            f"P with {P[place]} at {list(place)} and {P[other]} at {list(other)}",
+            "covariances, which are symmetric except for rounding",
+        )
+    return P
 
 
 def leaving(k: int, belief: Belief) -> bytes:
@@ -216,7 +230,7 @@ def is_leaving(message: Reader) -> bool:
 def read_leaving(message: Reader, extent: Extent) -> tuple[int, Belief]:
     """Decode the slot before which a receiver leaves, and its belief."""
     n, trials = extent.shape
-    x_hat, P = message.finite("x_hat", extent.shape), message.finite("P", (n, n, trials))
+    x_hat, P = message.finite("x_hat", extent.shape), _covariances(message, (n, n, trials))
     return message.integer("k", 0, extent.slots), Belief(x_hat, P, np.zeros(trials, np.uint8))
 
 

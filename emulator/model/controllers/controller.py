@@ -61,10 +61,9 @@ class Controller(ABC):
         return []
 
     @classmethod
+    @abstractmethod
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
         """Reasons why it cannot do what is asked: (entry of `[controller]`, value found and expected)."""
-        del assignment
-        return []
 
     @abstractmethod
     def decide(self, k: int, x_hat: Floats, d: Floats) -> Floats:

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.delays.checks import length_mistakes
-from evedrop.model.delays.delay import DelayModel
+from evedrop.model.delays.delay import DelayModel, length_mistakes
 from evedrop.model.process import Floats
 
 

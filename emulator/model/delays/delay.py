@@ -7,10 +7,16 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
+from evedrop.model.checks import number_mistakes
 from evedrop.model.process import Floats
 
 LONGEST = 1e6
 """The longest delay in slots; longer delays are cut to it, since no receiver waits that long."""
+
+
+def length_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
+    """A mistake for every one of the names that is given and is not a length of time."""
+    return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, LONGEST)]
 
 
 class DelayModel(ABC):

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from evedrop.kernels.elementary import exp, log
-from evedrop.model.delays.checks import is_number, length_mistakes
-from evedrop.model.delays.delay import LONGEST, DelayModel
+from evedrop.model.checks import number_mistakes
+from evedrop.model.delays.delay import LONGEST, DelayModel, length_mistakes
 from evedrop.model.process import Floats
 
 
@@ -29,10 +29,7 @@ class Pareto(DelayModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A length, and a positive shape."""
-        found = length_mistakes(given, "least")
-        if "shape" in given and not (is_number(given["shape"]) and 0.1 <= given["shape"] <= 1000.0):
-            found.append(("shape", f"is {given['shape']!r}; expected a number from 0.1 to 1000"))
-        return found
+        return length_mistakes(given, "least") + number_mistakes(given, "shape", 0.1, 1000.0)
 
     def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
         """Each from a uniform number in [0, 1)."""

@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.eavesdroppers.readers import READERS
-from evedrop.model.receiver import Belief, Codes, Flags, Reception
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
 from evedrop.model.theory.covariances import OutcomesAt
 from evedrop.streams import Batch
 
@@ -48,3 +49,7 @@ class Delegate(Eavesdropper):
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """The reader's belief."""
         return self.reader.step(k, belief, heard)
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """The reader's beliefs."""
+        return self.reader.follow(slots, belief, gamma, z)

@@ -11,11 +11,12 @@ from __future__ import annotations
 import numpy as np
 
 from evedrop.kernels.elementary import cholesky, log
+from evedrop.kernels.factored import Factor, Factors, covariance, grown, squared_length
+from evedrop.kernels.leak import Leak
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, squared_length
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Flags, Reception
-from evedrop.model.theory.leak import Leak, Leaks
+from evedrop.model.theory.leak import Leaks
 from evedrop.streams import Batch
 
 

@@ -23,3 +23,7 @@ class Naive(PacketTaker):
     def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike
         """Always."""
         return None
+
+    def uses_block(self, slots: range) -> Flags | None:  # noqa: ARG002 - every slot alike
+        """Always."""
+        return None

@@ -28,8 +28,4 @@ class Selective(PacketReader):
         action = heard.gamma.astype(np.uint8)
         if heard.header is not None:
             action = np.where(heard.gamma & (heard.header[0] != 0), np.uint8(Action.DISCARDED), action)
-        return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, heard.z),
-            update.believed_covariance(self.process, k, belief.P, action),
-            action,
-        )
+        return update.belief(self.process, k, belief, action, heard.z)

@@ -34,3 +34,7 @@ class Smart(PacketTaker):
     def uses(self, k: int) -> Flags | None:
         """Where the packet is the state."""
         return ~self._schedule.at(k)
+
+    def uses_block(self, slots: range) -> Flags | None:
+        """The same for consecutive slots."""
+        return ~self._schedule.block(slots)

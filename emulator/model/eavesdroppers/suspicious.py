@@ -11,7 +11,7 @@ import numpy as np
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
 from evedrop.model.receiver import Flags
 from evedrop.model.schedule import Schedule
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
 
 
 class Suspicious(PacketTaker):
@@ -27,7 +27,7 @@ class Suspicious(PacketTaker):
         self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
         self._use_state, self._use_innovation = self.use_probabilities(knowledge.parameters)
         self._coins = BlockReader(knowledge.keys["coin"], batch, 1)
-        self._slots = range(0)
+        self._used = Ahead(self._coins, self._tossed)
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
@@ -41,10 +41,13 @@ class Suspicious(PacketTaker):
 
     def uses(self, k: int) -> Flags | None:
         """True where this slot's coin falls below the probability for the packet's type."""
-        if k not in self._slots:
-            self._slots = self._coins.block(k)
-            self._coin = self._coins.uniforms(self._slots)[:, 0, :]
-        used: Flags = self._coin[k - self._slots.start] < np.where(
-            self._schedule.at(k), self._use_innovation, self._use_state
-        )
+        return self._used.at(k)
+
+    def uses_block(self, slots: range) -> Flags:
+        """The same for consecutive slots."""
+        return self._used.of(slots)
+
+    def _tossed(self, slots: range) -> Flags:
+        coins = self._coins.uniforms(slots)[:, 0, :]
+        used: Flags = coins < np.where(self._schedule.block(slots), self._use_innovation, self._use_state)
         return used

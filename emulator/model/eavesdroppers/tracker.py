@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.kernels.elementary import cholesky, exp, log
+from evedrop.kernels.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from evedrop.kernels.mixtures import Mixture, merge, pruned, summed, with_a_place
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from evedrop.model.numeric.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
-from evedrop.model.numeric.mixture import Mixture, merge, pruned, summed, with_a_place
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.twins import Twins
@@ -101,9 +101,9 @@ class Tracker(PacketReader):
         """Treat x as a packet that is known to be on the real track."""
         tracks, R = _read(belief.memory), self.trials
         # With a packet of this very slot there is nothing to weigh: either it is x, or it shows where the twin is.
-        beside: Flags = ~np.any(tracks.noise_diagonal > 0.0, axis=0)
-        distance = np.where(beside, tracks.last - x, 0.0)
-        tracks = self._heard(k, tracks, ~beside, x)
+        exact: Flags = ~np.any(tracks.noise_diagonal > 0.0, axis=0)
+        distance = np.where(exact, tracks.last - x, 0.0)
+        tracks = self._heard(k, tracks, ~exact, x)
         histories = self._afresh(tracks.histories, (distance != 0.0).any(axis=0), distance, _nothing(self.process.n))
         histories.weight[:, R:] = 0.0
         after = self._few(histories, np.ones(R, np.bool_))

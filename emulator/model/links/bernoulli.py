@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.links.checks import probability_mistakes
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.links.link import Chain, LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.kernels.elementary import exp, log, normal_quantile
-from evedrop.model.links.checks import as_toml, number_mistakes
+from evedrop.model.checks import as_toml, number_mistakes
 from evedrop.model.links.fading import count_variance, delivery_probability
 from evedrop.model.links.link import LossModel, fates_of
 from evedrop.model.links.way import FARTHEST, Way, way_mistakes

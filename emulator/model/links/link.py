@@ -10,9 +10,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from evedrop.model.links.counting import count_variance
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 
@@ -43,11 +41,6 @@ class Fate(IntEnum):
 
 REASONS = tuple(fate.name.lower() for fate in Fate if fate not in (Fate.DELIVERED, Fate.UNSENT))
 """The reasons for losses, in the order of `Fate`."""
-
-
-def losses(fates: Codes) -> dict[str, NDArray[np.uint32]]:
-    """Reason → packets lost for it in each slot, (slots,), from fates (slots, R)."""
-    return {reason: np.asarray((fates == code).sum(axis=1), np.uint32) for code, reason in enumerate(REASONS, 1)}
 
 
 def fates_of(lost: Flags) -> Codes:
@@ -132,3 +125,31 @@ class LossModel(ABC):
         first: the first of the slots, which follow those of the previous call. A model replaces its memory and never changes it
         in place, so that a shallow copy of the model can continue from the same point.
         """
+
+
+def count_variance(transitions: Floats, law: Floats, quality: Floats, slots: int) -> float:
+    """Variance of the number of packets that a chain in its stationary law delivers in `slots` slots.
+
+    transitions (states, states), law (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the number
+    of matrix products grows with the logarithm of the slots.
+    """
+    mean = float(law @ quality)
+    centred = quality - mean
+    # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
+    fading = transitions - law
+    own = np.eye(len(law))
+    power, partial, total = own - np.outer(np.ones(len(law)), law), np.zeros_like(own), np.zeros_like(own)
+    count = 0
+    for bit in f"{slots:b}":
+        # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
+        total = total + count * partial + power @ total
+        partial = partial + power @ partial
+        power = power @ power
+        count *= 2
+        if bit == "1":
+            partial = partial + power
+            total = total + partial
+            power = power @ fading
+            count += 1
+    together = float((law * centred) @ (2.0 * total @ centred)) - slots * float(law @ (centred * centred))
+    return max(0.0, together) + slots * float(law @ (quality * (1.0 - quality)))

@@ -11,7 +11,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.links.checks import as_toml, is_probability
+from evedrop.model.checks import as_toml, is_probability
 from evedrop.model.links.link import Chain, LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.links.checks import word_mistakes
+from evedrop.model.checks import word_mistakes
 from evedrop.model.links.link import LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes

@@ -17,19 +17,16 @@ _MOST_STATES = 1024  # of the joint chain of all links: the transitions of a lar
 
 
 class Pooled(LossModel):
-    """Pools independent loss models, each with its own random numbers. Scenarios cannot name it: see `colluding`."""
+    """Pools independent loss models, each with its own random numbers. Scenarios cannot name it: see `colluding`.
+
+    Each of the models is checked by itself, so there is nothing to check here.
+    """
 
     parameters: ClassVar[Mapping[str, Any]] = {}
 
     def __init__(self, models: Sequence[LossModel]) -> None:
         self._models = models
         self.uniforms_per_slot = sum(model.uniforms_per_slot for model in models)
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """None: each link is checked by itself."""
-        del given
-        return []
 
     @property
     def quality(self) -> float:

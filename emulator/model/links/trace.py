@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.links.checks import flag_mistakes, word_mistakes
+from evedrop.model.checks import flag_mistakes, word_mistakes
 from evedrop.model.links.link import LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes

@@ -7,7 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
-from evedrop.model.links.checks import as_toml, is_number
+from evedrop.model.checks import as_toml, is_number
 from evedrop.model.process import Floats
 
 FARTHEST = 1e9

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats, Process
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
 
 DEVIATIONS = 16.0
 """The range extends at least this many standard deviations of the state to either side; beyond lies less than 2⁻¹⁸⁹."""
@@ -30,9 +30,8 @@ class Mask:
 
     def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
         self._process = process
-        self._reader = BlockReader(key, batch, process.n)
-        self._slots = range(0)
-        self._pads: NDArray[np.int64]
+        reader = BlockReader(key, batch, process.n)
+        self._pads = Ahead(reader, lambda slots: (reader.uniforms(slots) * 2.0**_RANGE_BITS).astype(np.int64))
         self._k = 0
         self._sigma: Floats = process.initial_covariance[:, :, None]
         self._exponents: dict[int, NDArray[np.int32]] = {}
@@ -61,11 +60,7 @@ class Mask:
         return masked
 
     def _pad(self, k: int) -> NDArray[np.int64]:
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            self._pads = (self._reader.uniforms(self._slots) * 2.0**_RANGE_BITS).astype(np.int64)
-        pad: NDArray[np.int64] = self._pads[k - self._slots.start]
-        return pad
+        return self._pads.at(k)
 
     def _exponent(self, k: int) -> NDArray[np.int32]:
         """The exponents of H in slot k, (n,); those of the last two slots are cached."""

@@ -41,11 +41,7 @@ class CipherEstimator(Receiver):
         """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
         action = self.act(k, heard.gamma)
         state = self._mask.reveal(k, np.where(heard.gamma, heard.z, 0.0))
-        return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, state),
-            update.believed_covariance(self.process, k, belief.P, action),
-            action,
-        )
+        return update.belief(self.process, k, belief, action, state)
 
 
 class Cipher(Scheme):

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from evedrop.model import update
+from evedrop.model.checks import count_mistakes
 from evedrop.model.holding_time import HoldingTime
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
-from evedrop.model.schemes.checks import count_mistakes
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch
@@ -55,11 +55,7 @@ class EncryptedScheduleEstimator(Receiver):
         encrypted = heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
         masked = np.where(encrypted, heard.z, 0.0)
         z = select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)
-        return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, z),
-            update.believed_covariance(self.process, k, belief.P, action),
-            action,
-        )
+        return update.belief(self.process, k, belief, action, z)
 
 
 class EncryptedSchedule(Scheme):

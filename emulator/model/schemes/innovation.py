@@ -8,14 +8,17 @@ from typing import Any, final
 
 import numpy as np
 
+from evedrop.kernels.current import kernels
 from evedrop.model import update
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.process import Floats, Process, StateFactors, product
-from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
+from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schedule import Schedule
-from evedrop.model.schemes.checks import probability_mistakes
-from evedrop.model.schemes.scheme import Encoder, Packet, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
+
+_INNOVATION = int(Action.INNOVATION)  # numpy compares with an int ten times as fast
 
 
 @final
@@ -34,8 +37,7 @@ class SharedSecret(Shared):
         self._factors = StateFactors(process)
         self._process = process
         self._trials = batch.trials
-        self._slots = range(0)
-        self._chi: Floats
+        self._chi = Ahead(self._reader, self._drawn)
 
     def nu(self, k: int) -> Flags:
         """ν_k, (R,): true for an innovation."""
@@ -43,13 +45,18 @@ class SharedSecret(Shared):
 
     def chi(self, k: int) -> Floats:
         """χ_k ~ N(0, A Σ_{k−1} Aᵀ), (n, R); 0 at k = 0."""
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            zero = [[0.0] * self._process.n for _ in range(self._process.n)]
-            factors = np.array([self._factors.carried(slot) if slot else zero for slot in self._slots])
-            self._chi = product(factors, self._reader.normals(self._slots))
-        chi: Floats = self._chi[k - self._slots.start]
-        return chi
+        return self._chi.at(k)
+
+    def nu_block(self, slots: range) -> Flags:
+        """ν of consecutive slots, (c, R)."""
+        return self._schedule.block(slots)
+
+    def chi_block(self, slots: range) -> Floats:
+        """χ of consecutive slots, (c, n, R)."""
+        return self._chi.of(slots)
+
+    def _drawn(self, slots: range) -> Floats:
+        return product(self._factors.block(slots), self._reader.normals(slots))
 
     def encoder(self) -> Encoder:
         """The sensor's side."""
@@ -74,6 +81,11 @@ class InnovationEncoder(Encoder):
         nu = self._secret.nu(k)
         return Packet(select(nu, lambda: (x - predicted) + self._secret.chi(k), lambda: x), nu)
 
+    def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:
+        """The packets of consecutive slots."""
+        nu = self._secret.nu_block(slots)
+        return PacketBlock(kernels.encode(nu, x, predicted, self._secret.chi_block(slots)), nu)
+
 
 class InnovationEstimator(Receiver):
     """The exact MMSE estimator with the secret.
@@ -92,12 +104,15 @@ class InnovationEstimator(Receiver):
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
-        action, z = self.act(k, heard.gamma), heard.z
-        return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, z, lambda: z - self._secret.chi(k)),
-            update.believed_covariance(self.process, k, belief.P, action),
-            action,
-        )
+        action = self.act(k, heard.gamma)
+        chi = self._secret.chi(k) if (action == _INNOVATION).any() else None
+        return update.belief(self.process, k, belief, action, heard.z, chi)
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """The same for consecutive slots."""
+        action = gamma.view(np.uint8) + (gamma & self._secret.nu_block(slots)).view(np.uint8)
+        found = update.beliefs(self.process, slots.start, belief, action, z, self._secret.chi_block(slots))
+        return found, found.last
 
 
 class Innovation(Scheme):

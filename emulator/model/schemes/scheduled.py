@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.model.checks import count_mistakes
 from evedrop.model.holding_time import HoldingTime
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
-from evedrop.model.schemes.checks import count_mistakes
 from evedrop.model.schemes.plain import PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.streams import Batch

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.block_methods import outdated
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.theory.covariances import Outcomes
@@ -31,12 +32,58 @@ class Packet(NamedTuple):
     """Whether a packet is sent, (R,); None for a scheme that sends in every slot."""
 
 
+class PacketBlock(NamedTuple):
+    """What the sensor sends in c consecutive slots; as `Packet`, with the slots as first axis."""
+
+    z: Floats
+    """(c, n, R)."""
+    nu: Flags
+    """(c, R)."""
+    header: NDArray[np.int64] | None = None
+    """(c, h, R)."""
+    sent: Flags | None = None
+    """(c, R)."""
+
+    @classmethod
+    def of(cls, packets: Sequence[Packet]) -> PacketBlock:
+        """The packets of single slots, at least one, as one."""
+        columns = zip(*packets, strict=True)
+        return cls(*(None if column[0] is None else np.array(column) for column in columns))  # type: ignore[arg-type]
+
+    @classmethod
+    def joined(cls, parts: Sequence[PacketBlock]) -> PacketBlock:
+        """Consecutive packets, at least one, as one."""
+        columns = zip(*parts, strict=True)
+        return cls(*(None if column[0] is None else np.concatenate(column) for column in columns))  # type: ignore[arg-type]
+
+    def rows(self, some: slice) -> PacketBlock:
+        """The packets of some of the slots."""
+        return PacketBlock(*(None if column is None else column[some] for column in self))  # type: ignore[arg-type]
+
+    def at(self, row: int) -> Packet:
+        """The packet of one of the slots."""
+        return Packet(*(None if column is None else column[row] for column in self))  # type: ignore[arg-type]
+
+
 class Encoder(ABC):
     """Makes packets from states, slot by slot."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take `encode_block` from this class again in a subclass that changes a slot and not a block of slots."""
+        super().__init_subclass__(**options)
+        if outdated(cls, "encode_block", "encode"):
+            setattr(cls, "encode_block", Encoder.encode_block)  # noqa: B010 - mypy refuses the assignment
 
     @abstractmethod
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The packet of slot k, from x_k and A x_{k−1}, both (n, R)."""
+
+    def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:
+        """The packets of consecutive slots, from x and A x of the slots before, both (c, n, R).
+
+        A scheme may override this to make many packets at once; the numbers must be those of `encode`, slot by slot.
+        """
+        return PacketBlock.of([self.encode(k, x[row], predicted[row]) for row, k in enumerate(slots)])
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:  # noqa: B027 - most schemes need none
         """Receive the acknowledgements (R,) of slot k that reached the sensor; called before slot k + 1 is sent."""

@@ -14,7 +14,7 @@ from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, se
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Ahead, Batch, BlockReader
 
 _SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
 
@@ -34,9 +34,8 @@ class TwinTracks:
         self._process = process
         self._apart: Floats = product(factor, normals[process.n :]) - self.initial
         self._k, self._distance = 0, self._apart
-        self._reader = BlockReader(keys["track"], batch, 1)
-        self._slots = range(0)
-        self._coins: Flags
+        reader = BlockReader(keys["track"], batch, 1)
+        self._coins = Ahead(reader, lambda slots: reader.uniforms(slots)[:, 0, :] < 0.5)
 
     def distance(self, k: int) -> Floats:
         """d_k, (n, R): the distance from the process's track to its twin's."""
@@ -49,11 +48,7 @@ class TwinTracks:
 
     def on_twin(self, k: int) -> Flags:
         """Whether the packet of slot k is on the twin's track, (R,), by a fair coin."""
-        if k not in self._slots:
-            self._slots = self._reader.block(k)
-            self._coins = self._reader.uniforms(self._slots)[:, 0, :] < 0.5
-        coins: Flags = self._coins[k - self._slots.start]
-        return coins
+        return self._coins.at(k)
 
 
 class TwinTrackEncoder(Encoder):
@@ -91,11 +86,7 @@ class TwinTrackEstimator(Receiver):
         """(A x̂, A P Aᵀ + Q) if lost, otherwise (z, 0) or (z − d_k, 0)."""
         action = self.act(k, heard.gamma)
         z = select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
-        return Belief(
-            update.estimate(self.process, k, belief.x_hat, action, z),
-            update.believed_covariance(self.process, k, belief.P, action),
-            action,
-        )
+        return update.belief(self.process, k, belief, action, z)
 
 
 class TwinTrack(Scheme):

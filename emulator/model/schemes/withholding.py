@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Receiver
 from evedrop.model.schedule import Schedule
-from evedrop.model.schemes.checks import probability_mistakes
 from evedrop.model.schemes.plain import PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes

@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.links.link import Fate, losses
+from evedrop.kernels.current import kernels
+from evedrop.model.links.link import REASONS, Fate
 from evedrop.model.receiver import Flags
 from evedrop.model.slot.link import Fates
 
@@ -48,13 +49,15 @@ class Accountant:
 
     def account(self, slots: range, fates: Fates) -> Account:
         """The account of the next slots."""
+        counts = kernels.count_codes(fates.codes, len(Fate))
+        unsent = counts[:, Fate.UNSENT].copy()
         return Account(
             fates.in_time,
-            losses(fates.codes),
+            {reason: counts[:, code].copy() for code, reason in enumerate(REASONS, 1)},
             self._late(slots, fates),
-            self._bursts(fates.codes == Fate.LOST),
-            self._delays(fates),
-            _unsent(fates),
+            kernels.count_bursts(fates.codes, Fate.LOST, self._run, COUNTED_BURSTS),
+            self._delays(fates, counts),
+            unsent if unsent.any() else None,
         )
 
     def _late(self, slots: range, fates: Fates) -> NDArray[np.uint16] | None:
@@ -73,27 +76,11 @@ class Accountant:
                     self._due.setdefault(k, np.zeros(self._trials, np.uint16))[trial] += 1
         return counts
 
-    def _bursts(self, lost: Flags) -> NDArray[np.uint32]:
-        """Lengths of the runs that were ended by a packet that was not lost."""
-        rows = np.arange(1, len(lost) + 1)[:, None]
-        # For each row, the last row up to it, from 1, whose packet was not lost; 0 if there is none in these slots.
-        kept = np.maximum.accumulate(np.where(lost, 0, rows), axis=0)
-        before = np.vstack([np.zeros((1, lost.shape[1]), kept.dtype), kept[:-1]])
-        lengths = rows - 1 - before + np.where(before == 0, self._run, 0)
-        ended = lengths[~lost & (lengths > 0)]
-        self._run = len(lost) - kept[-1] + np.where(kept[-1] == 0, self._run, 0)
-        return np.bincount(np.minimum(ended, COUNTED_BURSTS) - 1, minlength=COUNTED_BURSTS).astype(np.uint32)
-
-    def _delays(self, fates: Fates) -> NDArray[np.uint32]:
-        through = (fates.codes == Fate.DELIVERED) | (fates.codes == Fate.LATE)
+    def _delays(self, fates: Fates, counts: NDArray[np.uint32]) -> NDArray[np.uint32]:
         bins = self._window + 2
         if fates.delays is None:
-            counts = np.zeros(bins, np.uint32)
-            counts[0] = np.count_nonzero(through)
-            return counts
+            delays = np.zeros(bins, np.uint32)
+            delays[0] = counts[:, [Fate.DELIVERED, Fate.LATE]].sum()
+            return delays
+        through = (fates.codes == Fate.DELIVERED) | (fates.codes == Fate.LATE)
         return np.bincount(np.minimum(fates.delays[through], bins - 1), minlength=bins).astype(np.uint32)
-
-
-def _unsent(fates: Fates) -> NDArray[np.uint32] | None:
-    counts = np.count_nonzero(fates.codes == Fate.UNSENT, axis=1).astype(np.uint32)
-    return counts if counts.any() else None

@@ -47,14 +47,9 @@ class Fates(NamedTuple):
         delivered: Flags = self.codes == Fate.DELIVERED
         return delivered if self.delays is None else delivered & (self.delays == 0)
 
-    def in_time_of(self, row: int) -> Flags:
-        """γ of one slot, (R,)."""
-        delivered: Flags = self.codes[row] == Fate.DELIVERED
-        return delivered if self.delays is None else delivered & (self.delays[row] == 0)
-
     def copied(self) -> Fates:
         """A copy with arrays of its own, so that packets may be silenced in it."""
-        return Fates(self.codes.copy(), self.delays, None if self.again is None else self.again.copy())
+        return self._replace(codes=self.codes.copy(), again=None if self.again is None else self.again.copy())
 
     def silence(self, row: int, sent: Flags) -> None:
         """Mark the packets of one slot that are not sent (R,) as unsent, in place."""
@@ -107,10 +102,10 @@ class LinkSchedule:
     """The receiver whose losses these are tied to, and how strongly."""
 
 
-def streams_of(receiver: str, course: LinkSchedule) -> tuple[str, ...]:
+def streams_of(receiver: str, schedule: LinkSchedule) -> tuple[str, ...]:
     """The random streams of a receiver's link: losses, delays, all other faults, and correlation."""
     names = (f"link/{receiver}", f"delay/{receiver}", f"fate/{receiver}")
-    return names if course.correlation is None else (*names, f"mix/{receiver}", f"link/{course.correlation[0]}")
+    return names if schedule.correlation is None else (*names, f"mix/{receiver}", f"link/{schedule.correlation[0]}")
 
 
 @final
@@ -137,7 +132,7 @@ class Link:
     keys: the keys of `streams_of`.
     """
 
-    course: LinkSchedule
+    schedule: LinkSchedule
     receiver: str
     keys: Mapping[str, bytes]
     batch: Batch
@@ -147,8 +142,8 @@ class Link:
     _readers: dict[tuple[str, int], BlockReader] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._state = _State(self.course.settings, loss_of(self.course.settings["loss"]))
-        self._changes = sorted(self.course.changes, key=lambda change: change.at)
+        self._state = _State(self.schedule.settings, loss_of(self.schedule.settings["loss"]))
+        self._changes = sorted(self.schedule.changes, key=lambda change: change.at)
 
     def planned(self, slots: range) -> Fates:
         """The fates of the next slots, which may still be amended."""
@@ -240,8 +235,8 @@ class Link:
         sent = arrives
         if delays is not None:
             arrives = sent + delays
-            codes = np.where((codes == 0) & (delays > self.course.window), np.uint8(Fate.LATE), codes)
-        for outage in self.course.outages:
+            codes = np.where((codes == 0) & (delays > self.schedule.window), np.uint8(Fate.LATE), codes)
+        for outage in self.schedule.outages:
             if delays is not None or (outage.start < slots.stop and slots.start < outage.stop):
                 away = (codes == 0) & (sent < outage.stop) & (arrives >= outage.start)
                 codes = np.where(away, np.uint8(outage.reason), codes)
@@ -253,9 +248,9 @@ class Link:
         """Uniform numbers of this link's own stream, or in some slots of the stream to which its losses are tied."""
         width = self._state.loss.uniforms_per_slot
         own = self._uniforms("link", slots, width)
-        if self.course.correlation is None:
+        if self.schedule.correlation is None:
             return own
-        other, strength = self.course.correlation
+        other, strength = self.schedule.correlation
         mixed = self._uniforms("mix", slots, 1)
         theirs = self._reader_of(f"link/{other}", width).uniforms(slots)
         return np.where(mixed < strength, theirs, own)

@@ -74,32 +74,32 @@ class LinkLaw:
         return self.last if one and self.segments[0].quality_at is None and self.segments[0].chain.independent else None
 
 
-def law_of(course: LinkSchedule) -> LinkLaw | None:
+def law_of(schedule: LinkSchedule) -> LinkLaw | None:
     """The law of a link, from everything that is known of it in advance; None if theory does not cover it.
 
     It does not cover losses with a memory that is not a chain, losses that never settle, queues, delays that are not
     independent draws, and receivers that are away while packets are under way.
     """
     segments = []
-    for start, settings, cut in stretches(course):
-        segment = _segment(start, settings, cut, course.window)
+    for start, settings, cut in stretches(schedule):
+        segment = _segment(start, settings, cut, schedule.window)
         if segment is None:
             return None
         segments.append(segment)
     late = any(segment.arrived[0] < segment.arrived[-1] for segment in segments)
-    if late and course.outages:
+    if late and schedule.outages:
         return None
     if not late:
         segments = [replace(one, arrived=one.arrived[-1:]) for one in segments]
-    outages = tuple((one.start, one.stop, getattr(one, "keeps_state", True)) for one in course.outages)
+    outages = tuple((one.start, one.stop, getattr(one, "keeps_state", True)) for one in schedule.outages)
     return LinkLaw(tuple(segments), outages)
 
 
-def stretches(course: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool]]:
+def stretches(schedule: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool]]:
     """The first slots of stretches with constant link settings, with the settings and whether the link is cut."""
-    settings, cut = course.settings, False
+    settings, cut = schedule.settings, False
     marks = [(0, settings, False)]
-    for change in sorted(course.changes, key=lambda one: one.at):
+    for change in sorted(schedule.changes, key=lambda one: one.at):
         settings = settings if change.settings is None else change.settings
         cut = cut if change.cut is None else change.cut
         marks = [mark for mark in marks if mark[0] != change.at] + [(change.at, settings, cut)]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, final
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,8 @@ from evedrop.model.links.link import Fate
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, Reception
 from evedrop.model.slot.link import Fates
+
+NOTHING: Mapping[int, Any] = MappingProxyType({})
 
 
 class Late(NamedTuple):
@@ -30,6 +34,32 @@ class Arrival(NamedTuple):
     heard: Reception
     """The slot's own packets."""
     late: tuple[Late, ...] = ()
+
+
+class Arrivals(NamedTuple):
+    """Everything that arrives at a receiver in c consecutive slots."""
+
+    gamma: Flags
+    """γ: whether the slot's own packet arrives, (c, R)."""
+    z: Floats
+    """Packets, (c, n, R); undefined where nothing was received."""
+    header: NDArray[np.int64] | None = None
+    """(c, h, R); None for a scheme without a header."""
+    late: Mapping[int, tuple[Late, ...]] = NOTHING
+    """Row → late packets, for rows in which any arrive."""
+    truth: Mapping[int, Floats] = NOTHING
+    """Row → x_k (n, R), for the row whose state is betrayed to this receiver."""
+
+    @property
+    def plain(self) -> bool:
+        """Whether the slots' own packets are all there is."""
+        return self.header is None and not self.late and not self.truth
+
+    def at(self, row: int) -> Arrival:
+        """What arrives in one of the slots."""
+        header = None if self.header is None else self.header[row]
+        heard = Reception(self.gamma[row], self.z[row], header, self.truth.get(row))
+        return Arrival(heard, self.late.get(row, ()))
 
 
 @final
@@ -61,6 +91,15 @@ class Transit:
                 self._keep(k, int(wait), Reception(again[row] & (waits == wait), z, header), copy=True)
             due += self._due.pop(k, [])
         return Arrival(Reception(delivered, z, header), tuple(due))
+
+    def arrivals(self, slots: range, fates: Fates, z: Floats, header: NDArray[np.int64] | None = None) -> Arrivals:
+        """The same for consecutive slots: z (c, n, R), header (c, h, R)."""
+        late = {}
+        for row, k in enumerate(slots):
+            found = self.arrival(k, fates, row, z[row], None if header is None else header[row]).late
+            if found:
+                late[row] = found
+        return Arrivals(fates.in_time, z, header, late)
 
     def _keep(self, k: int, wait: int, heard: Reception, copy: bool) -> None:
         header = None if heard.header is None else heard.header.copy()

@@ -12,7 +12,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import final
 
 import numpy as np
@@ -23,6 +25,7 @@ from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python's overhead, quick to set up (3 ms)
 _LARGEST_POWER = 1e100  # bound on A's entries within a block, far from overflow
 _ROUNDING = 1e-12
+_FEW_STATES = 9  # n² equations are solved at once, which takes a tenth of SciPy's time; it does the same up to here
 LARGEST_OPERATOR = 512
 """The most rows of a linear operator whose limit is computed, which takes some seconds; beyond it no limit is given."""
 
@@ -141,27 +144,15 @@ class ExpectedCovariance:
         self._process = process
         self._outcomes = outcomes
         self._remaining = RemainingCovariances(process) if outcomes.leaked else None
+        matrices = (np.float64(one).tobytes() for one in (process.A, process.Q))
+        key = (*matrices, n, outcomes.kept, outcomes.predicted, outcomes.misled)
+        self._powers, self._kept_powers, self._diffusion, self._spread, self._weights = _block_tables(*key)
         with np.errstate(over="ignore", invalid="ignore"):
-            length = _block_length(process.A)
-            self._powers = _powers(process.A, length)
-            self._kept_powers = _powers(math.sqrt(outcomes.kept) * process.A, length)
-            self._diffusion = np.empty((length, n, n))
-            self._spread = np.empty((length, n, n))
-            self._weights = 2.0 * outcomes.misled * np.cumsum(outcomes.kept ** np.arange(length))
-            E = np.zeros((n, n))
-            W = np.zeros((n, n))
-            for j in range(length):
-                carried = process.A @ W @ process.A.T
-                E = (
-                    outcomes.kept * (process.A @ E @ process.A.T)
-                    + outcomes.predicted * process.Q
-                    + 2.0 * outcomes.misled * carried
-                )
-                W = carried + process.Q
-                self._diffusion[j], self._spread[j] = E, W
             self._block: Floats = outcomes.initial * process.initial_covariance[None]
         self._sigma: Floats = process.initial_covariance
         self._next = 0
+        self._settled = False
+        """Whether all further blocks are equal to this one, because it ends with the value that it began after."""
 
     def next(self, slots: int) -> Floats:
         """The expectation in the next slots, (slots, n, n)."""
@@ -184,6 +175,8 @@ class ExpectedCovariance:
     def _advance(self) -> None:
         E = self._block[-1]
         self._next = 0
+        if self._settled:
+            return
         if not np.isfinite(E[0, 0]):
             self._block = np.full(self._powers.shape, np.inf)
             return
@@ -196,6 +189,8 @@ class ExpectedCovariance:
                 grown = _congruences(self._powers, self._sigma)
                 block += self._weights[:, None, None] * grown
                 self._sigma = grown[-1] + self._spread[-1]
+            else:
+                self._settled = np.array_equal(block[-1], E)
         self._block = _unbounded_from_overflow(block)
 
     def _slot_by_slot(self, E: Floats, remaining: RemainingCovariances) -> Floats:
@@ -302,20 +297,28 @@ def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
 
 
 def _stationary(process: Process, kept: float, source: Floats) -> Floats:
-    from scipy.linalg import LinAlgError, LinAlgWarning, solve_discrete_lyapunov  # noqa: PLC0415 - slow to import
-
-    unbounded = np.full_like(source, np.inf)
+    S: Floats = np.full_like(source, np.inf)
     if kept * radius(process) ** 2 >= 1.0 - _ROUNDING:
-        return unbounded
+        return S
+    # Near the bound the equation may be singular to rounding, or nearly; finiteness and definiteness decide.
+    with suppress(np.linalg.LinAlgError):
+        S = _fixed_point(math.sqrt(kept) * process.A, source)
+    sound = np.isfinite(S).all() and np.linalg.eigvalsh(0.5 * (S + S.T))[0] >= -1e-9 * np.abs(S).max()
+    return S if sound else np.full_like(source, np.inf)
+
+
+def _fixed_point(F: Floats, source: Floats) -> Floats:
+    """S = F S Fᵀ + source, (n, n). Raises LinAlgError; near the bound of stability S may be no covariance."""
+    n = len(F)
+    if n <= _FEW_STATES:
+        squared = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)
+        S = np.linalg.solve(np.eye(n * n) - squared, source.reshape(-1))
+        return np.asarray(S, np.float64).reshape(n, n)
+    from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov  # noqa: PLC0415 - slow to import
+
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LinAlgWarning)  # near the bound; the definiteness below decides
-        try:
-            S: Floats = np.asarray(solve_discrete_lyapunov(math.sqrt(kept) * process.A, source))
-        except LinAlgError:
-            return unbounded
-    if not np.all(np.isfinite(S)) or np.linalg.eigvalsh(0.5 * (S + S.T))[0] < -1e-9 * np.abs(S).max():
-        return unbounded
-    return S
+        warnings.simplefilter("ignore", LinAlgWarning)
+        return np.asarray(solve_discrete_lyapunov(F, source))
 
 
 def _block_length(A: Floats) -> int:
@@ -326,6 +329,31 @@ def _block_length(A: Floats) -> int:
             break
         length *= 2
     return length
+
+
+@lru_cache(maxsize=64)
+def _block_tables(
+    dynamics: bytes, noise: bytes, n: int, kept: float, predicted: float, misled: float
+) -> tuple[Floats, ...]:
+    """What is the same in every block: A^j, F^j, the sums of Q's part and of W's part, and the weights; none may be changed.
+
+    dynamics, noise: A and Q as bytes. A run asks for the same ones in every verdict, and they take milliseconds.
+    """
+    A, Q = (np.frombuffer(one).reshape(n, n) for one in (dynamics, noise))
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = _block_length(A)
+        diffusion, spread = np.empty((length, n, n)), np.empty((length, n, n))
+        E, W = np.zeros((n, n)), np.zeros((n, n))
+        for j in range(length):
+            carried = A @ W @ A.T
+            E = kept * (A @ E @ A.T) + predicted * Q + 2.0 * misled * carried
+            W = carried + Q
+            diffusion[j], spread[j] = E, W
+        weights = 2.0 * misled * np.cumsum(kept ** np.arange(length))
+        found = (_powers(A, length), _powers(math.sqrt(kept) * A, length), diffusion, spread, weights)
+    for table in found:
+        table.flags.writeable = False
+    return found
 
 
 def _powers(A: Floats, length: int) -> Floats:

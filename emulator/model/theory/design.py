@@ -41,7 +41,7 @@ class Adversary:
     """Whether it uses the leak of innovations: the genie, with the probabilities of smart."""
 
     @classmethod
-    def who(cls, name: str, mu_e: float, half: Outcomes) -> Adversary:
+    def with_outcomes(cls, name: str, mu_e: float, half: Outcomes) -> Adversary:
         """From its outcomes behind a lossless link at μ_d = 1/2."""
         return cls(name, mu_e, 2.0 * half.state, 2.0 * half.misled, half.leaked > 0.0)
 
@@ -54,7 +54,7 @@ class Adversary:
 
 @dataclass(frozen=True)
 class Against:
-    """The secrecy that can be had against one eavesdropper."""
+    """The secrecy that is possible against one eavesdropper."""
 
     bound: float
     """Lower end of the μ_d at which its error is bounded: (1 − ρ⁻²)/μ_e for smart; inf if there is no such μ_d."""
@@ -247,15 +247,9 @@ def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple
         elif before != after:
             edges.append(float(b if after == 0 else a))
     edges.append(1.0)
-    intervals: list[Interval] = []
-    for a, b in pairwise(edges):
-        if b - a <= _EQUAL or advantage(0.5 * (a + b)) <= 0.0:
-            continue
-        if intervals and intervals[-1][1] == a:
-            intervals[-1] = (intervals[-1][0], b)
-        else:
-            intervals.append((a, b))
-    return tuple(intervals)
+    edges = [low, *(b for a, b in pairwise(edges) if b - a > _EQUAL)]
+    wins = np.array([advantage(0.5 * (a + b)) > 0.0 for a, b in pairwise(edges)], np.bool_)
+    return tuple((edges[first - 1], edges[last]) for first, last in _stretches(wins))
 
 
 def least_state_probability(process: Process, mu: float, max_trace: float) -> float:

@@ -12,7 +12,7 @@ from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
 UNIT_ROUNDOFF = 2.0**-53
 TOLERANCE = 0.01
 _NO_NOISE = 1e-12  # relative to the largest eigenvalue of a singular Q: eigenvalues below it are rounding
-_EACH = 2**22  # numbers in the covariances of slots that are checked one by one; later slots are bisected
+_EACH = 2**17  # numbers in the covariances of slots that are checked one by one; later slots are bisected
 _AT_LEAST = 1024
 
 

@@ -12,65 +12,16 @@ Source: docs/mathematics.md, genie.
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import final
 
 import numpy as np
 
-from evedrop.kernels.elementary import Rows, cholesky, triangular_factor
-from evedrop.model.numeric.factored import Factor
-from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
+from evedrop.kernels.current import kernels
+from evedrop.kernels.elementary import cholesky
+from evedrop.kernels.leak import Leak
+from evedrop.model.process import MARGINAL, Floats, Process, StateFactors
 
-
-@final
-class Leak:
-    """The leak of a slot k ≥ 1; its numbers depend only on the process."""
-
-    def __init__(self, carried: Rows, noise: Rows) -> None:
-        n = len(noise)
-        above = [left + right for left, right in zip(carried, noise, strict=True)]
-        below = [[0.0] * n + right for right in noise]
-        joint = triangular_factor(above + below)
-        self._state = [row[:n] for row in joint[:n]]
-        self._gain = np.array([row[:n] for row in joint[n:]])
-        self._remaining = [row[n:] for row in joint[n:]]
-
-    def white(self, z: Floats) -> Floats:
-        """L_k⁻¹ z, (n, R): white where z ~ N(0, Σ_k), which is the distribution of packets of both types."""
-        y = np.empty_like(z)
-        for i, row in enumerate(self._state):
-            rest = z[i]
-            for j in range(i):
-                rest = rest - row[j] * y[j]
-            y[i] = rest / row[i]
-        return y
-
-    def innovation(self, white: Floats) -> Floats:
-        """The mean of w_{k−1} given the packet, QΣ_k⁻¹ z = QΣ_k⁻¹ L_k y, from y = L_k⁻¹ z, both (n, R)."""
-        return product(self._gain, white)
-
-    @cached_property
-    def remaining(self) -> Floats:
-        """M_k = Q − QΣ_k⁻¹Q, the covariance of w_{k−1} given the packet, (n, n)."""
-        n = len(self._remaining)
-        M = np.empty((n, n))
-        for i in range(n):
-            for j in range(i + 1):
-                total = 0.0
-                for c in range(j + 1):
-                    total += self._remaining[i][c] * self._remaining[j][c]
-                M[i, j] = M[j, i] = total
-        return M
-
-    @cached_property
-    def remaining_factor(self) -> Factor:
-        """M_k, factored."""
-        return Factor.of_triangular(self._remaining)
-
-    @cached_property
-    def state_diagonal(self) -> list[float]:
-        """Squares of L_k's diagonal, (n,): their product is det Σ_k."""
-        return [row[i] * row[i] for i, row in enumerate(self._state)]
+_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE = 64, 1 << 16  # read ahead of need
 
 
 @final
@@ -113,16 +64,34 @@ def remaining_limit(process: Process) -> Floats:
 
 @final
 class Leaks:
-    """The leak of every slot k ≥ 1; reading slots in order computes each once."""
+    """The leak of every slot k ≥ 1; reading slots in order computes each once, and many at a time."""
 
     def __init__(self, process: Process) -> None:
         self._states = StateFactors(process)
-        self._noise: Rows = cholesky(process.Q).tolist()
+        self._noise = cholesky(process.Q)
+        self._count = max(1, min(_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE // (4 * process.n * process.n)))
+        self._slots = range(0)
+        self._factors: Floats
         self._k = 0
         self._leak: Leak
 
     def at(self, k: int) -> Leak:
         """The leak of slot k."""
         if k != self._k:
-            self._k, self._leak = k, Leak(self._states.carried(k), self._noise)
+            self._k, self._leak = k, Leak(self.block(range(k, k + 1))[0])
         return self._leak
+
+    def block(self, slots: range) -> Floats:
+        """The triangular matrices of consecutive slots, at least one, (c, 2n, 2n); that of slot 0 has no meaning."""
+        if slots.start < self._slots.start or slots.stop > self._slots.stop:
+            self._slots = range(slots.start, max(slots.stop, slots.start + self._count))
+            self._factors = self._computed(self._slots)
+        start = self._slots.start
+        return self._factors[slots.start - start : slots.stop - start]
+
+    def _computed(self, slots: range) -> Floats:
+        n = len(self._noise)
+        joint = np.zeros((len(slots), 2 * n, 2 * n))
+        joint[:, :n, :n] = self._states.block(slots)
+        joint[:, :n, n:] = joint[:, n:, n:] = self._noise
+        return kernels.triangular_factors(joint)

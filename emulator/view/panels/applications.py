@@ -30,7 +30,7 @@ class ApplicationPanels(ViewPanel):
         for panel in self.scene.panels:
             span = None if panel.span is None else rrb.ScalarAxis(range=panel.span, zoom_lock=True)
             view = curves_view(panel.title, panel.path, whole_run(self.scene), span)
-            yield PlacedView(view, "right", 1.2) if panel.beside else PlacedView(view, "left")
+            yield PlacedView(view, "right", 1.2) if panel.with_beliefs else PlacedView(view, "left")
 
     def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
         """The styles that the application describes; a receiver's own colour if it gives none."""

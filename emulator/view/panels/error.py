@@ -24,7 +24,7 @@ class SquaredError(ViewPanel):
         """One view, with the legend of receivers unless an application's panel above it has one."""
         title = "Squared error |x − x̂|²   log10"
         if self.scene.moving:
-            legend = not any(panel.beside for panel in self.scene.panels)
+            legend = not any(panel.with_beliefs for panel in self.scene.panels)
             yield PlacedView(receivers_view(title, [_PATH], whole_run(self.scene), legend=legend), "right")
         else:
             title += ", bottom: exact"

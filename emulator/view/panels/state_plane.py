@@ -1,16 +1,18 @@
-"""The panel of the first two states: the truth and every estimate with its recent path, and the covariance ellipses believed."""
+"""The panel of the first two states, and its geometry: truth, estimates with their recent paths, covariance ellipses believed."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from typing import final
+from dataclasses import dataclass, field
+from typing import Any, final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from evedrop.view import plane
+from evedrop.model.process import Floats
 from evedrop.view.column import TIMELINE, Column
 from evedrop.view.palette import GROUND, Colour, colour, dim
 from evedrop.view.palette import TRUTH as WHITE
@@ -29,8 +31,8 @@ class StatePlane(ViewPanel):
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
-        self._frame, every = plane.Frame(), plane.stride(scene)
-        self._trails = {name: plane.Trail(every) for name in (TRUTH, *(shown.name for shown in scene.receivers))}
+        self._frame, every = Frame(), stride(scene)
+        self._trails = {name: Trail(every) for name in (TRUTH, *(shown.name for shown in scene.receivers))}
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
@@ -55,7 +57,7 @@ class StatePlane(ViewPanel):
 
     def _past(self, slots: int) -> rrb.VisibleTimeRanges:
         # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.
-        reach = max(slots, 4 * plane.stride(self.scene))
+        reach = max(slots, 4 * stride(self.scene))
         return rrb.VisibleTimeRanges(
             [
                 rrb.VisibleTimeRange(
@@ -77,9 +79,9 @@ class StatePlane(ViewPanel):
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Points, trails, ellipses, and the frame around them."""
-        k, at = slots.numbers, plane.frames(self.scene, slots.first, slots.count)
-        positions = {TRUTH: plane.on_plane(slots.x)}
-        positions |= {name: plane.on_plane(peer.x_hat) for name, peer in slots.peers.items()}
+        k, at = slots.numbers, frames(self.scene, slots.first, slots.count)
+        positions = {TRUTH: on_plane(slots.x)}
+        positions |= {name: on_plane(peer.x_hat) for name, peer in slots.peers.items()}
         for name, points in positions.items():
             yield from self._moving(name, k, points, at)
         everybody = np.stack([*positions.values()])
@@ -88,12 +90,10 @@ class StatePlane(ViewPanel):
             return
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
         for name, peer in slots.peers.items():
-            ellipses = plane.ellipses(peer.x_hat[at], peer.P[at])
-            yield Column(_ellipse(name), k[at], rr.LineStrips2D.columns(strips=ellipses))
+            outlines = ellipses(peer.x_hat[at], peer.P[at])
+            yield Column(_ellipse(name), k[at], rr.LineStrips2D.columns(strips=outlines))
 
-    def _moving(
-        self, name: str, k: NDArray[np.int64], positions: plane.Points, at: NDArray[np.intp]
-    ) -> Iterator[Column]:
+    def _moving(self, name: str, k: NDArray[np.int64], positions: Points, at: NDArray[np.intp]) -> Iterator[Column]:
         pieces = self._trails[name].pieces(positions, at)
         if len(at):
             yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=pieces))
@@ -121,3 +121,109 @@ def _ellipse(name: str) -> str:
 
 def _point(name: str) -> str:
     return f"{_PATH}/{name}/at"
+
+
+Points = NDArray[np.float32]
+
+_FRAMES_PER_SECOND = 30.0
+_MOST_FRAMES = 4_000
+_MOST_FRAMES_IN_REAL_TIME = 30_000  # five a second for more than an hour
+_LARGEST = 1e30  # Rerun's points are float32
+_FRAMED_SLOTS = 256
+_SIGMAS = 2.0
+_CORNERS = 40
+
+
+def stride(scene: Scene) -> int:
+    """Slots from one frame to the next."""
+    most = _MOST_FRAMES_IN_REAL_TIME if scene.pace > 0 else _MOST_FRAMES
+    smooth = math.ceil(1.0 / (_FRAMES_PER_SECOND * scene.pace) - 1e-9) if scene.pace > 0 else 1
+    return max(1, smooth, math.ceil(scene.slots / most))
+
+
+def frames(scene: Scene, first: int, count: int) -> NDArray[np.intp]:
+    """The slots among `count` from `first` on that are frames, as offsets; the run's last slot always is."""
+    every = stride(scene)
+    offsets = np.arange(-first % every, count, every)
+    if first + count == scene.slots and (first + count - 1) % every:
+        offsets = np.append(offsets, count - 1)
+    return offsets
+
+
+def on_plane(states: Floats) -> Points:
+    """The first two states, (c, 2), of states (c, n); Rerun's y axis points down, so the second is negated."""
+    return _shown(states[:, :2] * np.array([1.0, -1.0]))
+
+
+def ellipses(centres: Floats, P: Floats) -> Points:
+    """2σ ellipses of P (c, n, n) around states (c, n) as closed lines, (c, 41, 2).
+
+    A circle mapped by the Cholesky factor, written out so that a covariance of 0 gives a point and not an error.
+    """
+    angle = np.linspace(0.0, 2.0 * math.pi, _CORNERS + 1)
+    with np.errstate(all="ignore"):
+        spread = np.sqrt(np.maximum(P[:, 0, 0], 0.0))
+        lean = np.where(spread > 0.0, P[:, 1, 0] / np.where(spread > 0.0, spread, 1.0), 0.0)
+        rest = np.sqrt(np.maximum(P[:, 1, 1] - lean * lean, 0.0))
+        across = spread[:, None] * np.cos(angle)
+        along = lean[:, None] * np.cos(angle) + rest[:, None] * np.sin(angle)
+        lines = centres[:, None, :2] + _SIGMAS * np.stack([across, along], axis=2)
+    return _shown(lines * np.array([1.0, -1.0]))
+
+
+def _shown(values: NDArray[Any]) -> Points:
+    points: Points = np.clip(np.nan_to_num(values, nan=_LARGEST), -_LARGEST, _LARGEST).astype(np.float32)
+    return points
+
+
+@final
+@dataclass
+class Frame:
+    """The part of the plane to show: a box around all recent points, with some room.
+
+    Its sides lie on a grid that is coarse compared with its size, so that the view does not jitter.
+    """
+
+    _lows: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    _highs: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+
+    def boxes(self, lows: Points, highs: Points, offsets: NDArray[np.intp]) -> Points:
+        """Closed boxes (len(offsets), 5, 2) at these offsets of the next slots, which reach from lows to highs (c, 2)."""
+        before = len(self._lows)
+        self._lows = np.concatenate([self._lows, lows])
+        self._highs = np.concatenate([self._highs, highs])
+        low, high = np.empty((len(offsets), 2)), np.empty((len(offsets), 2))
+        for i, end in enumerate((offsets + before + 1).tolist()):
+            recent = slice(max(0, end - _FRAMED_SLOTS), end)
+            low[i], high[i] = self._lows[recent].min(axis=0), self._highs[recent].max(axis=0)
+        self._lows, self._highs = self._lows[-_FRAMED_SLOTS:], self._highs[-_FRAMED_SLOTS:]
+        step = np.exp2(np.floor(np.log2(np.maximum(high - low, 1e-30).max(axis=1, keepdims=True, initial=1e-30)))) / 8
+        low, high = (np.floor(low / step) - 0.5) * step, (np.ceil(high / step) + 0.5) * step
+        corners = [(low, low), (high, low), (high, high), (low, high), (low, low)]
+        return _shown(np.stack([np.stack([x[:, 0], y[:, 1]], axis=1) for x, y in corners], axis=1))
+
+
+@final
+@dataclass
+class Trail:
+    """The path of one point, cut at the frames into pieces of equal length, so that they fit into one array.
+
+    Piece i leads from the previous frame to frame i, through every slot between.
+    """
+
+    every: int
+    """Slots from one frame to the next, as by `stride`."""
+    _since: Points | None = None
+
+    def pieces(self, positions: Points, offsets: NDArray[np.intp]) -> Points:
+        """Pieces (len(offsets), every + 1, 2) that end at these offsets of the next positions (c, 2)."""
+        since = positions[:1] if self._since is None else self._since
+        path = np.concatenate([since, positions])
+        ends = offsets + len(since)
+        # A piece that would begin before the run, or before the frame ahead of a shortened last one, repeats its start.
+        starts = np.concatenate([[len(since) - 1 if self._since is None else 0], ends[:-1]]) if len(ends) else ends
+        index = np.maximum(ends[:, None] - np.arange(self.every, -1, -1), starts[:, None])
+        pieces: Points = path[np.minimum(index, len(path) - 1)]
+        keep_from = int(ends[-1]) if len(ends) else 0
+        self._since = path[keep_from:]
+        return pieces

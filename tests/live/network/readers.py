@@ -40,7 +40,7 @@ def _commanded(process: str, receivers: tuple[str, ...] | None = None) -> tuple[
 
 
 READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
-    "packet": _on("uplink", lambda m: (packets.read_uplink(m, K, SHAPE), packets.read_beside(m, SHAPE, 1))),
+    "packet": _on("uplink", lambda m: (packets.read_uplink(m, K, SHAPE), packets.read_extras(m, SHAPE, 1))),
     "resend": _on("uplink", lambda m: packets.is_resend(m) and packets.read_resend(m, SLOTS)),
     "barrier": _on("uplink", lambda m: packets.is_barrier(m) and m.slot(K)),
     "delivery": _on("downlink/eve", lambda m: packets.read_delivery(m, K, SHAPE, 1, WINDOW)),
@@ -82,7 +82,7 @@ def _accounts() -> dict[str, Account]:
 
 _z, _header, _flags = np.arange(6.0).reshape(SHAPE), np.ones((1, TRIALS), np.int64), np.array([True, False, True])
 _late = (Late(3, Reception(_flags, _z, _header)),)
-_digests = {0: np.zeros((TRIALS, 32), np.uint8)}
+_digests = {0: np.zeros((TRIALS, 16), np.uint8)}
 EXAMPLES: Mapping[str, bytes] = {
     "packet": packets.uplink(K, _z, _header, _flags, _z),
     "resend": packets.resend(2, 6, 4),

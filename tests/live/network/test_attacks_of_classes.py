@@ -73,7 +73,7 @@ def seen():
 
 
 def report(when):
-    words = Path("/proc/self/cmdline").read_text().split("\\0")
+    words = Path("/proc/self/cmdline").read_text().replace("\\0", " ").split()
     line = {{
         "when": when,
         "pid": os.getpid(),

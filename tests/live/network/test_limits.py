@@ -46,7 +46,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
     heard = Reception(all_of, z, header)
     late = tuple(Late(k, heard) for _ in range(2 * (sizes.window + 1)))
     packed = b"" if header is None else packets.packed_header(header, all_of)
-    digests = {k: np.ones((R, 32), np.uint8), k + 1: np.ones((R, 32), np.uint8)}
+    digests = {k: np.ones((R, 16), np.uint8), k + 1: np.ones((R, 16), np.uint8)}
     u = np.ones((c, sizes.inputs, R)) if sizes.inputs else None
     flags, counts = np.ones((c, R), bool), np.ones((c, R), np.uint16)
     lost = {reason: np.ones(c, np.uint32) for reason in REASONS}

@@ -26,11 +26,13 @@ from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.loading import load
+from evedrop.names import OBSERVER
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import stream_key
 from tests.live.network.bench import LIMIT_SECONDS, Ear, connect, until
+from tests.processes import descendants, parent_of, words_of
 
 SCENARIO = """
 title = "Under attack"
@@ -70,6 +72,7 @@ raise SystemExit(main(sys.argv[2:]))
 """  # a run as it is, and a copy of every brief it writes
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
 EVERYBODY = (*PROCESSES, "router", "observer")
+SERVERS = ("server of observers", "server of others")
 TOKEN = "only-the-launcher-has-this"  # noqa: S105 - an example
 ENOUGH = 20  # messages on each of the keys that are meant to be heard
 
@@ -144,13 +147,16 @@ def disturb(eve: AnyBrief, keys: RunKeys) -> None:
 
 
 def processes_of(pid: int) -> dict[str, int]:
-    """Process name → pid, of the children of a launcher."""
+    """Process name → pid, of the processes that a launcher has started, and of its fork servers."""
     found = {}
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        arguments = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
-        *options, path, _ = arguments if len(arguments) > 1 else (b"", b"")
-        if b"evedrop" in options and path.endswith(b".json"):
-            found[Path(path.decode()).stem] = int(child)
+    for child in descendants(pid):
+        *options, last = words_of(child)
+        if "evedrop" in options and last.endswith(".json"):
+            found[Path(last).stem] = child
+        elif "evedrop.fork_server" in options:
+            found[SERVERS["evedrop.fork_server" not in words_of(parent_of(child))]] = (
+                child  # that of observers is a fork
+            )
     return found
 
 
@@ -175,7 +181,10 @@ def attack(folder: Path) -> Evidence:
             )
         )
         stack.callback(run.kill)
-        found = until(lambda: (here := processes_of(run.pid)).keys() == set(EVERYBODY) and here, "all processes")
+        found = until(
+            lambda: (here := processes_of(run.pid)).keys() == {*EVERYBODY, *SERVERS} and here, "all processes"
+        )
+        servers = [found.pop(server) for server in SERVERS]
         briefs = {name: read_brief(kept / f"{name}.json") for name in EVERYBODY}
         keys, eve = RunKeys(briefs["eve"].run), briefs["eve"]
         meant = {keys.downlink(name): name for name in PROCESSES[1:]}
@@ -205,7 +214,8 @@ def attack(folder: Path) -> Evidence:
         traces = {
             name: {
                 "brief": (kept / f"{name}.json").read_bytes(),
-                "environment": Path(f"/proc/{pid}/environ").read_bytes(),
+                # The system shows the environment of a fork's server as the fork's.
+                "environment": Path(f"/proc/{servers[name != OBSERVER]}/environ").read_bytes(),
                 "arguments": Path(f"/proc/{pid}/cmdline").read_bytes(),
             }
             for name, pid in found.items()
@@ -262,7 +272,7 @@ def secrets_of(scenario: Scenario) -> dict[str, bytes]:
     """Every piece of key material of a scenario, by name."""
     keys = StreamKeys.of(scenario)
     found = {"seed's root": keys.seed_root, "secret's root": keys.secret_root, "process": keys.process}
-    found |= keys.links({name: scenario.course(name) for name in scenario.receivers})
+    found |= keys.links({name: scenario.schedule(name) for name in scenario.receivers})
     found |= {f"coin/{name}": stream_key(keys.seed_root, f"coin/{name}") for name in scenario.eavesdroppers}
     return found | keys.secret(("schedule", "noise"))
 

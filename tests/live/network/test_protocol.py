@@ -15,8 +15,8 @@ from evedrop.live.network.access import grants
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.model.digest import BeliefLog, RunDigest
-from evedrop.model.receiver import Belief
+from evedrop.model.digest import BlockDigests, RunDigest
+from evedrop.model.receiver import Beliefs
 from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
 from tests.live.network.golden import CODECS, GOLDEN, KEY, MESSAGES, TEXT, parts_of
 
@@ -111,15 +111,11 @@ def test_digest() -> None:
     golden = json.loads(GOLDEN["digest"])
     gamma, x_hat = np.array(golden["gamma"], np.uint8), np.array(golden["x_hat"])
     P = np.array(golden["P"]).reshape(3, 2, 2, 2)
-    log = BeliefLog(2, 2, 3)
-    blocks = [log.add(k, Belief(x_hat[k], P[k], gamma[k])) for k in range(3)]
-    assert blocks[:2] == [None, None]
-    assert blocks[2] is not None
-    first, digests = blocks[2]
-    assert first == 0
-    assert [bytes(row).hex() for row in digests] == golden["blocks"]
+    found = BlockDigests(2, 3).add(range(3), Beliefs(x_hat, P, gamma))
+    assert list(found) == [0]
+    assert [bytes(row).hex() for row in found[0]] == golden["blocks"]
     whole = RunDigest()
-    whole.add({first: digests})
+    whole.add(found)
     assert whole.hexadecimal == golden["receiver"]
 
 

@@ -14,9 +14,8 @@ import zenoh
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_places, places_at
-from evedrop.live.network.access import Grant, access_control, grants
+from evedrop.live.network.access import Grant, access_control, at_relay, at_router, grants
 from evedrop.live.network.health import is_there
-from evedrop.live.network.linked_routers import at_relay, at_router
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets

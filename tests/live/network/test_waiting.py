@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import socket
+import ssl
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,7 +16,7 @@ import pytest
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network import connecting
-from evedrop.live.network.connecting import RouterAddress
+from evedrop.live.network.connecting import Failures, RouterAddress
 from evedrop.live.network.session import Session
 from evedrop.ports import free_port
 from tests.clock import TestClock
@@ -79,3 +80,15 @@ def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_
         assert brief.identity is not None
         with pytest.raises(RunError, match=r"no router answered at .* within 10 s"):
             Session(replace(brief, patience=10), clock=TestClock())
+
+
+@pytest.mark.parametrize("error", [ssl.SSLEOFError, ssl.SSLZeroReturnError, ConnectionResetError, BrokenPipeError])
+@pytest.mark.parametrize("secure", [True, False])
+def test_a_connection_that_ends_is_a_refusal_only_in_clear(error: type[OSError], secure: bool) -> None:
+    """With each of the errors by which versions of Python and of OpenSSL report it."""
+    clock = TestClock()
+    failures = Failures(clock, secure)
+    for _ in range(8):
+        failures.add(error("the connection has been closed"), 0.1)
+        clock.sleep(1.0)
+    assert failures.refused is not secure

@@ -26,6 +26,7 @@ from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
+from tests.builders import mirrored
 from tests.live.network.readers import EXAMPLES, READERS, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -110,7 +111,7 @@ def test_marks(k: int) -> None:
 def test_leaving(data: st.DataObject, k: int, n: int, trials: int) -> None:
     """A receiver's last word reads back bit by bit."""
     x_hat = data.draw(arrays(float, (n, trials), elements=FINITE))
-    P = data.draw(arrays(float, (n, n, trials), elements=FINITE))
+    P = mirrored(data.draw(arrays(float, (n, n, trials), elements=FINITE)))
     message = Reader("t", telemetry.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
     assert telemetry.is_leaving(message)
     found, belief = telemetry.read_leaving(message, extent(n, trials))
@@ -141,10 +142,10 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
         k,
         data.draw(arrays(float, (count, n, trials), elements=FINITE)),
         data.draw(arrays(np.uint8, (count, trials), elements=st.integers(0, 3))),
-        data.draw(arrays(float, (count, n, n, recorded), elements=FINITE)),
+        mirrored(data.draw(arrays(float, (count, n, n, recorded), elements=FINITE))),
         data.draw(arrays(float, (count, 2), elements=FINITE)),
         late,
-        {block: data.draw(arrays(np.uint8, (trials, 32))) for block in blocks.ended(k, k + count)},
+        {block: data.draw(arrays(np.uint8, (trials, 16))) for block in blocks.ended(k, k + count)},
         None if late is None else late // 2,
     )
     of_run = replace(extent(n, trials, recorded), slots=slots)

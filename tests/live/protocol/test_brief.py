@@ -15,8 +15,8 @@ import pytest
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import places_at
-from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, read_brief
-from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, has_part, read_brief
+from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart, SensorPart
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.loading import load
 from evedrop.scenario import Scenario
@@ -56,6 +56,20 @@ def test_reads_back_what_was_written(tmp_path: Path) -> None:
     assert BRIEF.stream_keys == {"schedule": bytes.fromhex("ab" * 32)}
     assert list(BRIEF.batch.trial_range) == [5, 6, 7]
     assert np.array_equal(BRIEF.model.process.A, [[1.0, 0.1], [0.0, 1.0]])
+
+
+def test_a_brief_has_the_part_of_its_role() -> None:
+    """And of no other."""
+    assert has_part(BRIEF, EavesdropperPart)
+    assert not has_part(BRIEF, SensorPart)
+
+
+def test_a_brief_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
+    """A sparse file of more than a gigabyte."""
+    path = BRIEF.write(tmp_path)
+    os.truncate(path, 2**30 + 1)
+    with pytest.raises(BriefError, match=r"is not a brief of this version \(it has more than 1073741824 bytes\)"):
+        read_brief(path)
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644, 0o610])

@@ -124,11 +124,36 @@ def no_matrix(found: dict[str, Any]) -> None:
     found["model"]["A"] = [[1.0], [0.0, 1.0]]
 
 
+def no_process(found: dict[str, Any]) -> None:
+    """Its noise is not a covariance."""
+    found["model"]["Q"][0][0] = -1.0
+
+
+def free_input(found: dict[str, Any]) -> None:
+    """The controller weighs neither an input nor its change."""
+    weights = found["part"]["assignment"]
+    weights["input_weights"] = weights["rate_weights"] = [0.0] * len(weights["input_weights"])
+
+
+def many_disturbances(found: dict[str, Any]) -> None:
+    """One more in each slot than the plant has."""
+    plant = found["part"]["plant"]
+    plant["disturbance_matrix"] = [[*row, 1.0] for row in plant["disturbance_matrix"]]
+
+
 UNUSABLE = {
     "eavesdroppers/sensor": [(without_parameter, "part.scheme.state_probability is missing")],
     "acknowledged/sensor": [(other_scheme, "part.scheme.colour is not a parameter of the scheme")],
-    "microgrid/controller": [(other_controller, "part.strategy is pid, expected one of ")],
-    "microgrid/sensor": [(fewer_states, "part.plant"), (no_matrix, "model.A, model.Q or model.initial_covariance")],
+    "microgrid/controller": [
+        (other_controller, "part.strategy is pid, expected one of "),
+        (free_input, "part: the input_weights leave an input without weight; expected input_weights, or rate_weights"),
+    ],
+    "microgrid/sensor": [
+        (fewer_states, "part.plant"),
+        (no_matrix, "model.A, model.Q or model.initial_covariance"),
+        (no_process, "its model is not a process: model.Q has the eigenvalue -1"),
+        (many_disturbances, "disturbances in each slot, or they are not finite"),
+    ],
 }
 
 
@@ -142,3 +167,16 @@ def test_a_brief_whose_parts_do_not_fit_together_is_refused(name: str, tmp_path:
         refused = refusal(found, tmp_path)
         assert refused is not None
         assert said in refused, json.dumps(refused)
+
+
+def test_an_estimator_that_knows_the_inputs_has_the_plant_of_its_model(tmp_path: Path) -> None:
+    """Without the disturbances, which only sensor and controller know."""
+    found = copy.deepcopy(BRIEFS["microgrid/legitimate"])
+    plant = copy.deepcopy(BRIEFS["microgrid/sensor"]["part"]["plant"])
+    del plant["disturbances"]
+    found["part"]["controller"] = {"period": 1, "acts_on": "estimate", "plant": plant}
+    assert refusal(found, tmp_path) is None
+    plant["noise"] = [[*row, 0.0] for row in plant["noise"]]
+    refused = refusal(found, tmp_path)
+    assert refused is not None
+    assert "part.plant cannot be used (ValueError: it does not have " in refused

@@ -1,0 +1,129 @@
+"""Private memory of a run's processes, and whether it stays the same over many slots.
+
+    python benchmarks/memory.py [--quick]
+
+Private memory is what a process has for itself: its pages that no other process shares (Private_* of /proc/PID/smaps_rollup).
+The growth is that from a quarter of the slots to the last look before all are on disk: it does not include the final tables.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from subprocess import PIPE
+
+from live_run import measured, slots_on_disk
+from processes import processes_of
+from table import Row, judged, run_alone
+
+_LOOK_SECONDS = 0.1
+_FLAT = 10.0  # MB in a million slots, which is ten bytes a slot: less than one number of each slot kept for ever
+_PEERS = frozenset({"sensor", "legitimate", "eavesdropper"})
+_BARE = """
+import msgpack, numpy, sys, zenoh
+sys.path.insert(0, {folder!r})
+from zenoh_peers import session_of
+with session_of("router", "tcp/127.0.0.1:0"):
+    print(flush=True)
+    sys.stdin.read()
+"""
+
+
+@dataclass
+class Looks:
+    """Private memory of the processes of one run, each time it was looked at."""
+
+    total: int
+    """The slots of the run."""
+    slots: list[int] = field(default_factory=list)
+    """How many slots were on disk."""
+    megabytes: list[dict[str, float]] = field(default_factory=list)
+    """Process → MB."""
+    roles: dict[str, str] = field(default_factory=dict)
+    """Process → its role."""
+
+    def look(self, process: subprocess.Popen[bytes], out: Path) -> None:
+        """Look again and again until all slots are on disk."""
+        while process.poll() is None and (slots := slots_on_disk(out)) < self.total:
+            found = dict[str, float]()
+            for one in processes_of(process.pid):
+                try:
+                    found[one.name] = one.private
+                except OSError:
+                    continue
+                self.roles[one.name] = one.role
+            if slots:
+                self.slots.append(slots)
+                self.megabytes.append(found)
+            time.sleep(_LOOK_SECONDS)
+
+    @property
+    def largest(self) -> tuple[float, str]:
+        """The most that a peer had at any time, and its name."""
+        return max((size, name) for look in self.megabytes for name, size in look.items() if self.roles[name] in _PEERS)
+
+    @property
+    def growth(self) -> dict[str, float]:
+        """Process → MB in a million slots, from a quarter of the slots on.
+
+        Raises RuntimeError if there were too few looks.
+        """
+        # Peers leave before the last slots are on disk: a look that misses one of them is not compared.
+        all_there = max((len(found) for found in self.megabytes), default=0)
+        looks = [
+            (slots, found)
+            for slots, found in zip(self.slots, self.megabytes, strict=True)
+            if slots >= self.total / 4 and len(found) == all_there
+        ]
+        past = looks[-1][0] - looks[0][0] if looks else 0
+        if not past:
+            raise RuntimeError(f"{self.total} slots were over before memory was looked at twice; run more slots")
+        before, after = looks[0][1], looks[-1][1]
+        return {name: (size - before[name]) / past * 1e6 for name, size in after.items() if name in before}
+
+
+def bare_interpreter() -> float:
+    """Private MB of an interpreter with numpy and a session of Zenoh, beside another one that shares its libraries."""
+    command = [sys.executable, "-c", _BARE.format(folder=str(Path(__file__).parent))]
+    with ExitStack() as stack:
+        pair = [stack.enter_context(subprocess.Popen(command, stdin=PIPE, stdout=PIPE)) for _ in range(2)]
+        for one in pair:
+            assert one.stdout is not None
+            one.stdout.readline()
+        return processes_of(pair[0].pid)[0].private
+
+
+def rows(quick: bool) -> Iterator[Row]:
+    """The largest peer, and the growth of every process."""
+    slots = 3_000 if quick else 500_000
+    looks = Looks(slots)
+    pace = "0.0005" if quick else "0"  # so that there is time to look
+    measured("eavesdroppers", "--pace", pace, "--slots", str(slots), watch=looks.look)
+    size, name = looks.largest
+    yield Row(
+        "private memory of a peer, one trial, the largest",
+        f"{size:.0f} MB ({name})",
+        f"an interpreter with numpy and a Zenoh session: {bare_interpreter():.0f} MB",
+        "40 MB",
+        "25 MB",
+        judged(size <= 40, size <= 25),
+    )
+    growth = looks.growth
+    name = max(growth, key=lambda one: growth[one])
+    yield Row(
+        f"growth of private memory from a quarter to the end of {slots:,} slots, the largest of {len(growth)} processes",
+        f"{growth[name]:.1f} MB in 10⁶ slots ({name})",
+        "none",
+        f"flat: below {_FLAT:.0f} MB in 10⁶ slots",
+        "the same",
+        judged(growth[name] < _FLAT, growth[name] < _FLAT),
+    )
+
+
+if __name__ == "__main__":
+    run_alone(rows)

@@ -1,0 +1,249 @@
+"""The kernels in numpy: what they must compute, to the bit, and the fallback where no C compiler worked.
+
+Each function has a twin of the same name in `compiled.py`. Trials are the last axis, and slots the first; everything is
+elementwise over slots and trials, in a fixed order of operations.
+
+Source: docs/mathematics.md, model and eavesdroppers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.kernels import elementary, mixtures, posterior
+from evedrop.kernels.elementary import Floats
+from evedrop.kernels.factored import Factor
+from evedrop.kernels.leak import Leak
+
+Words = NDArray[np.uint64]
+Codes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+_STATE, _INNOVATION = 1, 2  # `Action` of evedrop.model.receiver
+
+
+def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
+    """Fill AES counters (c, m, 2), big-endian: slot, slot + 1, … and in each of them the blocks first … first + m − 1."""
+    slots, count, _ = counters.shape
+    big = counters.view(">u8")
+    big[:, :, 0] = np.arange(slot, slot + slots, dtype=np.uint64)[:, None]
+    big[:, :, 1] = np.arange(first, first + count, dtype=np.uint64)
+
+
+def uniforms(words: Words, width: int) -> Floats:
+    """Uniform numbers in [0, 1), multiples of 2⁻⁵³, (c, width, R), from words (c, R, m), m ≥ width."""
+    numbers = (_ordered(words, width) >> np.uint64(11)).view(np.int64).astype(np.float64)
+    numbers *= 2.0**-53
+    return numbers
+
+
+def normals(words: Words, width: int) -> Floats:
+    """Standard normal numbers, (c, width, R), from words (c, R, m), by the inverse distribution on an odd grid of 2⁻⁵³."""
+    numbers = (_ordered(words, width) >> np.uint64(12)).view(np.int64).astype(np.float64)
+    numbers += 0.5
+    numbers *= 2.0**-52
+    return elementary.normal_quantile(numbers)
+
+
+def _ordered(words: Words, width: int) -> Words:
+    return np.ascontiguousarray(words[:, :, :width].transpose(0, 2, 1))
+
+
+def product(M: Floats, x: Floats) -> Floats:
+    """M x for every slot and trial: M (c, m, n), x (c, n, R) → (c, m, R)."""
+    y: Floats = M[:, :, 0, None] * x[:, None, 0, :]
+    for j in range(1, M.shape[-1]):
+        y += M[:, :, j, None] * x[:, None, j, :]
+    return y
+
+
+def carry(A: Floats, P: Floats) -> Floats:
+    """A P Aᵀ for every trial: P (n, n, R) → (n, n, R)."""
+    left: Floats = A[:, 0, None, None] * P[0]
+    for j in range(1, len(A)):
+        left += A[:, j, None, None] * P[j]
+    result: Floats = left[:, :1] * A[:, 0, None]
+    for j in range(1, len(A)):
+        result += left[:, j : j + 1] * A[:, j, None]
+    return result
+
+
+def advance(A: Floats, noise: Floats, before: Floats) -> tuple[Floats, Floats]:
+    """Predictions A x_{k−1} and states x_k = A x_{k−1} + noise, (c, n, R) each, from noise (c, n, R) and x before (n, R)."""
+    predicted, x = np.empty_like(noise), np.empty_like(noise)
+    for row, one in enumerate(noise):
+        predicted[row] = product(A[None], before[None])[0]
+        before = x[row] = predicted[row] + one
+    return predicted, x
+
+
+def encode(nu: Flags, x: Floats, predicted: Floats, chi: Floats) -> Floats:
+    """(x − predicted) + χ where ν (c, R), x elsewhere; (c, n, R) each."""
+    return np.where(nu[:, None, :], (x - predicted) + chi, x)
+
+
+def follow(
+    A: Floats,
+    Q: Floats,
+    before: tuple[Floats, Floats],
+    action: Codes,
+    z: Floats,
+    chi: Floats | None = None,
+    initial: bool = False,
+) -> tuple[Floats, Floats]:
+    """Estimates (c, n, R) and believed covariances (c, n, n, R) after c slots, from those before them.
+
+    action (c, R); z (c, n, R): packets, read where they are used; χ (c, n, R): for a decoder, subtracted from innovations.
+    initial: the first slot is slot 0, which is not predicted. The table in `evedrop.model.update` says what is computed.
+    """
+    x_hat = np.empty(z.shape)
+    last = before[0]
+    for row, codes in enumerate(action):
+        kept = last if initial and row == 0 else product(A[None], last[None])[0]
+        if chi is not None:
+            kept = np.where(codes == _INNOVATION, kept + (z[row] - chi[row]), kept)
+        last = x_hat[row] = np.where(codes == _STATE, z[row], kept)
+    return x_hat, follow_covariance(A, Q, before[1], action, initial)
+
+
+def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: bool = False) -> Floats:
+    """The believed covariances (c, n, n, R) of `follow`, from P (n, n, R) and actions (c, R)."""
+    found = np.empty((len(action), *P.shape))
+    for row, codes in enumerate(action):
+        if not (initial and row == 0):
+            carried = carry(A, P)
+            P = np.where(codes == _INNOVATION, carried, carried + Q[:, :, None])
+        P = found[row] = np.where(codes == _STATE, 0.0, P)
+    return found
+
+
+def records(marks: Flags, a: Floats, P: Floats | None, out: Codes, first: int = 0) -> None:
+    """Fill in trials' bytes to digest: for each slot a mark, then its numbers as little-endian float64.
+
+    marks (c, R), a (c, m, R); P (c, n, n, R), whose upper triangle is taken, row by row, or None. out: that of the trials from
+    `first` on, (trials, c, 1 + 8 (m + n (n + 1) / 2)).
+    """
+    some = slice(first, first + len(out))
+    columns = [a[:, i, some] for i in range(a.shape[1])]
+    if P is not None:
+        columns += [P[:, i, j, some] for i in range(P.shape[1]) for j in range(i, P.shape[1])]
+    numbers = np.empty((len(out), len(marks), len(columns)), "<f8")
+    for i, column in enumerate(columns):
+        numbers[:, :, i] = column.T
+    out[:, :, 0] = marks[:, some].T
+    out[:, :, 1:] = numbers.view(np.uint8).reshape(len(out), len(marks), 8 * len(columns))
+
+
+def squared_errors(x: Floats, x_hat: Floats) -> Floats:
+    """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""
+    error = x - x_hat
+    error *= error
+    squared: Floats = error[:, 0].copy()
+    for i in range(1, error.shape[1]):
+        squared += error[:, i]
+    return squared
+
+
+def traces(P: Floats) -> Floats:
+    """Tr P of every slot and trial: P (c, n, n, R) → (c, R)."""
+    trace: Floats = P[:, 0, 0].copy()
+    for i in range(1, P.shape[1]):
+        trace += P[:, i, i]
+    return trace
+
+
+def count_codes(codes: Codes, kinds: int) -> NDArray[np.uint32]:
+    """How often each code below `kinds` occurs in each slot, (c, kinds), from codes (c, R)."""
+    return np.stack([(codes == code).sum(axis=1, dtype=np.uint32) for code in range(kinds)], axis=1)
+
+
+def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> NDArray[np.uint32]:
+    """How many runs of the code `lost` end in codes (c, R), by length: 1, 2, … and `most` or more.
+
+    run (R,): the length of each trial's current run, which is brought up to date.
+    """
+    counts = np.zeros(most, np.uint32)
+    for row in codes:
+        going = row == lost
+        ended = run[~going & (run > 0)]
+        counts += np.bincount(np.minimum(ended, most) - 1, minlength=most).astype(np.uint32)
+        run[:] = np.where(going, run + 1, 0)
+    return counts
+
+
+def add_to_histograms(counts: NDArray[np.uint32], values: Floats, shift: int, base: int) -> None:
+    """Add each of values (c, R) to a bin of its row of counts (c, bins): its bits shifted right, less base, within the bins."""
+    rows, bins = counts.shape
+    found = (np.ascontiguousarray(values).view(np.int64) >> shift) - base
+    np.clip(found, 0, bins - 1, out=found)
+    found += bins * np.arange(rows)[:, None]
+    counts += np.bincount(found.reshape(-1), minlength=rows * bins).reshape(rows, bins).astype(np.uint32)
+
+
+def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
+    """Numbers of all trials, (c, n, R), from those of the flagged ones: 0 in the others.
+
+    flags (c, R); packed (m,): for each slot n rows of as many numbers as it has flags.
+    """
+    z = np.zeros((len(flags), n, flags.shape[1]))
+    at = 0
+    for row, some in zip(z, flags, strict=True):
+        count = n * int(np.count_nonzero(some))
+        row[:, some] = packed[at : at + count].reshape(n, -1)
+        at += count
+    return z
+
+
+def gather(flags: Flags, x: Floats) -> Floats:
+    """The columns of x (n, R) where the flags (R,) are set, (n, count)."""
+    some: Floats = np.compress(flags, x, axis=1)
+    return some
+
+
+def triangular_factors(M: Floats) -> Floats:
+    """Lower triangular L (c, n, n) with L Lᵀ = M Mᵀ and a non-negative diagonal, for each of M (c, n, m), m ≥ n.
+
+    Raises ZeroDivisionError where the square of an entry is too small for a double.
+    """
+    count, n, _ = M.shape
+    return np.array([elementary.triangular_factor(one.tolist()) for one in M]).reshape(count, n, n)
+
+
+def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats:
+    """A L of `count` consecutive slots, (count, n, n): L is the triangular factor of [A L before, G], first of [carried, G].
+
+    Raises ZeroDivisionError as `triangular_factors` does.
+    """
+    found = np.empty((count, *carried.shape))
+    for row in range(count):
+        carried = found[row] = product(A[None], triangular_factors(np.concatenate([carried, G], axis=1)[None]))[0]
+    return found
+
+
+def follow_mixture(
+    A: Floats,
+    G: Floats,
+    leaks: Floats,
+    before: tuple[Floats, ...],
+    gamma: Flags,
+    z: Floats,
+    state_probability: float,
+    capacity: int,
+    initial: bool = False,
+) -> tuple[Floats, Floats, Codes, Floats, Floats, Floats, Floats]:
+    """The Bayesian eavesdropper: estimates (c, n, R), covariances (c, n, n, R), actions (c, R), and the mixture after c slots.
+
+    G (n, n): lower triangular, G Gᵀ = Q; leaks (c, 2n, 2n), see `Leak`; before: the mixture before these slots, with at most
+    `capacity` components, see `Mixture`; gamma (c, R); z (c, n, R): packets, read where they are received.
+    initial: the first slot is slot 0, in which a packet is the state.
+    """
+    model = posterior.Weighing(A, Factor.of_triangular(G.tolist()), state_probability, capacity)
+    mixture, (slots, n, trials) = mixtures.Mixture(*before), z.shape
+    x_hat, P, action = np.empty(z.shape), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8)
+    for row, heard in enumerate(gamma):
+        leak = None if initial and row == 0 else Leak(leaks[row])
+        mixture, state = posterior.step(model, mixture, heard, np.where(heard, z[row], 0.0), leak)
+        x_hat[row], P[row] = mixtures.moments(mixture)
+        action[row] = np.where(heard, np.where(state > 0.5, np.uint8(_STATE), np.uint8(_INNOVATION)), np.uint8(0))
+    return x_hat, P, action, *mixture

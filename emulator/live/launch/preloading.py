@@ -1,0 +1,300 @@
+"""Starts the processes of a run by fork servers, bare processes that have already made the imports (`evedrop.fork_server`).
+
+Source: docs/architecture.md, why it is built this way.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import IO, Protocol, final
+
+from evedrop.environment import SINGLE_THREADED, own_environment
+from evedrop.live.launch.starter import StartedProcess, Starter, start_process
+from evedrop.names import OBSERVER
+from evedrop.signals import held_back
+
+_MOST_BYTES = 4096
+_GONE = (errno.ESRCH, "the fork server has ended")
+_EVERY_ROLE = (
+    "evedrop.cli.commands.process",
+    "evedrop.cli.main",
+    "evedrop.live.protocol.brief_use",
+    "evedrop.plugins",
+    "evedrop.signals",
+)
+OF_OTHERS = (*_EVERY_ROLE, "evedrop.peers.eavesdropper", "evedrop.peers.legitimate")
+"""What the processes of most roles import; not the modules of sensor and router, which have no place in an eavesdropper."""
+OF_OBSERVERS = ("evedrop.live.observer.observer",)
+"""What an observer imports in addition."""
+
+
+@final
+class Fork:
+    """A process that a fork server has started, and whose end it reports; used like a `subprocess.Popen`."""
+
+    stdin: IO[bytes] | None = None
+    stdout: IO[bytes] | None = None
+
+    def __init__(self, pid: int, handle: int) -> None:
+        """handle: a file descriptor that refers to the process; once it has ended, its id may be another process's."""
+        self.pid = pid
+        self._handle: int | None = handle
+        self._status: int | None = None
+        self._lock, self._over = threading.Lock(), threading.Event()
+
+    def ended(self, status: int) -> None:
+        """Take note of its end."""
+        with self._lock:
+            if self._handle is not None:
+                os.close(self._handle)
+            self._handle, self._status = None, status
+        self._over.set()
+
+    def poll(self) -> int | None:
+        """Its status; None while it runs."""
+        return self._status
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end. Raises subprocess.TimeoutExpired."""
+        if not self._over.wait(timeout) or self._status is None:
+            raise subprocess.TimeoutExpired("evedrop", timeout or 0.0)
+        return self._status
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it, if it still runs."""
+        with self._lock, suppress(ProcessLookupError):
+            if self._handle is not None:
+                signal.pidfd_send_signal(self._handle, sig)
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it."""
+        self.send_signal(signal.SIGKILL)
+
+
+class ServerProcess(Protocol):
+    """The part of `subprocess.Popen` that `fork_servers` uses."""
+
+    def kill(self) -> None:
+        """End it."""
+
+    def wait(self) -> int:
+        """Wait for its end; returns its exit status."""
+
+
+def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> ServerProcess:
+    """Start the first of some fork servers, each of which takes requests from its end of a channel. Raises OSError.
+
+    modules: what each imports in addition to those before it. Each server after the first is forked from the one before.
+    """
+    words = [[str(channel.fileno()), *names] for channel, names in zip(channels, modules, strict=True)]
+    with held_back():
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "evedrop.fork_server", json.dumps(words)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            env={**own_environment(), **SINGLE_THREADED},
+            pass_fds=[channel.fileno() for channel in channels],
+        )
+
+
+@final
+class ForkServer:
+    """The launcher's side of a fork server for some roles: starts processes, and learns how they end.
+
+    channel: whose other end the server has.
+    """
+
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
+        self._forks: dict[int, Fork] = {}
+        self._asking = threading.Lock()
+        self._begun: SimpleQueue[Fork | OSError] = SimpleQueue()
+        """The process that was asked for, or why there is none."""
+        self._follower = threading.Thread(target=self._follow, name="fork server", daemon=True)
+        self._follower.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can still start processes."""
+        return self._follower.is_alive()
+
+    def close(self) -> None:
+        """End the fork server, as soon as it has made its imports; its forks have ended before."""
+        self._channel.shutdown(socket.SHUT_RDWR)
+        self._follower.join()
+        self._channel.close()
+
+    def start(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError."""
+        read_stdin, write_stdin = os.pipe()
+        read_stdout, write_stdout = os.pipe() if role == OBSERVER else (None, None)
+        stdin = os.fdopen(write_stdin, "wb")
+        stdout = None if read_stdout is None else os.fdopen(read_stdout, "rb")
+        files = (read_stdin, log.fileno() if write_stdout is None else write_stdout, log.fileno())
+        try:
+            process = self.fork([role, str(brief)], files, environment, _folder(), 0o077)
+        except OSError:
+            stdin.close()
+            if stdout is not None:
+                stdout.close()
+            raise
+        finally:
+            os.close(read_stdin)
+            if write_stdout is not None:
+                os.close(write_stdout)
+        process.stdin, process.stdout = stdin, stdout
+        return process
+
+    def fork(
+        self,
+        words: Sequence[str],
+        files: tuple[int, int, int],
+        environment: Mapping[str, str],
+        folder: str | None,
+        umask: int,
+    ) -> Fork:
+        """Run `evedrop WORDS` in a fork of the server, with these standard files, in this folder. Raises OSError."""
+        request = {"words": [*words], "environment": dict(environment), "folder": folder, "umask": umask}
+        with self._asking:
+            try:
+                socket.send_fds(self._channel, [json.dumps(request).encode()], files)
+            except ConnectionError:
+                raise OSError(*_GONE) from None
+            begun = self._begun.get()
+        if isinstance(begun, OSError):
+            raise begun
+        return begun
+
+    def _follow(self) -> None:
+        """Read the reports of the fork server until it ends, and end the processes that it leaves behind."""
+        while True:
+            try:
+                report, handles, _, _ = socket.recv_fds(self._channel, _MOST_BYTES, 1)
+            except OSError:
+                break
+            if not report:
+                break
+            found: dict[str, int] = json.loads(report)
+            if "error" in found:
+                self._begun.put(OSError(found["error"], os.strerror(found["error"])))
+            elif "status" in found:
+                self._forks.pop(found["pid"]).ended(found["status"])
+            else:
+                fork = self._forks[found["pid"]] = Fork(found["pid"], *handles)
+                self._begun.put(fork)
+        for fork in self._forks.values():
+            fork.kill()
+            fork.ended(-signal.SIGKILL)
+        self._begun.put(OSError(*_GONE))
+
+
+@contextmanager
+def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
+    """Fork servers, each of which imports these modules and those of the servers before it. Raises OSError."""
+    with ExitStack() as stack:
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in modules]
+        with ExitStack() as theirs:
+            for _, end in pairs:
+                theirs.enter_context(end)
+            process = start_servers([end for _, end in pairs], modules)
+        stack.callback(process.wait)
+        stack.callback(process.kill)  # it may be in the middle of its imports
+        servers = tuple(ForkServer(ours) for ours, _ in pairs)
+        for server in servers:
+            stack.callback(server.close)
+        yield servers
+
+
+@final
+class PreloadedStarter:
+    """Starts an observer from one fork server, and all others, which need fewer modules, from another one."""
+
+    def __init__(self, observers: ForkServer, others: ForkServer) -> None:
+        self._observers, self._others = observers, others
+
+    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        """Start `evedrop ROLE BRIEF`. Raises OSError."""
+        return (self._observers if role == OBSERVER else self._others).start(role, brief, log, environment)
+
+
+@final
+@dataclass(frozen=True)
+class _Kept:
+    """The fork servers of a `preloaded` block, and the environment in which their interpreters were started."""
+
+    servers: tuple[ForkServer, ...]
+    starter: Starter
+    environment: Mapping[str, str]
+
+    @property
+    def usable(self) -> bool:
+        """Whether the servers live, and interpreters that were started now would be no different."""
+        return all(server.alive for server in self.servers) and self.environment == _inherited()
+
+
+_kept: list[_Kept] = []
+"""Of the `preloaded` blocks that this process is in."""
+
+
+@contextmanager
+def process_starter() -> Iterator[Starter]:
+    """The fastest way to start processes on this system, until the block ends. Raises OSError."""
+    if _kept and _kept[-1].usable:
+        yield _kept[-1].starter
+        return
+    with preloaded() as starter:
+        yield starter
+
+
+@contextmanager
+def preloaded() -> Iterator[Starter]:
+    """Make the imports of live runs once for all runs in the block, which then start faster.
+
+    Two more processes wait meanwhile. Raises OSError if they cannot be started.
+
+    >>> with preloaded():                                                               # doctest: +SKIP
+    ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
+    """
+    try:
+        os.close(os.pidfd_open(os.getpid()))
+    except (AttributeError, OSError):  # not Linux, or a sandbox that forbids it
+        yield start_process
+        return
+    with fork_servers(OF_OTHERS, OF_OBSERVERS) as (others, observers):
+        starter = PreloadedStarter(observers, others)
+        kept = _Kept((others, observers), starter, _inherited())
+        _kept.append(kept)
+        try:
+            yield starter
+        finally:
+            _kept.remove(kept)
+
+
+def _inherited() -> dict[str, str]:
+    """What a server's interpreter may have read from the environment; where temporary files are, a fork asks for itself."""
+    return {name: value for name, value in own_environment().items() if name not in {"TMPDIR", "TEMP", "TMP"}}
+
+
+def _folder() -> str | None:
+    """The current folder; None if it has been removed."""
+    with suppress(OSError):
+        return os.getcwd()
+    return None

@@ -1,0 +1,76 @@
+"""Checks of parameters that the classes of a scenario share, and the way in which messages write values."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+_SHOWN = 60  # characters of a value that messages repeat
+MOST_SLOTS = 1_000_000
+
+
+def toml_of(value: Any) -> str:
+    """A value as a scenario would write it, in one line."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml_of(inner)}" for key, inner in value.items()) + " }" if value else "{}"
+    if isinstance(value, list):
+        return f"[{', '.join(toml_of(inner) for inner in value)}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
+
+
+def as_toml(value: Any) -> str:
+    """The same for a message: a long value is cut."""
+    text = toml_of(value[: _SHOWN + 1] if isinstance(value, (str, list)) else value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> bool:
+    """Whether a value is a finite number from `least` to `most`."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and least <= value <= most and abs(value) < math.inf
+
+
+def is_probability(value: Any) -> bool:
+    """Whether a value is a number from 0 to 1."""
+    return is_number(value, 0.0, 1.0)
+
+
+def number_mistakes(given: Mapping[str, Any], name: str, least: float, most: float) -> list[tuple[str, str]]:
+    """A mistake if the entry is given and is not a number from `least` to `most`."""
+    if name not in given or is_number(given[name], least, most):
+        return []
+    return [(name, f"is {as_toml(given[name])}; expected a number from {least:.10g} to {most:.10g}")]
+
+
+def probability_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
+    """A mistake for every one of the names that is given and is not a probability."""
+    return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, 1.0)]
+
+
+def count_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
+    """A mistake if the entry is given and is not a number of slots from 1 on."""
+    value = given.get(name, 1)
+    if type(value) is int and 1 <= value <= MOST_SLOTS:
+        return []
+    return [(name, f"is {value!r}; expected a whole number from 1 to {MOST_SLOTS}")]
+
+
+def flag_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
+    """A mistake for every one of the names that is given and neither true nor false."""
+    return [
+        (name, f"is {as_toml(given[name])}; expected true or false")
+        for name in names
+        if name in given and not isinstance(given[name], bool)
+    ]
+
+
+def word_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
+    """A mistake if the entry is given and is not a word of zeros and ones."""
+    word = given.get(name, "1")
+    if isinstance(word, str) and word and not set(word) - {"0", "1"}:
+        return []
+    return [(name, f'is {as_toml(word)}; expected a word of 0 (lost) and 1 (delivered), such as "1101"')]

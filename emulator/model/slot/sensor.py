@@ -1,0 +1,96 @@
+"""The sensor from slot to slot: states, the filter of its measurements, packets, and its watch over acknowledgements.
+
+Source: docs/mathematics.md, model, a filter at the sensor, and detecting an attack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, final
+
+import numpy as np
+
+from evedrop.model.local_filter import LocalFilter
+from evedrop.model.numeric.detection import CusumBatch
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags
+from evedrop.model.schemes.scheme import Encoder, PacketBlock
+from evedrop.model.slot.plant import PlantCore, States
+
+
+class Sent(NamedTuple):
+    """The sensor in c consecutive slots."""
+
+    true: Floats
+    """True states, (c, n, R)."""
+    x: Floats
+    """The states that packets are made from, (c, n, R): the true ones, or the estimates of the sensor's filter."""
+    packets: PacketBlock
+
+    @classmethod
+    def joined(cls, parts: Sequence[Sent]) -> Sent:
+        """Consecutive slots, at least one, as one."""
+        if len(parts) == 1:
+            return parts[0]
+        packets = PacketBlock.joined([part.packets for part in parts])
+        return cls(np.concatenate([part.true for part in parts]), np.concatenate([part.x for part in parts]), packets)
+
+    def rows(self, some: slice) -> Sent:
+        """Some of the slots."""
+        return Sent(self.true[some], self.x[some], self.packets.rows(some))
+
+
+@final
+class SensorCore:
+    """Makes the packets of many slots at once; or of one slot at a time, if the next packet depends on what comes back.
+
+    watch: over the acknowledgements, None if it does not watch them.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        plant: PlantCore,
+        local: LocalFilter | None = None,
+        watch: CusumBatch | None = None,
+    ) -> None:
+        self._encoder, self._plant = encoder, plant
+        self._local, self._watch = local, watch
+
+    @property
+    def watches(self) -> bool:
+        """Whether the sensor watches the acknowledgements."""
+        return self._watch is not None
+
+    @property
+    def filters(self) -> bool:
+        """Whether the sensor filters its measurements, so that it does not transmit the true state."""
+        return self._local is not None
+
+    def send(self, slots: range) -> Sent:
+        """The next slots, at least one."""
+        states = self._plant.advance(slots)
+        x, predicted = self._filtered(slots, states)
+        return Sent(states.x, x, self._encoder.encode_block(slots, x, predicted))
+
+    def _filtered(self, slots: range, states: States) -> tuple[Floats, Floats]:
+        """The states to transmit, and the predictions that their innovations refer to."""
+        if self._local is None or states.pushed is None:
+            return states.x, states.predicted
+        x, predicted = np.empty_like(states.x), np.empty_like(states.x)
+        for row, (k, pushed) in enumerate(zip(slots, states.pushed, strict=True)):
+            x[row] = self._local.take(k, states.x[row], pushed)
+            predicted[row] = self._local.predicted
+        return x, predicted
+
+    def acknowledged(self, k: int, acknowledged: Flags, sent: Flags | None) -> Flags | None:
+        """Take the acknowledgements of slot k that reached the sensor, before the next slot is sent; sent: as in `Packet`.
+
+        Returns where they raise an alarm, (R,); None if the sensor does not watch them.
+        """
+        self._encoder.acknowledged(k, acknowledged)
+        return None if self._watch is None else self._watch.take(acknowledged, sent)
+
+    def hold(self, u: Floats) -> None:
+        """Apply the inputs u (m, R) from the next slot on, until others come."""
+        self._plant.hold(u)

@@ -1,0 +1,112 @@
+"""Fields of messages: what each reader takes, and what it refuses with the field, what was found and what was expected."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.protocol.codec import Reader, pack, read_refusal, refusal
+from evedrop.live.protocol.packets import delivery, read_delivery, read_uplink
+from evedrop.live.protocol.telemetry import Extent, Truth, read_truth
+from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
+
+KEY = "evedrop/r1/telemetry/eve"
+
+
+@pytest.mark.parametrize(("found", "said"), [([1], "a list"), (3, "a int"), (None, "a NoneType"), ("x", "a str")])
+def test_a_message_that_is_not_a_map_is_refused(found: object, said: str) -> None:
+    """Although it is msgpack."""
+    with pytest.raises(MalformedMessage, match=f"{said}; expected a msgpack map"):
+        Reader(KEY, msgpack.packb(found))
+
+
+WRONG: list[tuple[str, dict[str, Any], str]] = [
+    ("report", {"late": np.full((2, TRIALS), 3, "<u2").tobytes()}, "late of 3; expected numbers from 0 to 2"),
+    ("report", {"x_hat": np.full((2, 2, TRIALS), np.nan).tobytes()}, "x_hat with a NaN or infinity; expected finite"),
+    (
+        "report",
+        {"P": np.array([[[1, 0.5], [0.5, 1]], [[1, 0.5], [0.25, 1]]]).tobytes()},
+        "P with 0.5 at [1, 0, 1, 0] and 0.25 at [1, 1, 0, 0]; expected covariances, which are symmetric except for rounding",
+    ),
+    (
+        "leaving",
+        {"P": np.array([[[1, 1, 1], [0, 0, 0]], [[0, 0, 2], [1, 1, 1]]], float).tobytes()},
+        "P with 0.0 at [0, 1, 2] and 2.0 at [1, 0, 2]; expected covariances, which are symmetric except for rounding",
+    ),
+    ("report", {"digests": {}}, "digests of blocks []; expected those of [0], which end in these slots"),
+    ("report", {"digests": {7: b""}}, "digests of block 7; expected of the blocks that end in these slots, [0]"),
+    ("report", {"digests": {0: b"short"}}, "digests of block 0; expected 48 bytes a block"),
+    ("report", {"k": 4, "c": 1}, "action of 6 bytes; expected 3 bytes"),
+    ("delivery", {"gamma": b"\x00"}, "z although nothing was received; expected no z"),
+    ("acknowledgement", {"gamma": b"\x08"}, "gamma with a bit beyond trial 2; expected unused bits that are 0"),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "said"), WRONG)
+def test_a_field_that_is_out_of_range_is_refused(name: str, changes: dict[str, Any], said: str) -> None:
+    """The rest of the message is right."""
+    READERS[name][1](EXAMPLES[name])
+    with pytest.raises(MalformedMessage, match=re.escape(f"malformed message on {READERS[name][0]}: {said}")):
+        READERS[name][1](pack({**fields_of(name), **changes}))
+
+
+def test_digests_of_slots_in_which_no_block_ends_are_refused() -> None:
+    """The report of one slot in the middle of a block has none."""
+    report = fields_of("report")
+    one = {
+        name: report[name][: len(report[name]) // 2] for name in ("x_hat", "action", "P", "trace", "late", "late_used")
+    }
+    key, read = READERS["report"]
+    read(pack({**report, **one, "c": 1, "digests": {}}))
+    with pytest.raises(
+        MalformedMessage, match=f"{key}: digests of block 0; expected none: no block ends in these slots"
+    ):
+        read(pack({**report, **one, "c": 1}))
+
+
+@pytest.mark.parametrize(
+    "key", ["evedrop/r2/downlink/eve", "evedrop/r1/downlink/other", "evedrop/r1/nothing", "downlink/eve", ""]
+)
+def test_only_a_key_that_the_process_reads_can_be_refused(key: str) -> None:
+    """Of its own run, and with a writer to blame."""
+    right = read_refusal(Reader(KEY, refusal("evedrop/r1/downlink/eve", "no\nk")), "eve")
+    assert (right.at_fault, "no?k" in str(right)) == (("router",), True)
+    with pytest.raises(MalformedMessage, match="expected a key that eve reads"):
+        read_refusal(Reader(KEY, refusal(key, "no k")), "eve")
+
+
+def test_the_reasons_and_the_alarms_of_the_sensor_are_read_as_sent() -> None:
+    """Whether it sent, and whether it raised an alarm; each may be absent."""
+    sent, alarms = np.array([[True, False, True]]), np.array([[False, False, True]])
+    truth = Truth(4, np.ones((1, 2, 3)), np.zeros((1, 3), np.bool_), sent, alarms)
+    found = read_truth(Reader(KEY, truth.pack()), 4, Extent(9, 3, 2, 3))
+    assert found.sent is not None
+    assert found.alarms is not None
+    assert np.array_equal(found.sent, sent)
+    assert np.array_equal(found.alarms, alarms)
+    assert (found.u, found.failed, found.true) == (None, None, None)
+    bare = read_truth(Reader(KEY, Truth(4, truth.x, truth.nu).pack()), 4, Extent(9, 3, 2, 3))
+    assert (bare.sent, bare.alarms) == (None, None)
+
+
+def test_a_delivery_of_nothing_has_an_empty_header() -> None:
+    """The header is 0 where nothing was received, as z is."""
+    heard, late = read_delivery(Reader(KEY, delivery(4, b"\x00", b"")), 4, (2, 3), header=1)
+    assert heard.header is not None
+    assert late == ()
+    assert not heard.gamma.any()
+    assert not heard.header.any()
+    assert not heard.z.any()
+
+
+def test_infinite_numbers_are_refused_wherever_finite_ones_are_expected() -> None:
+    """With the field."""
+    for value in (np.inf, -np.inf, np.nan):
+        payload = pack({"k": 4, "z": np.full((2, 3), value).tobytes()})
+        with pytest.raises(MalformedMessage, match="z with a NaN or infinity; expected finite numbers"):
+            read_uplink(Reader(KEY, payload), 4, (2, 3))

@@ -1,0 +1,99 @@
+"""News of a run: each kind is read as it was written, and a malformed line is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+
+from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
+from evedrop.names import ProcessAction
+from evedrop.news import (
+    ConnectionOutage,
+    FolderMoved,
+    Held,
+    News,
+    RunEnded,
+    RunEvent,
+    RunProgress,
+    Started,
+    ViewOpened,
+    silent,
+)
+
+KINDS: list[News] = [
+    Alive(),
+    Started(),
+    Held(7),
+    ProcessRequest(ProcessAction.END, "eve", 4, 2),
+    ConnectionOutage("eve", 3, 9, 0.5),
+    ConnectionOutage("eve", 3, None, 0.5, 1),
+    RunProgress(40, 12.5, "slots/s", {"eve": math.inf}),
+    RunProgress(40, 12.5, "trial-slots/s", {}, 80),
+    RunOver(),
+    Finishing(),
+    RunEnded(3, "a crash", ["eve"], ["router"], "no screen"),
+    RunEnded(0, "complete", [], []),
+    ViewOpened("http://127.0.0.1:1/", None),
+    ViewOpened(None, "no screen"),
+]
+
+
+@pytest.mark.parametrize("news", KINDS, ids=lambda news: news.event)
+def test_news_is_read_as_it_was_written(news: News) -> None:
+    """One line of JSON, which names its kind."""
+    assert news.line.endswith(b"\n")
+    assert news.line.count(b"\n") == 1
+    assert json.loads(news.line)["event"] == news.event
+    assert read_news(news.line) == news
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (b"", "Expecting value"),
+        (b"[" * 100_000, "it is nested too deeply"),
+        (b"[]", "it is not an object with an event of alive, started, held, "),
+        (b"{}", "it is not an object with an event of "),
+        (b'{"event": 3}', "it is not an object with an event of "),
+        (b'{"event": "dance"}', "it is not an object with an event of "),
+        (b'{"event": "held"}', "before is missing"),
+        (b'{"event": "held", "before": -1}', "before is -1, expected a whole number from 0 to "),
+        (b'{"event": "alive", "k": 1}', "k is an unknown entry"),
+        (b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}', "do is 'dance', expected one of "),
+        (b'{"event": "progress", "done": 1, "rate": "x", "rate_unit": "s", "squared_errors": {}}', "rate is 'x', expected a"),
+        (
+            b'{"event": "progress", "done": 1, "rate": 1, "rate_unit": "s", "squared_errors": {"eve": null}}',
+            "squared_errors.eve is None, expected a number",
+        ),
+        (b'{"event": "ended", "status": 256, "how": "x"}', "status is 256, expected a whole number from 0 to 255"),
+    ],
+)  # fmt: skip
+def test_a_malformed_line_is_refused(line: bytes, said: str) -> None:
+    """With a ValueError that says what is wrong with it."""
+    with pytest.raises(ValueError) as refused:  # noqa: PT011 - the words are compared below
+        read_news(line)
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(("status", "well"), [(0, True), (1, True), (2, False), (3, False), (130, False)])
+def test_a_run_ended_well_if_it_came_to_its_end(status: int, well: bool) -> None:
+    """Even if an expectation failed."""
+    assert RunEnded(status, "complete").well is well
+
+
+@pytest.mark.parametrize(("by", "line"), [("scenario", "cut eve"), ("operator", "cut eve (by the operator)")])
+def test_the_view_shows_who_caused_an_event(by: str, line: str) -> None:
+    """Unless it was the scenario."""
+    assert RunEvent(3, "cut eve", by).line == line
+
+
+def test_only_the_launcher_tells_that_the_folder_moved(capsys: pytest.CaptureFixture[str]) -> None:
+    """The launcher refuses an observer that writes it; a caller that ignores news prints nothing."""
+    moved: Any = FolderMoved("there")
+    with pytest.raises(ValueError, match="it is not an object with an event of"):
+        read_news(moved.line)
+    silent(moved)
+    assert capsys.readouterr() == ("", "")

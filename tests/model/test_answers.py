@@ -1,0 +1,166 @@
+"""Answers about classes that must not run here: each from a process of its own, whatever the class does in it."""
+
+from __future__ import annotations
+
+import json
+import re
+import select
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.model.answers import Answers
+
+HEAD = "import os, signal, time\nfrom pathlib import Path\nfrom evedrop.extend import Naive\n\n\nclass Mine(Naive):\n"
+
+
+def written(folder: Path, body: str, name: str = "answering_mine") -> str:
+    """The name of a class with this body, in a module of a folder."""
+    (folder / f"{name}.py").write_text(f"{HEAD}    {body}\n")
+    return f"{name}:Mine"
+
+
+def method(name: str, code: str) -> str:
+    """A method of a class, which takes parameters."""
+    return f"@classmethod\n    def {name}(cls, parameters):\n        {code}"
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The processes that answer, in order."""
+    found: list[subprocess.Popen[bytes]] = []
+    start = subprocess.Popen
+
+    def keeping(*given: Any, **options: Any) -> subprocess.Popen[bytes]:
+        found.append(start(*given, **options))
+        return found[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", keeping)
+    return found
+
+
+@pytest.fixture
+def answers(tmp_path: Path, started: list[subprocess.Popen[bytes]]) -> Iterator[Answers]:
+    """Of classes in a folder; afterwards no process is left."""
+    found = Answers()
+    found.folder = str(tmp_path)
+    yield found
+    found.forget()
+    assert all(process.poll() is not None for process in started)
+
+
+def test_a_class_answers_once_and_its_answers_are_kept(
+    answers: Answers, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+) -> None:
+    """One process answers all questions; a process that is given the answers asks none."""
+    name = written(tmp_path, method("betrayed", "return parameters['slot']"))
+    assert answers.folder_of(name) is None
+    assert answers.ask(name, "class", "STRATEGIES")["parameters"] == {}
+    assert [answers.ask(name, "betrayed", "STRATEGIES", {"slot": slot}) for slot in (3, 4, 3)] == [3, 4, 3]
+    assert len(started) == 1
+    assert started[0].poll() is None
+    assert answers.folder_of(name) == str(tmp_path)
+    known = answers.of([name])
+    assert len(known) == 3
+    assert answers.of(["other:Class"]) == {}
+    told = Answers()
+    told.learn(known)
+    assert told.ask(name, "betrayed", "STRATEGIES", {"slot": 4}) == 4
+    assert len(started) == 1
+
+
+def test_a_refusal_that_somebody_else_was_given_is_one_here() -> None:
+    """And no process is started for it."""
+    answers = Answers()
+    answers.learn({json.dumps(["mine:Class", "class"]): {"raised": "it is broken"}})
+    with pytest.raises(NoAnswer, match="it is broken"):
+        answers.ask("mine:Class", "class")
+
+
+def test_a_process_that_ended_is_started_again(
+    answers: Answers, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+) -> None:
+    """It ends by itself when it was not asked for a while, and the next question does not notice."""
+    name = written(tmp_path, method("betrayed", "return 7"))
+    answers.ask(name, "class", "STRATEGIES")
+    started[0].kill()
+    started[0].wait()
+    assert answers.ask(name, "betrayed", "STRATEGIES", {}) == 7
+    assert len(started) == 2
+
+
+BROKEN = {
+    "ends": ("os._exit(3)", "the process that was to answer for it ended (status 3)"),
+    "raises": ("return 1 / 0", "ZeroDivisionError: division by zero, answering_raises.py line 9"),
+    "types": ("return object()", "its answer is not made of numbers, texts, lists and tables"),
+    "long": ("return 'x' * 2**21", "its answer was longer than 1048576 bytes"),
+    "writes": (
+        r"[os.write(one, b'[1]\n') for one in range(3, 20) if Path(f'/proc/self/fd/{one}').is_fifo()]; time.sleep(60)",
+        "its answer was invalid",
+    ),
+    "garbage": (
+        r"[os.write(one, b'no JSON\n') for one in range(3, 20) if Path(f'/proc/self/fd/{one}').is_fifo()]; time.sleep(60)",
+        "the process that was to answer for it ended (status -9)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_class_that_gives_no_answer_is_said_to(
+    case: str, answers: Answers, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+) -> None:
+    """With the reason. Its process ends, nothing is kept, and a corrected class answers the same question."""
+    code, said = BROKEN[case]
+    name = written(tmp_path, method("betrayed", code), f"answering_{case}")
+    with pytest.raises(NoAnswer) as refused:
+        answers.ask(name, "betrayed", "STRATEGIES", {})
+    assert said in str(refused.value)
+    assert started[-1].poll() is not None
+    assert answers.of([name]) == {}
+    if case == "raises":
+        written(tmp_path, method("betrayed", "return 11"), f"answering_{case}")
+        assert answers.ask(name, "betrayed", "STRATEGIES", {}) == 11
+
+
+def test_a_class_that_does_not_answer_in_time_is_said_to(tmp_path: Path) -> None:
+    """The limit is in the message."""
+    answers = Answers(seconds=0.5)
+    answers.folder = str(tmp_path)
+    name = written(tmp_path, method("betrayed", "time.sleep(600)"), "answering_slow")
+    with pytest.raises(NoAnswer, match=r"it did not answer within 0.5 s"):
+        answers.ask(name, "betrayed", "STRATEGIES", {})
+
+
+def test_a_name_without_a_class_is_said_to_have_none(answers: Answers, tmp_path: Path) -> None:
+    """With the reason that the registry gives in the other process."""
+    name = written(tmp_path, "pass").replace("Mine", "Other")
+    with pytest.raises(NotRegistered) as refused:
+        answers.ask(name, "class", "STRATEGIES")
+    assert re.search(r"and the module answering_mine .* has no Other; expected one of Mine", refused.value.why)
+
+
+def test_without_a_process_there_is_no_answer(monkeypatch: pytest.MonkeyPatch, answers: Answers) -> None:
+    """Where none can be started."""
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    with pytest.raises(NoAnswer, match=r"it cannot be asked: no process can be started \(.*No such file or directory"):
+        answers.ask("mine:Class", "class", "STRATEGIES")
+
+
+def test_an_interrupt_ends_the_process_that_was_asked(
+    monkeypatch: pytest.MonkeyPatch, answers: Answers, started: list[subprocess.Popen[bytes]]
+) -> None:
+    """And is not taken for an answer."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(select, "select", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        answers.ask("mine:Class", "class", "STRATEGIES")
+    assert started[-1].poll() is not None
+    assert json.dumps(answers.of(["mine:Class"])) == "{}"

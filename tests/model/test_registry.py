@@ -1,0 +1,193 @@
+"""Classes by their names: built in, of a package, or in a module; any other name is refused with the reason."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.links.link import LossModel
+from evedrop.model.registry import Registry, asked, is_own, place_of
+from tests.packages import install
+
+GROUP = "evedrop.tests.registry"
+MODULE = """
+from evedrop.extend import Bernoulli, LossModel
+
+
+class Mine(Bernoulli):
+    parameters = {}
+
+
+class Half(LossModel):
+    quality = 0.5
+
+
+class None_(LossModel):
+    pass
+
+
+class Table(Bernoulli):
+    parameters = ("quality",)
+
+
+class Numbered(Bernoulli):
+    parameters = {1: 0.5}
+
+
+class Taken(Bernoulli):
+    parameters = {"model": 1}
+
+
+number = 3
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path of Python with a package; what is imported from it is forgotten afterwards."""
+    entries = {GROUP: {"mine": "registered:Mine", "gone": "registered:Gone", "here": "__main__:Mine"}}
+    entries["evedrop.tests.other"] = {"mine": "registered:Half"}
+    install(
+        tmp_path,
+        {"registered.py": MODULE, "registered_empty.py": "", "registered_exits.py": "raise SystemExit(3)"},
+        entries,
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in [one for one in sys.modules if one.startswith("registered")]:
+        del sys.modules[name]
+
+
+def registry(group: str = GROUP, **given: Any) -> Registry[LossModel]:
+    """A registry with one class of its own."""
+    return Registry("loss model", LossModel, group, {"bernoulli": Bernoulli}, ("model",), **given)  # type: ignore[type-abstract]
+
+
+def test_the_built_in_classes_are_what_it_iterates_over(folder: Path) -> None:
+    """Others are looked up by their names."""
+    found = registry()
+    assert (list(found), len(found), found["bernoulli"]) == (["bernoulli"], 1, Bernoulli)
+    assert found.names == ["bernoulli", "gone", "here", "mine"]
+    assert registry("evedrop.tests.none").names == ["bernoulli"]
+    assert [found.foreign(name) for name in ("bernoulli", "mine", "registered:Mine")] == [False, True, True]
+    assert [is_own(name) for name in ("bernoulli", "registered:Mine", 3)] == [False, True, False]
+    mine = found["mine"]
+    assert mine is found["registered:Mine"]
+    assert issubclass(mine, Bernoulli)
+    assert "mine" in found
+    assert "other" not in found
+
+
+REFUSED = {
+    "other": "",
+    "mine:": "; expected PACKAGE.MODULE:CLASS, such as mine:Masked",
+    "1:2": "; expected PACKAGE.MODULE:CLASS, such as mine:Masked",
+    "__main__:Mine": ", which other processes cannot import; expected a class in a module, a file of its own",
+    "here": ", which an installed package says is __main__:Mine, which other processes cannot import; expected a class in",
+    "nowhere:Mine": ", and the module nowhere cannot be imported (No module named 'nowhere'); expected a module in the",
+    "registered_exits:Mine": ", and the module registered_exits cannot be imported (SystemExit: 3, registered_exits.py line 1); "
+    "expected one that can be imported",
+    "registered:Mime": "has no Mime; did you mean registered:Mine?",
+    "registered:Qqq": "has no Qqq; expected one of Mine, Half, None_, Table, Numbered, Taken",
+    "registered_empty:Mine": "has no Mine; expected one of none",
+    "sys:Mine": ", and the module sys has no Mine; ",
+    "gone": ", which an installed package says is registered:Gone, and the module registered (",
+    "registered:number": ", which is not a LossModel; expected a class that inherits from evedrop.extend.LossModel",
+    "pathlib:Path": ", which is not a LossModel; expected a class that inherits from evedrop.extend.LossModel",
+    "registered:Half": ", which lacks fates; expected a class with this method, as LossModel describes them",
+    "registered:None_": ", which lacks fates, quality; expected a class with these methods, as LossModel describes them",
+    "registered:Table": ", whose parameters are not a table; expected the entries it takes, each with an example",
+    "registered:Numbered": ", whose parameters are not a table; expected the entries it takes, each with an example",
+    "registered:Taken": ", one of whose parameters is called model, as an entry of every loss model is",
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_name_of_no_usable_class_is_refused(name: str, folder: Path) -> None:
+    """With the reason and what was expected; the error is a KeyError, too."""
+    with pytest.raises(NotRegistered) as refused:
+        registry()[name]
+    assert refused.value.name == name
+    assert REFUSED[name] in refused.value.why
+    assert (refused.value.why == "") == (name == "other")
+
+
+def test_a_name_that_two_packages_use_is_refused(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody could tell which class it is; the full name of either can."""
+    install(tmp_path / "second", {}, {GROUP: {"mine": "registered:Half"}}, "second")
+    monkeypatch.syspath_prepend(str(tmp_path / "second"))
+    with pytest.raises(NotRegistered) as refused:
+        registry()["mine"]
+    assert refused.value.why == (
+        ", a name that two installed packages use; expected one of registered:Half and registered:Mine itself"
+    )
+
+
+def test_a_class_that_must_not_run_here_has_a_stand_in(folder: Path) -> None:
+    """Its module is not imported, but by `imported`; a name that cannot be a class has no stand-in."""
+    asked_for: list[str] = []
+
+    def stand_in(name: str) -> type[LossModel]:
+        asked_for.append(name)
+        return type("Elsewhere", (Bernoulli,), {"parameters": {"model": 1} if name.endswith("Taken") else {}})
+
+    found = registry(stand_in=stand_in)
+    assert found["mine"].__name__ == "Elsewhere"
+    assert found["bernoulli"] is Bernoulli
+    assert "registered" not in sys.modules
+    with pytest.raises(NotRegistered, match="one of whose parameters is called model"):
+        found["registered:Taken"]
+    with pytest.raises(NotRegistered, match=r"expected PACKAGE\.MODULE:CLASS"):
+        found["mine:"]
+    assert asked_for == ["mine", "registered:Taken"]
+    assert found.imported("mine").__name__ == "Mine"
+
+
+def checks(found: Any) -> type[Any]:
+    """A class whose check of parameters does so."""
+    return type("Mine", (Bernoulli,), {"mistakes": staticmethod(found), "__module__": __name__})
+
+
+def test_the_mistakes_that_a_class_finds_are_texts() -> None:
+    """Whatever it returns or raises, its parameters have mistakes or none."""
+    assert asked(LOSS_MODELS["bernoulli"], {"quality": 0.5}) == []
+    assert asked(checks(lambda _: [("depth", 3)]), {"depth": 3}) == [("depth", "3")]
+
+    def fails(given: Any) -> Any:
+        raise ValueError("too   deep")
+
+    ((entry, what),) = asked(checks(fails), {"depth": 3})
+    assert entry == "depth"
+    assert what.startswith("cannot be checked: Mine.mistakes raised ValueError: too deep, test_registry.py line ")
+    assert what.endswith("; expected it to return a list of (entry, what is wrong)")
+    for wrong in (None, ["depth"], [("depth",)]):
+        said = f"cannot be checked: Mine.mistakes returned {wrong!r}; expected it to return a list of (entry, what is wrong)"
+        assert asked(checks(lambda _, wrong=wrong: wrong), {}) == [("parameters", said)]
+
+
+def raised(code: str, file: str = "/there/mine.py") -> BaseException:
+    """The error of code in a file."""
+    try:
+        exec(compile(code, file, "exec"), {})  # noqa: S102 - code of this test
+    except BaseException as error:
+        return error
+    raise AssertionError(code)
+
+
+def test_the_place_of_an_error_is_the_line_of_its_author() -> None:
+    """The last line of the file in question, or of any file that is not Python's own; an error without words has its name."""
+    assert place_of(NoAnswer("it ended")) == "it ended"
+    assert place_of(raised("1 / 0"), "/there/mine.py") == "ZeroDivisionError: division by zero, mine.py line 1"
+    assert place_of(raised("\nraise KeyError")) == "KeyError, mine.py line 2"
+    assert place_of(raised("x = (")).startswith("SyntaxError: '(' was never closed, mine.py line 1")
+    assert place_of(ValueError("never raised")) == "ValueError: never raised"
+    assert place_of(ValueError()) == "ValueError"
+    nameless = SyntaxError("bad")
+    assert place_of(nameless) == "SyntaxError: bad"

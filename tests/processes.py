@@ -1,0 +1,24 @@
+"""The processes of a run as the system shows them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+
+def words_of(pid: int | str) -> list[str]:
+    """The command line of a process, without the spaces and zero bytes between its words. Raises OSError if it has ended."""
+    return re.split(r"[\0 ]+", Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").strip("\0 "))
+
+
+def parent_of(pid: int) -> int:
+    """The id of a process's parent. Raises OSError if it has ended."""
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def descendants(pid: int) -> Iterator[int]:
+    """The ids of all processes that descend from one."""
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        yield int(child)
+        yield from descendants(int(child))

@@ -1,0 +1,108 @@
+"""Consecutive slots joined into one, with every entry of every part."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.score.slots import InputSlots, ReceiverSlots, Slots, concatenated
+
+SHAPES = {"x_hat": (6, 2, 3), "P": (6, 2, 2, 3), "trace": (6, 2), "unsent": (6,), "true": (6, 2, 3), "x": (6, 2, 3)}
+
+
+def of_shape(name: str) -> Any:
+    """Different numbers for every entry; most entries have a row for each slot and a column for each trial."""
+    return np.random.default_rng(len(name)).random(SHAPES.get(name, (6, 3)))
+
+
+def whole() -> Slots:
+    """Six slots with every entry that slots can have."""
+    plain = {one.name: of_shape(one.name) for one in fields(ReceiverSlots) if one.name != "lost"}
+    receivers = {
+        "eve": ReceiverSlots(
+            **plain, lost={"lost": np.arange(6, dtype=np.uint32), "cut": np.arange(7, 13, dtype=np.uint32)}
+        )
+    }
+    inputs = InputSlots(of_shape("x"), of_shape("failed"))
+    return Slots(
+        4, of_shape("x"), of_shape("nu"), receivers, of_shape("sent"), of_shape("alarms"), inputs, of_shape("true")
+    )
+
+
+def part(value: Any, rows: slice) -> Any:
+    """Some of the slots."""
+    if isinstance(value, np.ndarray):
+        return value[rows]
+    if isinstance(value, dict):
+        return {name: part(one, rows) for name, one in value.items()}
+    if isinstance(value, int):
+        return value + rows.start
+    return type(value)(**{one.name: part(getattr(value, one.name), rows) for one in fields(value)})
+
+
+def entries(value: Any, path: str = "") -> dict[str, list[float]]:
+    """Path of every entry → its numbers."""
+    if isinstance(value, np.ndarray):
+        return {path: value.ravel().tolist()}
+    if not isinstance(value, dict):
+        value = (
+            {"first": [value]}
+            if isinstance(value, int)
+            else {one.name: getattr(value, one.name) for one in fields(value)}
+        )
+    found: dict[str, list[float]] = {}
+    for name, one in value.items():
+        found |= {f"{path}.{name}": one} if isinstance(one, list) else entries(one, f"{path}.{name}")
+    return found
+
+
+def test_every_entry_is_kept() -> None:
+    """Slots that were cut into pieces are the same again when they are joined."""
+    of_parts = [part(whole(), rows) for rows in (slice(0, 1), slice(1, 5), slice(5, 6))]
+    assert len(entries(whole())) == 19
+    assert entries(concatenated(of_parts)) == entries(whole())
+
+
+@pytest.mark.parametrize("name", ["sent", "alarms", "inputs", "true"])
+def test_an_entry_that_only_some_parts_have_is_refused(name: str) -> None:
+    """It cannot be joined, and is not left out silently."""
+    first, second = (part(whole(), rows) for rows in (slice(0, 3), slice(3, 6)))
+    with pytest.raises(ValueError, match="some of the parts have an entry that others lack"):
+        concatenated([first, replace(second, **{name: None})])
+    assert getattr(concatenated([replace(one, **{name: None}) for one in (first, second)]), name) is None
+
+
+def test_a_part_of_the_trials_has_their_columns() -> None:
+    """Of every entry that has trials; what is counted over trials stays."""
+    some = slice(1, 3)
+    found, all_of = entries(whole().part(some)), whole()
+    assert found[".x"] == all_of.x[..., some].ravel().tolist()
+    assert all_of.inputs is not None
+    assert found[".inputs.failed"] == all_of.inputs.failed[..., some].ravel().tolist()
+    counted = {
+        ".first.first",
+        ".receivers.eve.trace",
+        ".receivers.eve.unsent",
+        ".receivers.eve.lost.lost",
+        ".receivers.eve.lost.cut",
+    }
+    for name, numbers in entries(whole()).items():
+        assert (found[name] == numbers) is (name in counted)
+        assert name in counted or 3 * len(found[name]) == 2 * len(numbers)
+
+
+def test_a_copy_shares_no_memory() -> None:
+    """Not even with the larger arrays that its own are parts of."""
+    part_of = whole().part(slice(0, 1))
+    assert entries(part_of.copied()) == entries(part_of)
+
+    def arrays(value: Any) -> list[Any]:
+        if isinstance(value, np.ndarray):
+            return [value]
+        values = value.values() if isinstance(value, dict) else (getattr(value, one.name) for one in fields(value))
+        return [array for one in values if not isinstance(one, int) for array in arrays(one)]
+
+    assert all(array.base is None for array in arrays(part_of.copied()))

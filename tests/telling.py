@@ -1,0 +1,103 @@
+"""The command as it is, which also writes what its progress line shows: run as a script, or imported by a fork server.
+
+The environment variable EVEDROP_TEST_NEWS names the file for the news, if it is set. As a script: telling.py LARGEST WORDS...,
+where LARGEST limits the size of the command's files (0: no limit). A fork finds the modules of its own PYTHONPATH, as a new
+interpreter would.
+"""
+
+from __future__ import annotations
+
+from evedrop.interrupts import heed_signals
+
+if __name__ == "__main__":
+    heed_signals()
+
+import importlib
+import os
+import resource
+import socket
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, NoReturn
+
+from evedrop import __main__ as command
+from evedrop.cli.report import ProgressLine
+from evedrop.fork_server import serve
+from evedrop.live.launch import preloading
+
+if TYPE_CHECKING:
+    from evedrop.news import News
+
+show = ProgressLine.tell
+
+
+def tell(self: ProgressLine, news: News) -> None:
+    """In the place of `ProgressLine.tell`."""
+    if (path := os.environ.get("EVEDROP_TEST_NEWS")) is not None:
+        with open(path, "a") as file:
+            file.write(f"{getattr(news, 'done', 0)} {news.event}\n")
+    show(self, news)
+
+
+class Forked:
+    """A process that was forked from this one."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+
+    def kill(self) -> None:
+        """End it."""
+        os.kill(self._pid, 9)
+
+    def wait(self) -> int:
+        """Wait for its end."""
+        return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
+
+
+def forked_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> Forked:
+    """In the place of `start_servers`, in a command that has made all imports and has no other thread yet."""
+    del modules
+    pid = os.fork()
+    if pid == 0:
+        _become_servers(channels)
+    return Forked(pid)
+
+
+def _become_servers(channels: Sequence[socket.socket]) -> NoReturn:
+    os.setsid()
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for number in range(3):
+        os.dup2(nothing, number)
+    theirs = [channel.dup() for channel in channels]
+    before = 3
+    for channel in sorted(theirs, key=socket.socket.fileno):
+        os.closerange(before, channel.fileno())
+        before = channel.fileno() + 1
+    os.closerange(before, os.sysconf("SC_OPEN_MAX"))
+    serve(theirs[0], (), [(channel, ()) for channel in theirs[1:]])
+
+
+def program_with_path() -> NoReturn:
+    """In the place of `program`, in a fork: with the modules of PYTHONPATH, and a `sitecustomize` among them."""
+    folders = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one not in sys.path]
+    if folders:
+        sys.path[:0] = folders
+        importlib.invalidate_caches()
+        with suppress(ModuleNotFoundError):
+            importlib.import_module("sitecustomize")
+    program()
+
+
+ProgressLine.tell = tell  # type: ignore[method-assign]
+program = command.program
+
+if __name__ == "__main__":
+    largest = int(sys.argv[1])
+    if largest:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+    sys.argv[1:] = sys.argv[2:]
+    program()
+else:
+    preloading.start_servers = forked_servers
+    command.program = program_with_path
