@@ -133,14 +133,14 @@ class BlockReader:
 
 @final
 class Ahead(Generic[Made]):
-    """Values that are made from a stream some slots ahead, and read a slot or many slots at a time.
+    """Values that are made some slots ahead of need, and read a slot or many slots at a time.
 
-    make: the values of consecutive slots, (c, …). Reading slots in order makes each value once; any other order is correct,
-    only slower.
+    extended: the slots to make when these are asked for: the same, and some after them, such as `BlockReader.ahead`; make: the
+    values of consecutive slots, (c, …). Reading slots in order makes each value once; any other order is correct, only slower.
     """
 
-    def __init__(self, reader: BlockReader, make: Callable[[range], NDArray[Made]]) -> None:
-        self._reader, self._make = reader, make
+    def __init__(self, extended: Callable[[range], range], make: Callable[[range], NDArray[Made]]) -> None:
+        self._extended, self._make = extended, make
         self._slots = range(0)
         self._values: NDArray[Made]
 
@@ -159,7 +159,7 @@ class Ahead(Generic[Made]):
         return self._values[slots.start - start : slots.stop - start]
 
     def _draw(self, slots: range) -> None:
-        held, wanted = self._slots, self._reader.ahead(slots)
+        held, wanted = self._slots, self._extended(slots)
         if slots.start in held:
             more = self._make(range(held.stop, wanted.stop))
             self._values = np.concatenate([self._values[slots.start - held.start :], more])

@@ -25,6 +25,7 @@ from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend,
 from evedrop.live.protocol.telemetry import held
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.numeric.detection import CusumBatch
+from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
@@ -175,60 +176,60 @@ class Sensing:
         )
         self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
         self._betrayed = set(part.leaks.values())
+        self._answered = self._back is not None or self._steered is not None
+        self._most = 1 if part.pace or self._answered else most_slots(brief)
+        self._slots = range(0)
+        """Those that were made at once and are being sent."""
+        self._made: Sent
+        self._reported = 0
         self._start = 0.0
 
     def carry_on(self) -> None:
         """Send all slots."""
-        brief = self._brief
-        alone = brief.part.pace or self._back is not None or self._steered is not None
-        most = 1 if alone else most_slots(brief)
         self._start = time.monotonic()
-        k = 0
-        while k < brief.slots:
-            batch = brief.flow.batch
-            slots = range(k, min(k + most, k - k % batch + batch, brief.slots))
-            self._wait(k, lambda: None)
-            self._block(slots)
-            k = slots.stop
+        for k in range(self._brief.slots):
+            self._wait(k)
+            if k == self._slots.stop:
+                self._slots = range(k, min(k + self._most, self._end_of_report(k)))
+                self._made = self._core.send(self._slots)
+            self._send_packet(k)
+            if k + 1 == self._slots.stop:
+                self._report(k + 1)
 
-    def _block(self, slots: range) -> None:
-        """Make consecutive slots, send them, and report them. The first of them may be sent."""
-        made, first = self._core.send(slots), slots.start
-        packets = made.packets
+    def _end_of_report(self, k: int) -> int:
+        batch = self._brief.flow.batch
+        return min(k - k % batch + batch, self._brief.slots)
 
-        def report(end: int) -> None:
-            """Report the slots that have been sent: at a barrier, nothing else may be on its way."""
-            nonlocal first
-            if end > first:
-                some = slice(first - slots.start, end - slots.start)
-                self._reporter.add(range(first, end), made.rows(some))
-                first = end
+    def _send_packet(self, k: int) -> None:
+        packets, row = self._made.packets, k - self._slots.start
+        header, sent = (None if column is None else column[row] for column in (packets.header, packets.sent))
+        self._send(k, uplink(k, packets.z[row], header, sent, self._made.x[row] if k in self._betrayed else None))
 
-        for row, k in enumerate(slots):
-            if row:
-                self._wait(k, lambda k=k: report(k))  # type: ignore[misc]
-            header, sent = (None if column is None else column[row] for column in (packets.header, packets.sent))
-            self._send(k, uplink(k, packets.z[row], header, sent, made.x[row] if k in self._betrayed else None))
-        if len(slots) == 1 and (self._back is not None or self._steered is not None):
-            self._answered(slots.start, made)
-        else:
-            report(slots.stop)
+    def _report(self, end: int) -> None:
+        """Report the slots below `end` of those that were made at once; all of these have been sent."""
+        some = range(self._reported, end)
+        if some:
+            first = self._slots.start
+            made = self._made.rows(slice(some.start - first, end - first))
+            alarms, steered = self._answers(some.start, made) if self._answered else (None, None)
+            self._reporter.add(some, made, alarms, steered)
+            self._reported = end
 
-    def _answered(self, k: int, made: Sent) -> None:
-        """Wait for the answers to slot k, and report it."""
-        alarms, sent = None, made.packets.at(0).sent
+    def _answers(self, k: int, made: Sent) -> tuple[Flags | None, tuple[Floats, Flags] | None]:
+        """Wait for the answers to slot k, and heed them: alarms (1, R), and the inputs (1, m, R) with their failures (1, R)."""
+        alarms, steered = None, None
         if self._back is not None:
+            sent = made.packets.at(0).sent
             alarms = self._core.acknowledged(k, self._back.wait(k), sent)
-        steered = None
         if self._steered is not None:
             u, failed = self._steered.wait(k, made.true[0])
             if self._steered.decides(k):
                 self._core.hold(u)
             steered = u[None], failed[None]
-        self._reporter.add(range(k, k + 1), made, None if alarms is None else alarms[None], steered)
+        return None if alarms is None else alarms[None], steered
 
-    def _wait(self, k: int, before: Callable[[], None]) -> None:
-        """Wait until slot k may be sent and is due; at a barrier before it, wait for the conductor, after calling `before`."""
+    def _wait(self, k: int) -> None:
+        """Wait until slot k may be sent and is due; at a barrier before it, report all slots and wait for the conductor."""
         self._session.place.slot = k
         self._window.wait(k)
         pace = self._brief.part.pace
@@ -236,7 +237,7 @@ class Sensing:
         while not (wanted := self._barriers.wanted(k)) and pace and (left := self._left(k)) > 0.0:
             time.sleep(min(left, _LOOK_SECONDS))
         if wanted:
-            before()
+            self._report(k)  # before the barrier is sent: at a barrier, nothing else may be on its way
             self._send(k, barrier(k))
             began = time.monotonic()
             self._barriers.wait_at(k)

@@ -25,6 +25,7 @@ from evedrop import __main__ as command
 from evedrop.cli.report import ProgressLine
 from evedrop.fork_server import serve
 from evedrop.live.launch import preloading
+from evedrop.news import Held
 
 if TYPE_CHECKING:
     from evedrop.news import News
@@ -36,7 +37,8 @@ def tell(self: ProgressLine, news: News) -> None:
     """In the place of `ProgressLine.tell`."""
     if (path := os.environ.get("EVEDROP_TEST_NEWS")) is not None:
         with open(path, "a") as file:
-            file.write(f"{getattr(news, 'done', 0)} {news.event}\n")
+            done = news.before if isinstance(news, Held) else getattr(news, "done", 0)
+            file.write(f"{done} {news.event}\n")
     show(self, news)
 
 

@@ -102,7 +102,9 @@ class ProgressLine:
             case Started():
                 self._progress.update(self._task, description="running")
             case Held():
-                self._progress.update(self._task, description=f"held before slot {news.before}", rate="")
+                self._progress.update(
+                    self._task, description=f"held before slot {news.before}", completed=news.before, rate=""
+                )
             case RunProgress():
                 self._progress.update(
                     self._task,

@@ -69,7 +69,7 @@ def expect_same_in_blocks(scheme: Scheme, slots: Sequence[Slot], problem: Proble
 
 
 def expect_same_followed(make: Callable[[], Receiver], steps: Sequence[Step], problem: Problem, kind: type) -> None:
-    """Raise Broken unless a receiver, made anew for each division into blocks, has the beliefs of single slots."""
+    """Raise Broken unless a receiver has the same beliefs for every division into blocks; `make` makes one for each division."""
     whole, single, uneven = divisions(problem.slots)
     for blocks, every in ((whole, 1), (single, 1), (uneven, 1), (uneven, 2)):
         receiver = make()

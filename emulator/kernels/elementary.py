@@ -21,6 +21,14 @@ _LOG_ODD = (6.666666666666735130e-01, 2.857142874366239149e-01, 1.81835721616180
 _LOG_EVEN = (3.999999999940941908e-01, 2.222219843214978396e-01, 1.531383769920937332e-01)
 
 
+def product(M: Floats, x: Floats) -> Floats:
+    """M x of many vectors: M (…, m, n), x (…, n, R) → (…, m, R)."""
+    y: Floats = M[..., :, 0, None] * x[..., None, 0, :]
+    for j in range(1, M.shape[-1]):
+        y += M[..., :, j, None] * x[..., None, j, :]
+    return y
+
+
 def polynomial(coefficients: Sequence[float], x: Floats) -> Floats:
     """Evaluate c₀ + c₁x + c₂x² + … by Horner's rule, elementwise (any shape)."""
     value: Floats = coefficients[-1] * x

@@ -64,11 +64,14 @@ class Factors(NamedTuple):
         return [[*self.lower[start : start + i], 1.0] + [0.0] * (n - 1 - i) for i, start in enumerate(starts)]
 
 
-def applied(M: Floats, x: Floats) -> Floats:
-    """M x of many vectors: M (m, n), x (n, S) → (m, S), S of one axis."""
-    y: Floats = M[:, 0, None] * x[0]
-    for j in range(1, M.shape[1]):
-        y += M[:, j, None] * x[j]
+def solved(L: Sequence[Sequence[float]], z: Floats) -> Floats:
+    """L⁻¹ z of many vectors, by forward substitution: L lower triangular, n rows of n; z and the result (n, R)."""
+    y = np.empty_like(z)
+    for i, row in enumerate(L):
+        rest = z[i]
+        for j in range(i):
+            rest = rest - row[j] * y[j]
+        y[i] = rest / row[i]
     return y
 
 

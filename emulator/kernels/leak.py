@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
-from evedrop.kernels.elementary import Floats
-from evedrop.kernels.factored import Factor, applied
+from evedrop.kernels.elementary import Floats, product
+from evedrop.kernels.factored import Factor, solved
 
 
 @final
@@ -26,17 +26,11 @@ class Leak:
 
     def white(self, z: Floats) -> Floats:
         """L_k⁻¹ z, (n, R): white where z ~ N(0, Σ_k), which is the distribution of packets of both types."""
-        y = np.empty_like(z)
-        for i, row in enumerate(self._state):
-            rest = z[i]
-            for j in range(i):
-                rest = rest - row[j] * y[j]
-            y[i] = rest / row[i]
-        return y
+        return solved(self._state, z)
 
     def innovation(self, white: Floats) -> Floats:
         """The mean of w_{k−1} given the packet, QΣ_k⁻¹ z = QΣ_k⁻¹ L_k y, from y = L_k⁻¹ z, both (n, R)."""
-        return applied(self._gain, white)
+        return product(self._gain, white)
 
     @cached_property
     def remaining(self) -> Floats:

@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.kernels.elementary import Floats, exp
-from evedrop.kernels.factored import Factor, applied, grown, squared_length
+from evedrop.kernels.elementary import Floats, exp, product
+from evedrop.kernels.factored import Factor, grown, squared_length
 from evedrop.kernels.leak import Leak
 from evedrop.kernels.mixtures import Mixture, opened, pruned, summed
 
@@ -58,7 +58,7 @@ def _weighed(model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak)
     trial = there % max(1, of.weight.shape[1])
     some = Mixture(*(_taken(part.reshape(*part.shape[:-2], of.weight.size), there) for part in of))
     white, heard = leak.white(z), _taken(gamma, trial)
-    mean = applied(model.A, some.mean)
+    mean = product(model.A, some.mean)
     predicted, informed = grown(model.A, some.spread, model.noise, leak.remaining_factor)
     squared = squared_length(predicted, list(_taken(z, trial) - mean))
     alone = _taken(_squared(white), trial)

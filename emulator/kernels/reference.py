@@ -50,12 +50,7 @@ def _ordered(words: Words, width: int) -> Words:
     return np.ascontiguousarray(words[:, :, :width].transpose(0, 2, 1))
 
 
-def product(M: Floats, x: Floats) -> Floats:
-    """M x for every slot and trial: M (c, m, n), x (c, n, R) → (c, m, R)."""
-    y: Floats = M[:, :, 0, None] * x[:, None, 0, :]
-    for j in range(1, M.shape[-1]):
-        y += M[:, :, j, None] * x[:, None, j, :]
-    return y
+product = elementary.product
 
 
 def carry(A: Floats, P: Floats) -> Floats:

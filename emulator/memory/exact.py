@@ -113,7 +113,7 @@ class ExactSimulation:
                 for link in links.values():
                     link.silence(slots, made.packets.sent)
             if self._way_back is not None:
-                alarm = self._acknowledge(slots.start, made.packets.sent, links)
+                alarm = self._acknowledge(self._way_back, slots.start, made.packets.sent, links)
                 alarms += [] if alarm is None else [alarm]
             if self._steering is not None and inputs is not None:
                 if self._steering.awaits_estimate:
@@ -131,13 +131,13 @@ class ExactSimulation:
             self._digests[name].update(self._logs[name].add(chunk, one.beliefs))
         return self._chunk(chunk, whole, followed, links, np.array(alarms) if alarms else None, inputs)
 
-    def _acknowledge(self, k: int, sent: Flags | None, links: Mapping[str, LinkCore]) -> Flags | None:
+    def _acknowledge(
+        self, way_back: AckChannel, k: int, sent: Flags | None, links: Mapping[str, LinkCore]
+    ) -> Flags | None:
         """Return the acknowledgements of slot k to the sensor; where they raise an alarm, (R,), or None."""
-        if self._way_back is None:
-            return None
         gamma = links[LEGITIMATE].gamma(k)
         gamma_e = gamma if self._jammer is None else links[self._jammer].gamma(k)
-        arrived = self._way_back.arrived(k, None if sent is None else sent[0], gamma, gamma_e)
+        arrived = way_back.arrived(k, None if sent is None else sent[0], gamma, gamma_e)
         with self._guard.asking(LEGITIMATE, range(k, k + 1)):
             return self._sensor.acknowledged(k, arrived, None if sent is None else sent[0])
 
@@ -160,7 +160,8 @@ class ExactSimulation:
         inputs: InputSlots | None,
     ) -> Chunk:
         """What is measured of the slots."""
-        counted: dict[str, NDArray[np.uint32]] = {}
+        none_counted: dict[str, NDArray[np.uint32]] = {}
+        no_sums = np.full((len(chunk), 2), np.nan)  # only receivers of a live run report sums over slots
         receivers, slots = {}, {}
         for name, (beliefs, late) in followed.items():
             link = links[name]
@@ -171,9 +172,9 @@ class ExactSimulation:
                 beliefs.x_hat,
                 beliefs.action,
                 beliefs.P,
-                np.empty((len(chunk), 2)),
+                no_sums,
                 link.in_time,
-                counted,
+                none_counted,
                 arrived,
                 used,
             )

@@ -72,7 +72,7 @@ class AckChannel:
         self._attack = ATTACKS[attack]
         self._spans = spans
         reader = BlockReader(key, batch, 1)
-        self._through = Ahead(reader, lambda slots: reader.uniforms(slots)[:, 0, :] < quality)
+        self._through = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, 0, :] < quality)
 
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
         """The acknowledgements of slot k that reach the sensor, (R,).

@@ -105,7 +105,7 @@ class LocalFilter:
         self._C, V = _measured(plant)
         factor = semidefinite_factor(V)
         reader = BlockReader(key, batch, len(self._C))
-        self._noise = Ahead(reader, lambda slots: product(factor, reader.normals(slots)))
+        self._noise = Ahead(reader.ahead, lambda slots: product(factor, reader.normals(slots)))
         self.x: Floats = np.zeros((process.n, batch.trials))
         """x̂ˢ of the last slot, (n, R)."""
         self.predicted: Floats = self.x

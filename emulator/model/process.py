@@ -100,7 +100,7 @@ class ProcessNoise:
         self._reader = BlockReader(key, batch, process.n)
         self._initial_factor = cholesky(process.initial_covariance)
         self._factor = process.noise_factor if covariance is None else semidefinite_factor(covariance)
-        self._noise = Ahead(self._reader, self._drawn)
+        self._noise = Ahead(self._reader.ahead, self._drawn)
 
     def at(self, k: int) -> Floats:
         """The noise that slot k adds to A x_{k−1}, (n, R)."""

@@ -20,7 +20,7 @@ class Schedule:
     def __init__(self, key: bytes, state_probability: float, batch: Batch) -> None:
         self._reader = BlockReader(key, batch, 1)
         self._state_probability = state_probability
-        self._innovations = Ahead(self._reader, self._drawn)
+        self._innovations = Ahead(self._reader.ahead, self._drawn)
 
     def at(self, k: int) -> Flags:
         """ν_k as flags, (R,): true for an innovation."""

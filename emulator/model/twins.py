@@ -18,7 +18,7 @@ import numpy as np
 
 from evedrop.kernels.current import kernels
 from evedrop.kernels.elementary import cholesky
-from evedrop.kernels.factored import Factor
+from evedrop.kernels.factored import Factor, solved
 from evedrop.model.process import Floats, Process, product
 
 
@@ -37,13 +37,7 @@ class Apart:
 
     def mean(self, a: Floats) -> Floats:
         """G L_k⁻¹ a, (n, R), of tracks a (n, R)."""
-        white = np.empty_like(a)
-        for i, row in enumerate(self._state):
-            rest = a[i]
-            for j in range(i):
-                rest = rest - row[j] * white[j]
-            white[i] = rest / row[i]
-        return product(self._gain, white)
+        return product(self._gain, solved(self._state, a))
 
 
 @final

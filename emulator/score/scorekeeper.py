@@ -54,7 +54,9 @@ class Scorekeeper:
     def __init__(
         self, scenario: Scenario, trials: int, theory: Mapping[str, ExpectedTraceStream] | None = None
     ) -> None:
-        self._theory = theory or {name: one.stream() for name, one in expectations_of(scenario).items()}
+        if theory is None:
+            theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
+        self._theory = theory
         self.totals = Totals.of(scenario, trials)
 
     def add(self, slots: Slots, known: Mapping[str, Floats] | None = None) -> dict[str, Scored]:

@@ -145,7 +145,7 @@ def test_a_block_may_be_digested_in_parts(cuts: list[int], trials: int, seed: in
 
 
 def test_what_is_held_is_a_copy() -> None:
-    """Whoever adds slots may write the next ones to the same place."""
+    """The caller may overwrite the arrays that it has added."""
     beliefs = random_beliefs(40, 2, 3, 6)
     parts, place = PartialDigests(3), Beliefs(np.empty((1, 2, 3)), np.empty((1, 2, 2, 3)), np.empty((1, 3), np.uint8))
     for one in beliefs:

@@ -13,7 +13,7 @@ from evedrop.model import modulated
 from evedrop.model.eavesdroppers import READERS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.links import loss_of
-from evedrop.model.process import Floats, Process
+from evedrop.model.process import Floats, Process, StateFactors
 from evedrop.model.receiver import Action
 from evedrop.model.slot.link_law import LinkLaw
 from evedrop.model.theory.covariances import (
@@ -92,6 +92,26 @@ def test_the_leak_by_triangularisation_is_the_leak(process: Process) -> None:
         assert np.allclose(leak.innovation(white), gain @ z, rtol=1e-8, atol=1e-9)
         determinant = float(np.sum(np.log(leak.state_diagonal)))
         assert determinant == pytest.approx(np.linalg.slogdet(sigma)[1], rel=1e-9, abs=1e-9)
+
+
+@given(st.data())
+def test_leaks_in_order_are_computed_once(data: st.DataObject) -> None:
+    """Whatever number of slots is read at a time: a long live run reads them in blocks that nobody can foresee."""
+    leaks, computed = Leaks(MIXED), list[int]()
+    whole, original = Leaks(MIXED).block(range(1, 400)), StateFactors.block
+
+    def counting(factors: StateFactors, slots: range) -> Floats:
+        computed.extend(slots)
+        return original(factors, slots)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StateFactors, "block", counting)
+        k = 1
+        while k < 400:
+            stop = data.draw(st.integers(k + 1, min(k + 100, 400)))
+            assert np.array_equal(leaks.block(range(k, stop)), whole[k - 1 : stop - 1])
+            k = stop
+    assert computed == list(range(1, computed[-1] + 1))
 
 
 def test_the_leak_where_the_state_covariance_cannot_be_inverted() -> None:

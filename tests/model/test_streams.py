@@ -103,7 +103,7 @@ def test_what_is_drawn_ahead_is_drawn_once_and_in_order(data: st.DataObject, sha
         made.extend(some)
         return np.array(some)
 
-    ahead = Ahead(BlockReader(KEY, Batch(slots, trials), 2), make)
+    ahead = Ahead(BlockReader(KEY, Batch(slots, trials), 2).ahead, make)
     k = 0
     while k < slots:
         stop = data.draw(st.integers(k + 1, slots))

@@ -127,7 +127,7 @@ class Downlink:
                 z = kernels.gather(arrivals.gamma[row], packets.z[row]).tobytes()
             header = b"" if packets.header is None else packed_header(packets.header[row], arrivals.gamma[row])
             truth = packets.truth[row].tobytes() if k == self._leak and row in packets.truth else b""
-            arrived = late.get(row, ()) if late else ()
+            arrived = late.get(row, ())
             message = delivery(k, self._masks[first + row], z, arrived, header, truth)
             put(message, self._rest(k, arrivals.gamma[row], arrived) if rests else 0.0)
 

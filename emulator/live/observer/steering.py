@@ -74,7 +74,7 @@ class Steering:
         self.at, self._last, self._asked = k, k, False
         self._pending = list(self._due.pop(k, []))
         self._since = time.monotonic()
-        if self.paused:  # it began so: whoever else pauses it does so at a hold
+        if self.paused:  # only a run that began paused is paused here: all later pauses take effect at a hold
             self._pause(k, "pause the run")
 
     def left(self, name: str, k: int) -> None:

@@ -27,7 +27,7 @@ class Suspicious(PacketTaker):
         self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
         self._use_state, self._use_innovation = self.use_probabilities(knowledge.parameters)
         self._coins = BlockReader(knowledge.keys["coin"], batch, 1)
-        self._used = Ahead(self._coins, self._tossed)
+        self._used = Ahead(self._coins.ahead, self._tossed)
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all

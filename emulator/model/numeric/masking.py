@@ -31,7 +31,7 @@ class Mask:
     def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
         self._process = process
         reader = BlockReader(key, batch, process.n)
-        self._pads = Ahead(reader, lambda slots: (reader.uniforms(slots) * 2.0**_RANGE_BITS).astype(np.int64))
+        self._pads = Ahead(reader.ahead, lambda slots: (reader.uniforms(slots) * 2.0**_RANGE_BITS).astype(np.int64))
         self._k = 0
         self._sigma: Floats = process.initial_covariance[:, :, None]
         self._exponents: dict[int, NDArray[np.int32]] = {}

@@ -37,7 +37,7 @@ class SharedSecret(Shared):
         self._factors = StateFactors(process)
         self._process = process
         self._trials = batch.trials
-        self._chi = Ahead(self._reader, self._drawn)
+        self._chi = Ahead(self._reader.ahead, self._drawn)
 
     def nu(self, k: int) -> Flags:
         """ν_k, (R,): true for an innovation."""

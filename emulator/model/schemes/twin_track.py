@@ -35,7 +35,7 @@ class TwinTracks:
         self._apart: Floats = product(factor, normals[process.n :]) - self.initial
         self._k, self._distance = 0, self._apart
         reader = BlockReader(keys["track"], batch, 1)
-        self._coins = Ahead(reader, lambda slots: reader.uniforms(slots)[:, 0, :] < 0.5)
+        self._coins = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, 0, :] < 0.5)
 
     def distance(self, k: int) -> Floats:
         """d_k, (n, R): the distance from the process's track to its twin's."""

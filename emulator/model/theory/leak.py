@@ -20,6 +20,7 @@ from evedrop.kernels.current import kernels
 from evedrop.kernels.elementary import cholesky
 from evedrop.kernels.leak import Leak
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors
+from evedrop.streams import Ahead
 
 _SLOTS_AT_ONCE, _NUMBERS_AT_ONCE = 64, 1 << 16  # read ahead of need
 
@@ -69,9 +70,8 @@ class Leaks:
     def __init__(self, process: Process) -> None:
         self._states = StateFactors(process)
         self._noise = cholesky(process.Q)
-        self._count = max(1, min(_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE // (4 * process.n * process.n)))
-        self._slots = range(0)
-        self._factors: Floats
+        count = max(1, min(_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE // (4 * process.n * process.n)))
+        self._factors = Ahead(lambda slots: range(slots.start, max(slots.stop, slots.start + count)), self._computed)
         self._k = 0
         self._leak: Leak
 
@@ -83,11 +83,7 @@ class Leaks:
 
     def block(self, slots: range) -> Floats:
         """The triangular matrices of consecutive slots, at least one, (c, 2n, 2n); that of slot 0 has no meaning."""
-        if slots.start < self._slots.start or slots.stop > self._slots.stop:
-            self._slots = range(slots.start, max(slots.stop, slots.start + self._count))
-            self._factors = self._computed(self._slots)
-        start = self._slots.start
-        return self._factors[slots.start - start : slots.stop - start]
+        return self._factors.of(slots)
 
     def _computed(self, slots: range) -> Floats:
         n = len(self._noise)
