@@ -30,9 +30,8 @@ BLOCK_SLOTS = 256
 DIGEST_BYTES = 16
 _TILE_BYTES = 2**18  # of the records made at a time, so that they are still in the cache when they are hashed
 _TILE_TRIALS = 8, 256  # at least as many trials at a time as share a line of the cache, and at most as many as pay
-_HELD_BYTES = (
-    2**20
-)  # of beliefs that wait for the next ones: a call of the hash costs as much as the bytes of some tens of slots
+# Of beliefs that wait for the next ones: a call of the hash costs as much as the bytes of some tens of slots.
+_HELD_BYTES = 2**20
 
 Digests = NDArray[np.uint8]
 

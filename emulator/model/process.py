@@ -264,9 +264,15 @@ def _covariance_mistakes(M: Floats) -> list[str]:
         return [f"entry [{i}][{j}] is {M[i, j]} but [{j}][{i}] is {M[j, i]}; expected a symmetric matrix"]
     scale = np.sqrt(np.abs(np.diag(M)))
     lowest = float(np.linalg.eigvalsh(M)[0])
-    # The eigenvalues of the correlations do not depend on the states' units; the limit allows for rounding in a singular M.
-    if not np.all(np.diag(M) > 0.0) or np.linalg.eigvalsh(M / np.outer(scale, scale))[0] <= _SINGULAR:
+    if not np.all(np.diag(M) > 0.0):
         return [f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix, all eigenvalues above 0"]
+    # The eigenvalues of the correlations do not depend on the states' units; the limit allows for rounding in a singular M.
+    least = float(np.linalg.eigvalsh(M / np.outer(scale, scale))[0])
+    if least <= _SINGULAR:
+        return [
+            f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix: the smallest eigenvalue of its correlation "
+            f"matrix is {least:.3g}, and must exceed {_SINGULAR:g} to be told from 0 in double precision"
+        ]
     return []
 
 

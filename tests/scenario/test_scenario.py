@@ -45,6 +45,7 @@ from tests.scenario.good import GOOD, mistakes
         ("process.Q", [[1e-3]], "process.Q: is 1 × 1; expected 2 × 2, as A is"),
         ("process.Q.0.1", 1e-4, "process.Q: entry [0][1] is 0.0001 but [1][0] is 0.0; expected a symmetric matrix"),
         ("process.Q.1.1", -1.0, "process.Q: has the eigenvalue -1; expected a positive definite matrix"),
+        ("process.Q", [[1.0, 1.0 - 1e-14], [1.0 - 1e-14, 1.0]], "must exceed 1e-13 to be told from 0 in double precision"),
         ("process.initial_covariance.1.1", 0.0, "process.initial_covariance: has the eigenvalue 0; expected a positive"),
         (
             "encoding.scheme",

@@ -146,13 +146,13 @@ class BeliefReporter:
             np.empty((batch, brief.trials), np.uint8),
         )
         self._trace = np.empty((batch, 2))
-        self._late = np.zeros((2, batch, brief.trials), np.uint16) if counts_late else None
+        self._late = np.empty((2, batch, brief.trials), np.uint16) if counts_late else None
         self._first = first
 
     def add(self, slots: range, beliefs: Beliefs, late: NDArray[np.uint16] | None = None) -> None:
         """Add consecutive slots, and report where a report is due.
 
-        late: how many late packets arrived and how many were used, (2, c, R).
+        late: how many late packets arrived and how many were used, (2, c, R), if the receiver can use them.
         """
         k, batch = slots.start, self._brief.flow.batch
         while k < slots.stop:
@@ -171,8 +171,8 @@ class BeliefReporter:
         self._beliefs.P[rows] = beliefs.P[..., : self._brief.recorded]
         trace = kernels.traces(beliefs.P)
         self._trace[rows, 0], self._trace[rows, 1] = trace.sum(axis=1), (trace * trace).sum(axis=1)
-        if self._late is not None:
-            self._late[:, rows] = 0 if late is None else late
+        if self._late is not None and late is not None:
+            self._late[:, rows] = late
         self._digests.update(self._log.add(slots, beliefs))
 
     def flush(self, end: int) -> None:

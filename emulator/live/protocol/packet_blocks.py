@@ -100,8 +100,6 @@ def _plain_deliveries(messages: Sequence[Reader], shape: tuple[int, int]) -> Arr
         return None
     gamma = flags_of(bits, trials)
     counts = np.count_nonzero(gamma, axis=1).tolist()
-    if any((count == 0) == ("z" in one) for count, one in zip(counts, found, strict=True)):
-        return None
     packed = _finite([one.get("z", b"") for one in found], [n * count for count in counts])
     return None if packed is None else Arrivals(gamma, kernels.scatter(gamma, packed, n))
 

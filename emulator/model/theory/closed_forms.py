@@ -165,7 +165,7 @@ def in_sync_probability(mu: float, mu_d: float) -> float:
 
     Source: Proposition (limiting distribution), first part.
     """
-    return 1.0 if mu == 1.0 else mu * mu_d / (1.0 - mu * (1.0 - mu_d))
+    return 1.0 if mu == 1.0 else mu * mu_d / ((1.0 - mu) + mu * mu_d)
 
 
 def word_probability(mu: float, mu_d: float, innovations: int, drops: int) -> float:
@@ -184,6 +184,7 @@ def step_probabilities(mu: float, mu_d: float, steps: int) -> Floats:
     Source: Proposition (limiting distribution), summed over the 2^{i−1} words of a step.
     """
     in_sync = in_sync_probability(mu, mu_d)
-    probabilities = (1.0 - mu) * in_sync * (1.0 - mu * mu_d) ** (np.arange(steps, dtype=np.float64) - 1.0)
+    not_the_state = (1.0 - mu) + mu * (1.0 - mu_d)
+    probabilities = (1.0 - mu) * in_sync * not_the_state ** (np.arange(steps, dtype=np.float64) - 1.0)
     probabilities[:1] = in_sync
     return probabilities

@@ -65,7 +65,9 @@ class Outcomes:
         """A user of packets behind a link of quality μ_e, with P(b=1 | ν=0) and P(b=1 | ν=1)."""
         state = mu_e * mu_d * use_state
         misled = mu_e * (1.0 - mu_d) * use_innovation
-        return cls(1.0 - state - misled, state, misled, decoded=0.0, initial=1.0 - mu_e * use_state)
+        discarded = mu_d * (1.0 - use_state) + (1.0 - mu_d) * (1.0 - use_innovation)
+        lost = 1.0 - mu_e
+        return cls(lost + mu_e * discarded, state, misled, decoded=0.0, initial=lost + mu_e * (1.0 - use_state))
 
     @classmethod
     def genie(cls, mu_e: float, mu_d: float) -> Outcomes:
@@ -236,7 +238,7 @@ def stability_bound(process: Process, mu: float) -> float:
     rho = radius(process)
     if rho < 1.0:
         return 0.0
-    return (1.0 - rho**-2.0) / mu if mu > 0.0 else math.inf
+    return (rho - 1.0) * (rho + 1.0) / rho**2 / mu if mu > 0.0 else math.inf
 
 
 def lyapunov(process: Process, kept: float) -> Floats:

@@ -19,48 +19,78 @@ import numpy as np
 from evedrop.kernels.current import kernels
 from evedrop.kernels.elementary import cholesky
 from evedrop.kernels.leak import Leak
-from evedrop.model.process import MARGINAL, Floats, Process, StateFactors
+from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
 from evedrop.streams import Ahead
 
 _SLOTS_AT_ONCE, _NUMBERS_AT_ONCE = 64, 1 << 16  # read ahead of need
+_AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state, in those of the noise: its square is far from overflow
+_DOUBLINGS = 40  # more than the slowest stable direction takes: 2⁴⁰ slots
 
 
 @final
 class RemainingCovariances:
-    """M_k for k = 1, 2, … in this order, for the theory: fast, and accurate to the rounding of Q, but bits depend on the machine.
-
-    From M_k = A (Σ_{k−1}⁻¹ + AᵀQ⁻¹A)⁻¹ Aᵀ and Σ_k⁻¹ = Q⁻¹ − Q⁻¹M_kQ⁻¹, which work even where Σ_k cannot be inverted.
-    """
+    """M_k for k = 1, 2, … in this order, for the theory: in slots beyond the horizon too, where Σ_k exceeds double precision."""
 
     def __init__(self, process: Process) -> None:
-        self._A = process.A
-        self._precision = np.linalg.inv(process.Q)
-        self._carried = process.A.T @ self._precision @ process.A
-        self._information = np.linalg.inv(process.initial_covariance)
+        self._A, self._noise = process.A, cholesky(process.Q)
+        self._state = cholesky(process.initial_covariance)
+        self._largest = _AS_GOOD_AS_INFINITE * float(np.abs(self._noise).max())
 
     def next(self) -> Floats:
         """M_k of the next slot, (n, n)."""
-        M: Floats = self._A @ np.linalg.inv(self._information + self._carried) @ self._A.T
-        self._information = self._precision - self._precision @ M @ self._precision
-        return M
+        joint = _triangularised(product(self._A, self._state)[None], self._noise, self._noise)[0]
+        n = len(self._noise)
+        # A column that is scaled down still means a variance that is as good as infinite, beside which M_k is the same.
+        self._state = joint[:n, :n] / np.maximum(1.0, np.abs(joint[:n, :n]).max(axis=0) / self._largest)
+        return _squared(joint[n:, n:])
 
 
 def remaining_limit(process: Process) -> Floats:
     """Limit of M_k, (n, n): Q minus the permanent leak in the directions in which the process is stable.
 
-    With rows W of Aᵀ's stable invariant subspace, Wᵀx is a stable process by itself and the rest of Σ_k⁻¹ vanishes.
+    With rows W of Aᵀ's stable invariant subspace, Wᵀx is a stable process by itself and the rest of Σ_k⁻¹ vanishes. M_k's
+    limit is what the triangularisation above leaves, with Wᵀx in place of x.
 
     Source: docs/mathematics.md, genie.
     """
-    from scipy.linalg import schur, solve_discrete_lyapunov  # noqa: PLC0415 - slow to import
+    from scipy.linalg import schur  # noqa: PLC0415 - slow to import
 
     T, Z, stable = schur(process.A.T, sort=lambda real, imaginary: math.hypot(real, imaginary) < 1.0 - MARGINAL)
     if stable == 0:
         return process.Q
-    W = Z[:, :stable]
-    S = solve_discrete_lyapunov(T[:stable, :stable].T, W.T @ process.Q @ W)
-    limit: Floats = process.Q - process.Q @ W @ np.linalg.solve(S, W.T @ process.Q)
-    return limit
+    noise, dynamics = cholesky(process.Q), T[:stable, :stable].T
+    seen = Z[:, :stable].T @ noise
+    joint = _triangularised((dynamics @ _stationary_factor(dynamics, seen))[None], seen, noise)[0]
+    return _squared(joint[stable:, stable:])
+
+
+def _stationary_factor(F: Floats, G: Floats) -> Floats:
+    """Lower triangular L with L Lᵀ = S, S = F S Fᵀ + G Gᵀ, by doubling: F (s, s) stable, G (s, m)."""
+    L: Floats = kernels.triangular_factors(G[None])[0]
+    power = F
+    for _ in range(_DOUBLINGS):
+        grown = kernels.triangular_factors(np.concatenate([L, power @ L], axis=1)[None])[0]
+        if np.array_equal(grown, L):
+            break
+        L, power = grown, power @ power
+    return L
+
+
+def _triangularised(carried: Floats, seen: Floats, noise: Floats) -> Floats:
+    """The triangular matrices above, (c, s + n, s + n).
+
+    carried: A L_{k−1}, (c, s, s); seen: the factor of what the noise adds to the state, (s, n); noise: Q^½, (n, n).
+    """
+    s, n = seen.shape
+    joint = np.zeros((len(carried), s + n, s + n))
+    joint[:, :s, :s] = carried
+    joint[:, :s, s:], joint[:, s:, s:] = seen, noise
+    return kernels.triangular_factors(joint)
+
+
+def _squared(L: Floats) -> Floats:
+    """L Lᵀ, (n, n), of L (n, n)."""
+    return np.asarray(L @ L.T)
 
 
 @final
@@ -86,8 +116,4 @@ class Leaks:
         return self._factors.of(slots)
 
     def _computed(self, slots: range) -> Floats:
-        n = len(self._noise)
-        joint = np.zeros((len(slots), 2 * n, 2 * n))
-        joint[:, :n, :n] = self._states.block(slots)
-        joint[:, :n, n:] = joint[:, n:, n:] = self._noise
-        return kernels.triangular_factors(joint)
+        return _triangularised(self._states.block(slots), self._noise, self._noise)
