@@ -131,21 +131,21 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
         return
     if mode is Mode.ERROR_COORDINATES and scenario.plant is not None:
         raise UsageError(
-            f"--mode {mode.value} follows errors, not states, and the plant's inputs and disturbances depend on states; give "
-            "--mode exact, or covariance-only for the covariances alone"
+            f"--{mode.value} follows errors, not states, and the plant's inputs and disturbances depend on states; leave "
+            f"--{mode.value} out, or give --{Mode.COVARIANCE_ONLY.value} instead, for the covariances alone"
         )
     _check_scheme(scenario, mode)
     for name in scenario.receivers:
         if scenario.timeline.outages[name] or scenario.window(name):
             raise UsageError(
-                f"{name} uses late packets or goes away, which the mode {mode.value} cannot follow; "
-                "leave --mode out, or remove its window and its outages from the scenario"
+                f"{name} uses late packets or goes away, which --{mode.value} cannot follow; "
+                f"leave --{mode.value} out, or remove the window and the outages of {name} from the scenario"
             )
     for name, table in scenario.eavesdroppers.items():
         if not STRATEGIES[table.strategy].follows_gamma(table.parameters):
             raise UsageError(
-                f"--mode {mode.value} follows events, not packets, and the actions of {name} (strategy {table.strategy}) "
-                f"depend on more; give --mode exact, or remove {name} from the scenario"
+                f"--{mode.value} follows events, not packets, and the actions of {name} (strategy {table.strategy}) "
+                f"depend on more; leave --{mode.value} out, or remove {name} from the scenario"
             )
     for name, expected in expected_traces_of(scenario).items():
         beyond = np.flatnonzero(np.isinf(expected))
@@ -168,14 +168,14 @@ def _check_scheme(scenario: Scenario, mode: Mode) -> None:
     for what, so in reasons.items():
         if so:
             raise UsageError(
-                f"--mode {mode.value} follows events, not packets, and the scheme {name} {what}; give --mode exact"
+                f"--{mode.value} follows events, not packets, and the scheme {name} {what}; leave --{mode.value} out"
             )
     for receiver, table in scenario.eavesdroppers.items():
         follows = STRATEGIES[table.strategy].follows_gamma(table.parameters)
         if follows and eavesdropper_outcomes(scheme, table.strategy, table.parameters) is None:
             raise UsageError(
-                f"--mode {mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) reads the "
-                f"packets of the scheme {name}; give --mode exact, or remove {receiver} from the scenario"
+                f"--{mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) reads the "
+                f"packets of the scheme {name}; leave --{mode.value} out, or remove {receiver} from the scenario"
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 from pathlib import Path
@@ -37,6 +38,36 @@ def test_every_command_of_the_documents_is_one(page: str) -> None:
             assert f"def test_{words[-1]}_" in names, words
         elif words[1] != "FILE":
             assert cli.parser_of().parse_args(words[1:]).command is not None
+
+
+OTHER_OPTIONS = {
+    "emulator/applications/microgrid/day.py",  # a program of its own
+    "emulator/pytest_plugin.py",
+    "emulator/view/picture.py",  # the viewer's
+    "emulator/view/viewer.py",
+    "emulator/view/viewer_process.py",  # the sandbox's
+}
+"""Modules that name the options of other programs."""
+_PIP = {"--force-reinstall"}
+
+
+def test_every_option_that_the_code_names_is_one() -> None:
+    """A message that advises an option names one that a command has."""
+    known = options(cli.parser_of()) | _PIP
+    sources = [path.relative_to(DOCS.parent).as_posix() for path in sorted((DOCS.parent / "emulator").rglob("*.py"))]
+    assert set(sources) > OTHER_OPTIONS
+    for source in set(sources) - OTHER_OPTIONS:
+        text = (DOCS.parent / source).read_text(encoding="utf-8")
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known, source
+
+
+def options(parser: argparse.ArgumentParser) -> set[str]:
+    """The options of a parser and of all its commands."""
+    found = {option for action in parser._actions for option in action.option_strings}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found = found.union(*(options(one) for one in action.choices.values()))
+    return found
 
 
 def test_the_pages_that_show_commands_have_some() -> None:

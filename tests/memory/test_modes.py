@@ -5,6 +5,7 @@ Comparisons with theory are at 4.5 standard errors: a normal mean is beyond with
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.builders import MICROGRID, process_table
+from tests.conftest import Evedrop
 
 SURE = 4.5
 COVARIANCES, ERRORS = Plan(Mode.COVARIANCE_ONLY, workers=1), Plan(Mode.ERROR_COORDINATES, workers=1)
@@ -259,10 +261,29 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
     }
     more = entries.get(strategy, {"link": {"quality": 0.5}})
     of = scenario(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
-    said = rf"--mode {plan.mode.value} follows .* the actions of eve \(strategy {strategy}\).*; give --mode exact, or remove eve"
+    option = f"--{plan.mode.value}"
+    said = rf"{option} follows .* the actions of eve \(strategy {strategy}\).*; leave {option} out, or remove eve"
     with pytest.raises(UsageError, match=said):
         montecarlo(of, trials=2, plan=plan, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["--covariance-only", "--error-coordinates"])
+@pytest.mark.parametrize("name", ["acknowledged", "bayesian", "heated-room", "late", "restart", "twin-track"])
+def test_a_refused_study_runs_as_advised(name: str, option: str, evedrop: Evedrop) -> None:
+    """Every option that the message names is one of the command, and the command runs with each change that it advises."""
+    command = ("montecarlo", name, "--trials", "2")
+    refused = evedrop(*command, option, "--out", "refused")
+    if (name, option) == ("heated-room", "--covariance-only"):
+        assert refused.status in {0, 1}  # error-coordinates are refused with this advice
+        return
+    assert (refused.status, refused.out) == (2, "")
+    options = set(re.findall(r"--[a-z-]+", refused.err))
+    assert f"; leave {option} out" in refused.err
+    assert options == ({option, "--covariance-only"} if name == "heated-room" else {option})
+    for number, remedy in enumerate([[], *([one] for one in options - {option})]):
+        done = evedrop(*command, *remedy, "--out", f"advised {number}")
+        assert done.status in {0, 1}, done.err  # 1: two trials do not meet every expectation
 
 
 def test_a_constant_one_and_a_pool_are_followed_in_every_mode() -> None:
