@@ -3,7 +3,8 @@
     python benchmarks/memory.py [--quick]
 
 Private memory is what a process has for itself: its pages that no other process shares (Private_* of /proc/PID/smaps_rollup).
-The growth is that from a quarter of the slots to the last look before all are on disk: it does not include the final tables.
+The growth is that from the second quarter of the slots to the last, each by its median, because queues fill and empty. It does
+not include the final tables.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from subprocess import PIPE
 
 from live_run import measured, slots_on_disk
@@ -69,22 +71,26 @@ class Looks:
 
     @property
     def growth(self) -> dict[str, float]:
-        """Process → MB in a million slots, from a quarter of the slots on.
+        """Process → MB in a million slots, from the median of the second quarter of the slots to that of the last.
 
         Raises RuntimeError if there were too few looks.
         """
         # Peers leave before the last slots are on disk: a look that misses one of them is not compared.
         all_there = max((len(found) for found in self.megabytes), default=0)
         looks = [
-            (slots, found)
+            (slots / self.total, found)
             for slots, found in zip(self.slots, self.megabytes, strict=True)
-            if slots >= self.total / 4 and len(found) == all_there
+            if len(found) == all_there
         ]
-        past = looks[-1][0] - looks[0][0] if looks else 0
-        if not past:
+        before = [found for share, found in looks if 0.25 <= share < 0.5]
+        after = [found for share, found in looks if share >= 0.75]
+        if not before or not after:
             raise RuntimeError(f"{self.total} slots were over before memory was looked at twice; run more slots")
-        before, after = looks[0][1], looks[-1][1]
-        return {name: (size - before[name]) / past * 1e6 for name, size in after.items() if name in before}
+        apart = 0.5 * self.total / 1e6
+        return {
+            name: (median(one[name] for one in after) - median(one[name] for one in before)) / apart
+            for name in after[0]
+        }
 
 
 def bare_interpreter() -> float:
@@ -100,7 +106,7 @@ def bare_interpreter() -> float:
 
 def rows(quick: bool) -> Iterator[Row]:
     """The largest peer, and the growth of every process."""
-    slots = 3_000 if quick else 500_000
+    slots = 3_000 if quick else 2_000_000
     looks = Looks(slots)
     pace = "0.0005" if quick else "0"  # so that there is time to look
     measured("eavesdroppers", "--pace", pace, "--slots", str(slots), watch=looks.look)
@@ -116,7 +122,7 @@ def rows(quick: bool) -> Iterator[Row]:
     growth = looks.growth
     name = max(growth, key=lambda one: growth[one])
     yield Row(
-        f"growth of private memory from a quarter to the end of {slots:,} slots, the largest of {len(growth)} processes",
+        f"growth of private memory over {slots:,} slots, the largest of {len(growth)} processes",
         f"{growth[name]:.1f} MB in 10⁶ slots ({name})",
         "none",
         f"flat: below {_FLAT:.0f} MB in 10⁶ slots",

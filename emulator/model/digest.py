@@ -13,7 +13,8 @@ Source: docs/results.md, digests.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from array import array
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
 from typing import final
@@ -179,6 +180,38 @@ def _records(marks: Flags, a: Floats, P: Floats | None) -> Iterator[tuple[int, l
         count = min(some, trials - first)
         kernels.records(marks, a, P, tile[:count], first)
         yield first, rows[:count]
+
+
+@final
+class DigestLog(Mapping[int, Digests]):
+    """The digests of a run's blocks, (R, 16) each, by the block's first slot: some bytes for each, and no objects."""
+
+    def __init__(self) -> None:
+        self._starts = array("q")
+        self._bytes = bytearray()
+
+    def add(self, blocks: Mapping[int, Digests]) -> None:
+        """Add the next blocks, which are later than all that have been added."""
+        for start in sorted(blocks):
+            self._starts.append(start)
+            self._bytes += blocks[start].tobytes()
+
+    def after(self, count: int) -> dict[int, Digests]:
+        """All blocks but the first `count`."""
+        return {start: self[start] for start in self._starts[count:]}
+
+    def __getitem__(self, start: int) -> Digests:
+        place = bisect_left(self._starts, start)
+        if place == len(self._starts) or self._starts[place] != start:
+            raise KeyError(start)
+        size = len(self._bytes) // len(self._starts)
+        return np.frombuffer(self._bytes[place * size : (place + 1) * size], np.uint8).reshape(-1, DIGEST_BYTES)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._starts)
+
+    def __len__(self) -> int:
+        return len(self._starts)
 
 
 @final

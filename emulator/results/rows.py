@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import islice
 from typing import final
 
-from evedrop.model.digest import Digests
+from evedrop.model.digest import DigestLog
 from evedrop.results.writer import ResultsWriter
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
@@ -25,7 +24,7 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
 class DigestRows:
     """The digests of a run; their rows are written as blocks are reported."""
 
-    def __init__(self, digests: Mapping[str, Mapping[int, Digests]], first_trial: int) -> None:
+    def __init__(self, digests: Mapping[str, DigestLog], first_trial: int) -> None:
         """digests: receiver, or controller → block → digests of the trials from first_trial on; blocks are added later."""
         self._digests = digests
         self._first_trial = first_trial
@@ -35,6 +34,5 @@ class DigestRows:
         """Write the blocks that were added since the last call."""
         for name, blocks in self._digests.items():
             if len(blocks) > self._written[name]:
-                new = dict(islice(blocks.items(), self._written[name], None))
-                writer.digest_rows(self._first_trial, {name: new})
+                writer.digest_rows(self._first_trial, {name: blocks.after(self._written[name])})
                 self._written[name] = len(blocks)

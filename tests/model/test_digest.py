@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from xxhash import xxh3_128, xxh3_128_digest
 
-from evedrop.model.digest import BLOCK_SLOTS, BlockDigests, Blocks, InputLog, PartialDigests, RunDigest
+from evedrop.model.digest import BLOCK_SLOTS, BlockDigests, Blocks, DigestLog, InputLog, PartialDigests, RunDigest
 from evedrop.model.receiver import Belief, Beliefs
 from tests.builders import one_slot
 
@@ -209,3 +209,27 @@ def test_a_run_has_one_digest_of_all_its_blocks() -> None:
     whole.add(logged(beliefs, 3))
     expected = b"".join(digest for r in range(3) for digest in defined(beliefs, r))
     assert whole.hexadecimal == sha256(expected).hexdigest()
+
+
+def test_a_log_of_digests_is_a_mapping_of_them() -> None:
+    """Whatever the blocks' starts are, and however many blocks are added at a time."""
+    random = np.random.default_rng(1)
+    blocks = {start: random.integers(0, 256, (3, 16), np.uint8) for start in (0, 100, 256, 300, 512)}
+    log = DigestLog()
+    assert not log
+    assert 0 not in log
+    log.add({start: blocks[start] for start in (100, 0)})
+    assert list(log.after(0)) == [0, 100]
+    log.add({})
+    log.add({start: blocks[start] for start in (256, 300, 512)})
+    assert list(log) == list(blocks)
+    assert all(np.array_equal(log[start], values) for start, values in blocks.items())
+    later = log.after(2)
+    assert list(later) == [256, 300, 512]
+    assert np.array_equal(later[300], blocks[300])
+    for missing in (-1, 99, 101, 513):
+        assert missing not in log
+    whole, from_log = RunDigest(), RunDigest()
+    whole.add(blocks)
+    from_log.add(log)
+    assert whole.hexadecimal == from_log.hexadecimal

@@ -50,6 +50,8 @@ _LEASE_SECONDS = 4.0  # a connection on which nothing arrives for this long is l
 _HEARD_SECONDS = 2.0  # to find the readers again when a connection is back
 _SENT_BYTES = 1 << 20  # under way to one reader: a full buffer would keep Zenoh from noticing that the reader is lost
 _NEVER_MS = 86_400_000
+# Of what Zenoh sends at once. A message that waits to be read keeps the whole batch in memory that it came in.
+_BATCH_PACKETS, _LEAST_BATCH_BYTES, _LARGEST_BATCH_BYTES = 64, 1 << 14, (1 << 16) - 1
 _ANSWER_BYTES = 64 * 2**20  # for the operator
 _WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
 ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
@@ -57,11 +59,16 @@ ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
 _LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
 
 
-def _transport(identity: Identity | None, largest: int, listens: bool = False) -> ZenohConfig:
+def _transport(identity: Identity | None, largest: int, packet: int, listens: bool = False) -> ZenohConfig:
+    """The limits of a connection; largest, packet: bytes of the run's largest message and of a packet's numbers."""
     # A full queue waits a minute, not five seconds, before it drops a reader: the window bounds the messages under way.
     wait = {"block": {"wait_before_close": 60_000_000}}
     link: ZenohConfig = {
-        "tx": {"lease": int(_LEASE_SECONDS * 1000), "queue": {"congestion_control": wait}},
+        "tx": {
+            "lease": int(_LEASE_SECONDS * 1000),
+            "batch_size": max(_LEAST_BATCH_BYTES, min(_BATCH_PACKETS * packet, _LARGEST_BATCH_BYTES)),
+            "queue": {"congestion_control": wait},
+        },
         "rx": {"buffer_size": 1 << 20, "max_message_size": largest},
     }
     if identity is not None:
@@ -74,9 +81,15 @@ def _transport(identity: Identity | None, largest: int, listens: bool = False) -
     return {"link": link, "shared_memory": {"enabled": False}}
 
 
+def _packet_bytes(brief: AnyBrief) -> int:
+    return 8 * len(brief.model.A) * brief.trials
+
+
 def client_config(entry: Credentials) -> ZenohConfig:
     """Zenoh configuration of every process but the router: one connection, to the router, and no scouting for others."""
-    largest = entry.flow.largest_message if isinstance(entry, Brief) else _ANSWER_BYTES
+    largest, packet = _ANSWER_BYTES, 0
+    if isinstance(entry, Brief):
+        largest, packet = entry.flow.largest_message, _packet_bytes(entry)
     auth = {"usrpwd": {"user": entry.user, "password": entry.password}}
     return {
         "mode": "client",
@@ -87,7 +100,7 @@ def client_config(entry: Credentials) -> ZenohConfig:
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {**_transport(entry.identity, largest), "auth": auth},
+        "transport": {**_transport(entry.identity, largest, packet), "auth": auth},
     }
 
 
@@ -106,7 +119,7 @@ def _once(door: RouterAddress) -> RouterAddress:
 
 def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
     """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
-    transport = _transport(brief.identity, brief.flow.largest_message, listens=True)
+    transport = _transport(brief.identity, brief.flow.largest_message, _packet_bytes(brief), listens=True)
     return {
         "mode": "router",
         **({"id": brief.part.zid} if isinstance(brief.part, RouterPart) and brief.part.zid is not None else {}),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evedrop.live.protocol.closed_loop import read_decisions
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
-from evedrop.model.digest import Blocks, Digests
+from evedrop.model.digest import Blocks, DigestLog
 from evedrop.model.links.link import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.slot.account import Account
@@ -45,10 +45,10 @@ class Joiner:
         self._journal = _Column[Journal]()
         self._reports = {name: _Column[Report]() for name in windows}
         self._done = 0
-        self.digests: dict[str, dict[int, Digests]] = {name: {} for name in windows}
+        self.digests = {name: DigestLog() for name in windows}
         """Receiver or controller → first slot of a block → its digests, (R, 16)."""
         if period is not None:
-            self.digests[CONTROLLER] = {}
+            self.digests[CONTROLLER] = DigestLog()
 
     @property
     def done(self) -> int:
@@ -81,7 +81,7 @@ class Joiner:
         """Take the controller's telemetry; returns the seconds that each decision took."""
         message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
         self._decided += message.count
-        self.digests[CONTROLLER].update(message.digests)
+        self.digests[CONTROLLER].add(message.digests)
         return message.seconds
 
     def truth(self, telemetry: Reader) -> None:
@@ -95,7 +95,7 @@ class Joiner:
         message = read_report(telemetry, column.end, self._extent, self._blocks[name], self._windows[name])
         self._check(name, message)
         column.add(message, message.count)
-        self.digests[name].update(message.digests)
+        self.digests[name].add(message.digests)
 
     def journal(self, journal: Reader) -> Mapping[str, Account]:
         """Take the router's journal; returns the accounts in it."""
