@@ -191,7 +191,8 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
     if surprising is not None:
         console.print(
             f"most surprising: trial {surprising.trial}, {surprising.receiver}, mean error "
-            f"{surprising.mean_error:.3g} against {surprising.median:.3g} in the median trial"
+            f"{surprising.mean_error:.3g} against {surprising.expected_error:.3g} expected after the same losses "
+            f"(probability {surprising.probability:.1g})"
         )
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising.trial} --trials 1")

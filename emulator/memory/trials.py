@@ -101,7 +101,9 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
         for block, keeper in zip(blocks, keepers, strict=True):
             rows = slice(block.start - task.start, block.start - task.start + block.trials)
             if chunk.slots is None:
-                _add(block, rows, chunk, {name: one[some.start : some.stop] for name, one in expected.items()})
+                _add(
+                    block, task.mode, rows, chunk, {name: one[some.start : some.stop] for name, one in expected.items()}
+                )
             else:
                 _score(block, keeper, rows, chunk, chunk.slots)
         for name, one in chunk.receivers.items():
@@ -166,7 +168,7 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
 
 
 @np.errstate(over="ignore")
-def _add(block: TrialBlock, rows: slice, chunk: Chunk, expected: Mapping[str, Floats]) -> None:
+def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Mapping[str, Floats]) -> None:
     """Add a chunk of another mode, which has no estimates, to a block."""
     for name, one in chunk.receivers.items():
         error, trace, action = one.error[:, rows], one.trace[:, rows], one.action[:, rows]
@@ -177,6 +179,10 @@ def _add(block: TrialBlock, rows: slice, chunk: Chunk, expected: Mapping[str, Fl
         tally = block.totals.tallies[name]
         tally.watched.add(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
         tally.add(chunk.first, error, sums, expected[name])
+        if (
+            tally.conditional is not None and mode is not Mode.COVARIANCE_ONLY
+        ):  # there, the error is its own expectation
+            tally.conditional.add(action)
         account = _account(block, name, rows, chunk)
         tally.account(account.delivered, action, account.lost, account.unsent)
         tally.count(account)

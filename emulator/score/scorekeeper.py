@@ -70,6 +70,8 @@ class Scorekeeper:
             )
             tally = self.totals.tallies[name]
             tally.add(slots.first, *one)
+            if tally.conditional is not None:
+                tally.conditional.add(receiver.action)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
                 tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)
@@ -192,24 +194,22 @@ def _quantiles(tally: Tally) -> dict[str, float] | None:
 
 
 def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising | None:
-    """The trial whose mean error, for any receiver, is furthest from the median, in logarithms and median deviations.
+    """The trial whose mean error, for any receiver, is least probable, given what happened to its own packets.
 
-    None without such a trial: the run was cut short, has too few trials, or has errors of 0.
+    None without such a trial: the run was cut short, has too few trials, or no receiver with such expectations.
     """
     found: Surprising | None = None
-    furthest = 0.0
     for name, tally in tallies.items():
-        means = trial_means(tally)
-        if tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE or not np.all(means > 0.0):
+        own = tally.conditional
+        if own is None or not own.slots or tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE:
             continue
-        logarithms = np.log(means)
-        median = float(np.median(logarithms))
-        deviation = np.abs(logarithms - median)
-        spread = float(np.median(deviation))
-        worst = int(np.argmax(deviation))
-        if spread > 0.0 and deviation[worst] / spread > furthest:
-            furthest = float(deviation[worst] / spread)
-            found = Surprising(scenario.first_trial + worst, name, float(means[worst]), float(np.exp(median)))
+        means, expected = trial_means(tally), own.expected / tally.slots
+        probability = own.probability(means * tally.slots)
+        # Where probabilities are too small for a float, the error decides.
+        least = int(np.lexsort((-means, np.nan_to_num(probability, nan=1.0)))[0])
+        if expected[least] > 0.0 and (found is None or probability[least] < found.probability):
+            trial = scenario.first_trial + least
+            found = Surprising(trial, name, *(float(one[least]) for one in (means, expected, probability)))
     return found
 
 

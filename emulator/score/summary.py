@@ -139,12 +139,15 @@ class FilterSummary:
 
 @dataclass(frozen=True)
 class Surprising:
-    """The most surprising trial: the one whose mean error is furthest from the median trial's."""
+    """The most surprising trial: the one whose error is least probable, given what happened to its own packets."""
 
     trial: int
     receiver: str
     mean_error: float
-    median: float
+    expected_error: float
+    """The mean error that is expected of this trial, given what happened to its packets."""
+    probability: float
+    """That an error is as far from this expectation."""
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.score.conditional import ConditionalError
 from evedrop.score.watched import Watched, WatchedSlots
 
 WINDOWS = 8
@@ -97,6 +98,8 @@ class Tally(ReceiverTotals):
     """Further totals that its figures and expectations need."""
     done: int = 0
     """Slots that all trials have reached."""
+    conditional: ConditionalError | None = None
+    """The expected errors given what happened to the packets; None where that does not determine them."""
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
     bursts: NDArray[np.int64] = field(init=False)
@@ -201,4 +204,6 @@ def merged(parts: Sequence[Tally]) -> Tally:
         if part.delays.size:
             total.delays = part.delays + (total.delays if total.delays.size else 0)
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
+    conditional = [part.conditional for part in parts if part.conditional is not None]
+    total.conditional = ConditionalError.merged(conditional) if conditional else None
     return total

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection
 from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
+from evedrop.score.conditional import conditional_error_of
 from evedrop.score.filtering import FilterTally
 from evedrop.score.sums import Tally, merged
 from evedrop.score.watched import Watched, watches_of
@@ -28,7 +29,10 @@ class Totals:
     def nothing(cls, scenario: Scenario, trials: int) -> Totals:
         """Empty totals with tallies only: of trials without slots, or in a mode without states."""
         watches = watches_of(scenario)
-        return cls({name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()})
+        tallies = {name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()}
+        for name, tally in tallies.items():
+            tally.conditional = conditional_error_of(scenario, name, trials)
+        return cls(tallies)
 
     @classmethod
     def of(cls, scenario: Scenario, trials: int) -> Totals:

@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from scipy.stats import chi2
 
-from evedrop.api import montecarlo
+from evedrop import preloaded
+from evedrop.api import montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
 from evedrop.results.writer import Results, load_results
 from tests.conftest import Evedrop
 
@@ -84,23 +87,86 @@ def test_the_tables_are_the_means_of_the_trials(tmp_path: Path) -> None:
         assert row["used_fraction"] == pytest.approx(1 - (actions.count("dropped") + actions.count("discarded")) / 7)
 
 
-def test_the_most_surprising_trial_is_the_one_furthest_off(tmp_path: Path) -> None:
-    """Recomputed from every recorded trial: median deviations of the logarithm of a trial's mean error over k ≥ 1."""
+def least_probable(results: Results) -> tuple[tuple[int, str], float, float]:
+    """Trial, receiver, expected mean error and probability, from every recorded trial, by textbook formulas."""
+    table, found = results.trials.to_pydict(), {}
+    columns = (table[name] for name in ("peer", "trial", "action", "trace_covariance", "squared_error"))
+    trials: dict[tuple[int, str], list[tuple[str, float, float]]] = {}
+    for peer, trial, action, trace, error in zip(*columns, strict=True):
+        if peer in {"legitimate", "smart"}:
+            trials.setdefault((trial, peer), []).append((action, trace, error))
+    for at, rows in trials.items():
+        sums = [0.0]
+        for action, trace, _ in rows:
+            if action == "state":
+                sums.append(0.0)
+            sums[-1] += trace
+        mean, spread = sum(sums), sum(one * one for one in sums)
+        if mean > 0.0:
+            law = chi2(mean**2 / spread, scale=spread / mean)
+            error = sum(error for *_, error in rows)
+            found[at] = (2.0 * min(law.cdf(error), law.sf(error)), mean / len(rows))
+    least = min(found, key=lambda at: found[at])
+    return least, found[least][1], found[least][0]
+
+
+def test_the_most_surprising_trial_is_the_least_probable_one(tmp_path: Path) -> None:
+    """Recomputed from every recorded trial: its error against what its own losses let expect."""
     results = montecarlo("eavesdroppers", slots=30, trials=40, record_trials=40, first_trial=5, out=tmp_path / "run")
-    table, found = results.trials.to_pydict(), results.summary["surprising"]
-    scores = {}
-    for peer in results.summary["peers"]:
-        rows = zip(table["slot"], table["peer"], table["trial"], table["squared_error"], strict=True)
-        errors: dict[int, list[float]] = {}
-        for slot, name, trial, error in rows:
-            if name == peer and slot >= 1:
-                errors.setdefault(trial, []).append(error)
-        logarithms = {trial: np.log(np.mean(of_slots)) for trial, of_slots in errors.items()}
-        middle = np.median(list(logarithms.values()))
-        deviations = {trial: abs(value - middle) for trial, value in logarithms.items()}
-        spread = np.median(list(deviations.values()))
-        scores.update({(trial, peer): value / spread for trial, value in deviations.items()})
-    assert max(scores, key=lambda at: scores[at]) == (found["trial"], found["receiver"])
+    found, (at, expected, probability) = results.summary["surprising"], least_probable(results)
+    assert at == (found["trial"], found["receiver"])
+    assert found["expected_error"] == pytest.approx(expected, rel=1e-9)
+    assert found["probability"] == pytest.approx(probability, rel=1e-6)
+    errors = [row["squared_error"] for row in results.trials.to_pylist() if (row["trial"], row["peer"]) == at]
+    assert found["mean_error"] == pytest.approx(np.mean(errors), rel=1e-9)
+
+
+def test_the_largest_error_is_not_the_most_surprising_trial(tmp_path: Path) -> None:
+    """A trial that lost its first packets has an error that is far from the median, and as expected."""
+    results = montecarlo("vehicle", slots=200, trials=200, record_trials=200, out=tmp_path / "run")
+    found, rows = results.summary["surprising"], results.trials.to_pylist()
+    errors: dict[int, float] = dict.fromkeys(range(200), 0.0)
+    for row in rows:
+        if row["peer"] == found["receiver"]:
+            errors[row["trial"]] += row["squared_error"] / 200
+    logarithms = np.log(list(errors.values()))
+    assert found["trial"] != np.argmax(np.abs(logarithms - np.median(logarithms)))
+    assert found["trial"] == least_probable(results)[0][0]
+
+
+def test_the_most_surprising_trial_is_the_same_live_and_in_memory(tmp_path: Path) -> None:
+    """To the bit, for any division of the trials into shards."""
+    with preloaded():
+        for shards in (1, 2):
+            live = run("eavesdroppers", trials=12, slots=70, shards=shards, out=tmp_path / f"live {shards}")
+            memory = montecarlo(live.folder, trials=12, out=tmp_path / f"memory {shards}")
+            assert live.summary["surprising"] == memory.summary["surprising"]
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "there"),
+    [
+        ("eavesdroppers", Mode.EXACT, True),
+        ("eavesdroppers", Mode.ERROR_COORDINATES, True),
+        ("eavesdroppers", Mode.COVARIANCE_ONLY, False),  # its error is its own expectation
+        ("heated-room", Mode.EXACT, False),  # inputs and disturbances
+        ("acknowledged", Mode.EXACT, False),  # packets that are not states
+        ("late", Mode.EXACT, True),  # by the one receiver that uses no late packets
+    ],
+)
+def test_a_trial_surprises_only_where_its_own_expectation_is_known(
+    name: str, mode: Mode, there: bool, tmp_path: Path
+) -> None:
+    """The modes with errors agree; elsewhere the entry is null."""
+    plan = Plan(mode, workers=1)
+    found = montecarlo(name, slots=40, trials=15, expect=[], event=[], plan=plan, out=tmp_path / "run").summary
+    assert (found["surprising"] is not None) is there
+    if name == "late":
+        assert found["surprising"]["receiver"] == "hasty"
+    if mode is Mode.ERROR_COORDINATES:
+        exact = montecarlo(name, slots=40, trials=15, expect=[], out=tmp_path / "exact").summary["surprising"]
+        assert found["surprising"].pop("receiver") == exact.pop("receiver")
+        assert found["surprising"] == pytest.approx(exact, rel=1e-6)
 
 
 def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -> None:

@@ -1,0 +1,83 @@
+"""The expected error of each trial given what happened to its packets, and the probability of its actual error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Action, Codes
+from evedrop.score.conditional import ConditionalError
+from tests.builders import MARGINAL, UNSTABLE
+
+SLOTS, TRIALS = 40, 4000
+
+
+def actions(seed: int, trials: int = TRIALS) -> Codes:
+    """States, innovations, losses and discarded packets."""
+    found: Codes = np.random.default_rng(seed).choice(4, (SLOTS, trials), p=[0.3, 0.3, 0.2, 0.2]).astype(np.uint8)
+    return found
+
+
+def errors(process: Process, action: Codes, seed: int) -> Floats:
+    """The sum of squared errors of each trial, simulated error by error, (R,)."""
+    A, Q, start = process.A, process.Q, process.initial_covariance
+    rng, trials = np.random.default_rng(seed), action.shape[1]
+    e, total = np.zeros((len(A), trials)), np.zeros(trials)
+    for k, codes in enumerate(action):
+        noise = np.linalg.cholesky(Q if k else start) @ rng.standard_normal((len(A), trials))
+        e = A @ e + np.where((codes == Action.INNOVATION) & (k > 0), 0.0, noise)
+        e = np.where(codes == Action.STATE, 0.0, e)
+        total += (e * e).sum(axis=0)
+    return total
+
+
+@pytest.mark.parametrize("process", [MARGINAL, UNSTABLE], ids=["marginal", "unstable"])
+def test_probabilities_are_not_too_small(process: Process) -> None:
+    """Simulated errors are in the tails no more often than their probability says, and in wide ones nearly as often.
+
+    Exceeded by 4.5 standard errors of the count of trials with a probability of about 1 in 150 000.
+    """
+    action = actions(1)
+    own = ConditionalError(process, process.initial_covariance, TRIALS)
+    own.add(action)
+    probability = own.probability(errors(process, action, 2))
+    for level in (0.5, 0.1, 0.01, 0.001):
+        share = float((probability < level).mean())
+        assert share <= level + 4.5 * np.sqrt(level * (1.0 - level) / TRIALS), level
+        assert share > 0.3 * level or level < 0.1
+
+
+def test_the_expectation_is_the_mean_of_many_trials_with_the_same_events() -> None:
+    """4000 trials with the actions of one: their mean error is the expected one."""
+    action = np.repeat(actions(3, 1), TRIALS, axis=1)
+    own = ConditionalError(MARGINAL, MARGINAL.initial_covariance, TRIALS)
+    own.add(action)
+    found = errors(MARGINAL, action, 4)
+    assert found.mean() == pytest.approx(own.expected[0], abs=4.5 * found.std() / np.sqrt(TRIALS))
+    assert 0.5 < found.var() / (2.0 * (own._squares + own._open**2))[0] < 1.3  # a bound; beyond 1 by chance only
+
+
+@pytest.mark.parametrize("length", [1, 7, SLOTS])
+def test_blocks_of_slots_and_sets_of_trials_do_not_matter(length: int) -> None:
+    """To the bit: slots in parts, and trials in two sets that are merged."""
+    action = actions(5, 20)
+    whole = ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, 20)
+    whole.add(action)
+    parts = [ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, count) for count in (8, 12)]
+    for part, trials in zip(parts, (slice(0, 8), slice(8, 20)), strict=True):
+        for first in range(0, SLOTS, length):
+            part.add(action[first : first + length, trials])
+    merged = ConditionalError.merged(parts)
+    assert merged.slots == whole.slots == SLOTS
+    assert np.array_equal(merged.expected, whole.expected)
+    given = np.linspace(0.1, 10.0, 20)
+    assert np.array_equal(merged.probability(given), whole.probability(given))
+
+
+def test_without_an_expected_error_there_is_no_probability() -> None:
+    """A trial that heard every state."""
+    own = ConditionalError(MARGINAL, MARGINAL.initial_covariance, 1)
+    own.add(np.full((5, 1), Action.STATE, np.uint8))
+    assert own.expected == [0.0]
+    assert np.isnan(own.probability(np.zeros(1))).all()
