@@ -1,4 +1,4 @@
-"""The Python API: `run`, `montecarlo`, `compare`, `design`, `load_results`, each like the command of the same name."""
+"""The Python API: `run`, `montecarlo`, `compare`, `design`, `load_results`, and `design_policy`: each like its command."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:
+    from evedrop.expected.policies import PolicyDesign
     from evedrop.memory.montecarlo import Plan
     from evedrop.model.theory.design import Design
     from evedrop.results.comparison import Comparison
 
-__all__ = ["compare", "design", "load_results", "montecarlo", "run"]
+_TWENTIETHS = tuple(float(i) / 20 for i in range(21))
+
+__all__ = ["compare", "design", "design_policy", "load_results", "montecarlo", "run"]
 
 
 def run(
@@ -156,6 +159,27 @@ def design(
             adversaries.append(Adversary.with_outcomes(name, quality[name], outcomes_at(1.0)))
     process, mu, mu_d = made.process.process, quality[LEGITIMATE], made.encoding.mu_d
     return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
+
+
+def design_policy(
+    scenario: str | Path | Scenario,
+    *,
+    weights: Sequence[float] = _TWENTIETHS,
+    prices: Sequence[float] = (0.0,),
+    states: int = 10,
+    changes: Mapping[str, Any] | None = None,
+) -> PolicyDesign:
+    """When a sensor with acknowledgements should send: the Pareto front against each eavesdropper of a scenario.
+
+    weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
+    holding times are told apart; changes: entries by dotted key.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError if it is not one for policies, see
+    `evedrop.expected.policies.policies_of`.
+    """
+    from evedrop.expected.policies import policies_of  # noqa: PLC0415 - a run does not need it
+
+    return policies_of(_prepared(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
 
 
 def _not_for(scheme: str) -> str:

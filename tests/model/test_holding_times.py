@@ -6,8 +6,6 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -22,7 +20,6 @@ from evedrop.model.theory.covariances import limit
 from evedrop.streams import Batch, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, Played, coins, play
-from tests.model.transmission_design import best_policy
 
 MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 READERS = {"scheduled": "naive", "encrypted-schedule": "selective"}
@@ -170,47 +167,3 @@ def test_late_acknowledgements_count_for_their_slot() -> None:
         sent = encoder.encode(k, x, x).sent
         assert sent is not None
         assert bool(sent[0]) is due
-
-
-@settings(deadline=None, max_examples=15)
-@given(
-    mu=st.sampled_from([0.5, 0.8, 0.95]),
-    mu_e=st.sampled_from([0.3, 0.6, 0.9]),
-    weight=st.sampled_from([0.5, 0.6, 0.7, 0.8, 0.9]),
-    process=st.sampled_from([STABLE, DRIFTING, UNSTABLE]),
-)
-def test_the_best_policy_is_a_threshold(mu: float, mu_e: float, weight: float, process: Process) -> None:
-    """Known holding times: send from some holding time of the user on, the later the longer the eavesdropper's."""
-    policy = best_policy(process, mu, mu_e, weight, 12)
-    assert (np.diff(policy.send.astype(int), axis=0) >= 0).all()
-    thresholds = [policy.threshold(j) for j in range(12)]
-    assert thresholds == [int((~policy.send[:, j]).sum()) for j in range(12)]
-    assert thresholds == sorted(thresholds)
-
-
-def test_the_best_policy_is_no_worse_than_others() -> None:
-    """Its cost to go is that of following it, and no policy of a random search does better from any state."""
-    states, mu, mu_e, weight, discount = 6, 0.8, 0.6, 0.7, 0.9
-    policy = best_policy(STABLE, mu, mu_e, weight, states, discount)
-    W, traces = np.zeros((2, 2)), [0.0]
-    for _ in range(states - 1):
-        W = STABLE.A @ W @ STABLE.A.T + STABLE.Q
-        traces.append(float(np.trace(W)))
-
-    def cost_of(send: np.ndarray) -> np.ndarray:
-        T, stage = np.zeros((states, states, states, states)), np.zeros((states, states))
-        for i, j in itertools.product(range(states), repeat=2):
-            later_i, later_j = min(i + 1, states - 1), min(j + 1, states - 1)
-            for heard, heard_e in itertools.product((True, False), repeat=2):
-                chance = (mu if heard else 1 - mu) * (mu_e if heard_e else 1 - mu_e)
-                to = (0 if heard and send[i, j] else later_i, 0 if heard_e and send[i, j] else later_j)
-                T[i, j][to] += chance
-                stage[i, j] += chance * (weight * traces[to[0]] - (1 - weight) * traces[to[1]])
-        flat = np.linalg.solve(np.eye(states**2) - discount * T.reshape(states**2, -1), stage.reshape(-1))
-        found: np.ndarray = flat.reshape(states, states)
-        return found
-
-    assert np.allclose(cost_of(policy.send), policy.value, atol=1e-7)
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        assert (cost_of(rng.random((states, states)) < rng.random()) >= policy.value - 1e-7).all()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.process import Floats, Process
+from evedrop.model.theory.covariances import radius
 
 
 def twin_track_bound(process: Process, slots: int) -> Floats:
@@ -96,9 +97,10 @@ class SensorChain:
     def limit(self, process: Process) -> Floats:
         """Limit of E P_k, (n, n); all inf if it is unbounded."""
         states, n = len(self.start), process.n
-        operator = np.kron(self.carried.T, np.kron(process.A, process.A))
-        if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
+        # The spectral radius of a Kronecker product is the product of its factors'.
+        if np.max(np.abs(np.linalg.eigvals(self.carried))) * radius(process) ** 2 >= 1.0 - 1e-12:
             return np.full((n, n), np.inf)
+        operator = np.kron(self.carried.T, np.kron(process.A, process.A))
         noise = self.carried.T @ self.law
         solution = np.linalg.solve(np.eye(len(operator)) - operator, np.kron(noise, process.Q.reshape(-1)))
         total: Floats = solution.reshape(states, n, n).sum(axis=0)

@@ -1,0 +1,129 @@
+"""The best policies of sending for a scenario, against each of its eavesdroppers.
+
+Source: docs/mathematics.md, the best policy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from evedrop.errors import UsageError
+from evedrop.expected.closed_forms import closed_of
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
+from evedrop.model.theory.policy import least_weight
+from evedrop.model.theory.policy_front import Front, ScheduledLinks, front
+from evedrop.names import LEGITIMATE
+from evedrop.scenario import Scenario
+from evedrop.scenario.words import listed
+
+_CLOSED_FORM = "scheduled"
+_LARGEST_CHAIN = 4 * LARGEST_OPERATOR  # rows of the linear equation of a policy's chain, which then takes a second
+
+
+@dataclass(frozen=True)
+class PolicyDesign:
+    """The best policies against each eavesdropper of a scenario."""
+
+    mu: float
+    states: int
+    """Holding times are told apart up to this one."""
+    fronts: dict[str, Front]
+    left_out: dict[str, str]
+    """Eavesdropper → strategy, for those whose error has no closed form under this scheme."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The JSON of `evedrop design --policy`; `left_out` is present only if it has values."""
+        found: dict[str, object] = {
+            "mu": self.mu,
+            "states": self.states,
+            "eavesdroppers": {name: one.as_dict() for name, one in self.fronts.items()},
+        }
+        return {**found, "left_out": self.left_out} if self.left_out else found
+
+
+def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> PolicyDesign:
+    """The front of each eavesdropper of a scenario.
+
+    weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
+    holding times are told apart.
+
+    Raises UsageError if the scheme does not go by acknowledgements when to send, if the losses of a link are not independent
+    and alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy
+    never sends, and for numbers out of range.
+    """
+    _check_numbers(scenario, weights, prices, states)
+    forms = SCHEMES[scenario.encoding.scheme].closed_forms
+    if forms.get(LEGITIMATE) != _CLOSED_FORM:
+        raise UsageError(_not_for(scenario.encoding.scheme))
+    left_out = {
+        name: table.strategy
+        for name, table in scenario.eavesdroppers.items()
+        if forms.get(table.strategy) != _CLOSED_FORM
+    }
+    closed = {name: closed_of(scenario, name) for name in scenario.receivers if name not in left_out}
+    if len(closed) == 1:
+        raise UsageError(
+            "the design of a policy needs an eavesdropper whose error has a closed form under this scheme; expected a "
+            f"strategy of {listed(sorted(set(forms) - {LEGITIMATE}))}"
+        )
+    unknown = [name for name, one in closed.items() if one is None]
+    unknown = [LEGITIMATE] if LEGITIMATE in unknown else unknown  # without the user's, no other closed form is known
+    if unknown:
+        raise UsageError(
+            "the design of a policy is for independent losses that stay the same, without late packets and outages, and for "
+            "an attack on acknowledgements that is always on; the link of "
+            f"{', '.join(unknown)} is different; give each link only a quality, such as "
+            "--set 'legitimate.link={quality = 0.9}', and remove events"
+        )
+    user = closed[LEGITIMATE]
+    assert user is not None  # noqa: S101 - refused above
+    process, mu = scenario.process.process, user.received
+    if mu == 0.0 or (process.spectral_radius >= 1.0 and stability_bound(process, mu) >= 1.0):
+        bound = max(0.0, 1.0 - process.spectral_radius**-2)
+        raise UsageError(
+            f"no policy keeps the user's error bounded: the legitimate link's quality μ = {mu:g} must exceed "
+            f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as --set legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
+        )
+    fronts = {}
+    for name, one in closed.items():
+        if name == LEGITIMATE or one is None:
+            continue
+        links = ScheduledLinks(mu, one.received, user.acknowledged, one.acknowledged)
+        fronts[name] = front(process, links, weights, prices, states)
+        if not fronts[name].points:
+            raise UsageError(_never(scenario, name, links, max(weights), min(prices), states))
+    return PolicyDesign(mu, states, fronts, left_out)
+
+
+def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> None:
+    for weight in weights:
+        if not 0.0 <= weight <= 1.0:
+            raise UsageError(f"--weight {weight:g}: expected a number from 0 to 1, the weight of the user's error")
+    for price in prices:
+        if not 0.0 <= price < math.inf:
+            raise UsageError(f"--price {price:g}: expected a finite number of at least 0, the cost of a transmission")
+    most = math.isqrt(_LARGEST_CHAIN // scenario.process.process.n**2)
+    if not 2 <= states <= max(2, most):
+        raise UsageError(
+            f"--states {states}: expected a whole number from 2 to {max(2, most)}, how many holding times are told apart"
+        )
+
+
+def _not_for(scheme: str) -> str:
+    able = [name for name in SCHEMES if SCHEMES[name].closed_forms.get(LEGITIMATE) == _CLOSED_FORM]
+    return (
+        f"a policy decides, by acknowledgements, when to send: its design is for the scheme {listed(able)}, and this scenario "
+        f"has {scheme}; evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, "
+        "which can be designed"
+    )
+
+
+def _never(scenario: Scenario, name: str, links: ScheduledLinks, weight: float, price: float, states: int) -> str:
+    least = least_weight(scenario.process.process, links.mu, links.mu_e, price, states)
+    never = f"the best policy against {name} never sends at --weight {weight:g} --price {price:g}"
+    if least is None:
+        return f"{never}, nor at any other weight: give a lower price"
+    return f"{never}: it sends from --weight {least:.4f} on; give a larger weight to the user's error, up to 1"
