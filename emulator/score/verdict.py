@@ -6,7 +6,7 @@ Source: docs/mathematics.md, secrecy and design; docs/results.md, verdict.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,7 +17,8 @@ from evedrop.model.process import Floats
 from evedrop.score.summary import SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 
-BOUND_CONFIDENCE = 0.99
+ERROR_RATE = 0.01
+"""Of a verdict: how often `held`, or `failed`, may be said in error."""
 _ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
 
 
@@ -92,47 +93,68 @@ class Secrecy:
         return f"{self.eavesdropper}: {times} × the legitimate error; {run}; {promise}"
 
 
-Bounds = Callable[[Floats], tuple[float, float]]
-"""Lower and upper bound of a quantity, from its samples (R,)."""
+@dataclass(frozen=True)
+class SignTest:
+    """The p-values of two one-sided tests on the mean, or the median, of a quantity."""
+
+    above: float
+    """Of the hypothesis that it is 0 or less: small where it is above 0."""
+    below: float
+    """Of the hypothesis that it is 0 or more: small where it is below 0."""
 
 
-def mean_bounds(samples: Floats) -> tuple[float, float]:
-    """One-sided 99 % bounds below and above the mean of samples (R,), by Student's t."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - 0.2 s that only a verdict needs
+SignTestOf = Callable[[Floats], SignTest]
+"""Tests a quantity, from its samples (R,)."""
+_NOTHING = SignTest(1.0, 1.0)
+
+
+def sign_of_mean(samples: Floats) -> SignTest:
+    """Tests on the mean of samples (R,), by Student's t."""
+    from scipy.special import stdtr  # noqa: PLC0415 - 0.2 s that only a verdict needs
+
+    count, mean = len(samples), float(np.mean(samples))
+    if count < 2 or mean == 0.0:
+        return _NOTHING
+    error = float(np.std(samples, ddof=1)) / math.sqrt(count)
+    t = mean / error if error else math.copysign(math.inf, mean)
+    return SignTest(float(stdtr(count - 1, -t)), float(stdtr(count - 1, t)))
+
+
+def sign_of_median(samples: Floats) -> SignTest:
+    """Tests on the median of samples (R,), by the number of them on either side of 0, for any tails."""
+    from scipy.special import bdtr  # noqa: PLC0415 - as above
 
     count = len(samples)
-    if count < 2:
-        return -math.inf, math.inf
-    mean = float(np.mean(samples))
-    reach = float(stdtrit(count - 1, BOUND_CONFIDENCE)) * float(np.std(samples, ddof=1)) / math.sqrt(count)
-    return mean - reach, mean + reach
+    low, high = int(np.count_nonzero(samples <= 0.0)), int(np.count_nonzero(samples >= 0.0))
+    return SignTest(float(bdtr(low, count, 0.5)), float(bdtr(high, count, 0.5)))
 
 
-def median_bounds(samples: Floats) -> tuple[float, float]:
-    """One-sided 99 % bounds below and above the median of samples (R,), by order statistics, for any tails."""
-    from scipy.special import bdtr, bdtrik  # noqa: PLC0415 - as above
+def rejected(p_values: Mapping[int, float]) -> list[int]:
+    """The hypotheses, by number, that Holm's method rejects: at most one time in a hundred is any of them true.
 
-    count = len(samples)
-    ordered = np.sort(samples)
-    # The largest rank that is too high with a probability of 1 %, by the binomial law of the number of samples below the median.
-    rank = int(bdtrik(1.0 - BOUND_CONFIDENCE, count, 0.5)) if bdtr(0, count, 0.5) <= 1.0 - BOUND_CONFIDENCE else -1
-    if rank < 0:
-        return -math.inf, math.inf
-    return float(ordered[rank]), float(ordered[count - 1 - rank])
+    Source: docs/mathematics.md, verdicts.
+    """
+    found = []
+    for place, one in enumerate(sorted(p_values, key=lambda at: p_values[at])):
+        if p_values[one] > ERROR_RATE / (len(p_values) - place):
+            break
+        found.append(one)
+    return sorted(found)
 
 
-def _relative(difference: Floats, bounds_of: Bounds, slots: int) -> tuple[Verdict, str]:
+def _relative(difference: Floats, test: SignTestOf, slots: int) -> tuple[Verdict, str]:
     """The verdict on relative secrecy, and the slots in which it failed or is undecided, empty if in all.
 
-    difference: the eavesdropper's mean error less the legitimate one, by window and trial, (WINDOWS, R).
+    difference: the eavesdropper's mean error less the legitimate one, by window and trial, (WINDOWS, R). One window fails the
+    claim, so the windows share the error rate. All windows must support it, so that each may have the whole rate.
     """
-    bounds = {w: bounds_of(row) for w, row in enumerate(difference) if not np.isnan(row).any()}
-    failed = [window for window, (_, high) in bounds.items() if high < 0.0]
-    doubtful = [window for window, (low, _) in bounds.items() if not low > 0.0]
+    tests = {w: test(row) for w, row in enumerate(difference) if not np.isnan(row).any()}
+    failed = rejected({window: one.below for window, one in tests.items()})
+    doubtful = [window for window, one in tests.items() if one.above > ERROR_RATE]
     if failed:
         return Verdict.FAILED, _slots_of(failed, slots)
-    if doubtful or not bounds:
-        return Verdict.UNDECIDED, _slots_of(doubtful, slots) if len(doubtful) < len(bounds) else ""
+    if doubtful or not tests:
+        return Verdict.UNDECIDED, _slots_of(doubtful, slots) if len(doubtful) < len(tests) else ""
     return Verdict.HELD, ""
 
 
@@ -143,16 +165,17 @@ def _slots_of(windows: list[int], slots: int) -> str:
     return ", ".join(f"{span[0]} to {span[-1]}" for span in spans)
 
 
-def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, bounds_of: Bounds) -> Verdict:
+def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
     """Held if the eavesdropper's error grows from the first to the last quarter and the legitimate error stays within `bound`."""
     quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
         return Verdict.UNDECIDED
-    growth = bounds_of(eavesdropper[-quarter:].mean(axis=0) - eavesdropper[:quarter].mean(axis=0))
-    error = bounds_of(legitimate[-quarter:].mean(axis=0))
-    if growth[1] < 0.0 or error[0] > bound + _ROUNDING * float(np.mean(eavesdropper)):
+    growth = test(eavesdropper[-quarter:].mean(axis=0) - eavesdropper[:quarter].mean(axis=0))
+    highest = bound + _ROUNDING * float(np.mean(eavesdropper))
+    excess = test(legitimate[-quarter:].mean(axis=0) - highest) if math.isfinite(highest) else _NOTHING
+    if rejected({0: growth.below, 1: excess.above}):
         return Verdict.FAILED
-    return Verdict.HELD if growth[0] > 0.0 else Verdict.UNDECIDED
+    return Verdict.HELD if growth.above <= ERROR_RATE else Verdict.UNDECIDED
 
 
 def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
@@ -172,14 +195,14 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     always = math.isfinite(user_bound) and slots > 1 and bool(np.all(gap[1:] > 0.0))
     user_means, other_means = window_means(user), window_means(other)
     heavy = user_theory.infinite_variance or other_theory.infinite_variance
-    bounds_of = median_bounds if heavy else mean_bounds
+    test = sign_of_median if heavy else sign_of_mean
     relative, windows = Verdict.UNDECIDED, ""
     if complete:
-        relative, windows = _relative(other_means - user_means, bounds_of, slots)
+        relative, windows = _relative(other_means - user_means, test, slots)
     if perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
-        perfect = _perfect(other_means, user_means, user_bound, bounds_of) if complete else Verdict.UNDECIDED
+        perfect = _perfect(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
     ratio = other.error / user.error if user.error else math.inf if user.done else math.nan
     return Secrecy(
         name,

@@ -1,4 +1,4 @@
-"""Infinite variance: flagged where theory says so, judged by medians there, with bounds that cover what they say."""
+"""Infinite variance: flagged where theory says so, judged by medians there, with tests that are wrong no more than they say."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evedrop.api import montecarlo
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.model.process import Floats
-from evedrop.score.verdict import Bounds, mean_bounds, median_bounds
+from evedrop.score.verdict import ERROR_RATE, SignTest, SignTestOf, sign_of_mean, sign_of_median
 from tests.conftest import Evedrop
 
 TRIES = 4000
@@ -59,45 +59,54 @@ def test_the_report_says_so(evedrop: Evedrop) -> None:
     assert "infinite" not in done.out
 
 
-def misses(bounds: Bounds, samples: Floats, truth: float) -> tuple[float, float]:
-    """How often the lower and the upper bound are on the wrong side, over the rows of samples."""
-    found = np.array([bounds(row) for row in samples])
-    return float((found[:, 0] > truth).mean()), float((found[:, 1] < truth).mean())
+def misses(test: SignTestOf, samples: Floats, truth: float) -> tuple[float, float]:
+    """How often the samples, by row, are found to be above their true value, and below it."""
+    found = [test(row - truth) for row in samples]
+    return float(np.mean([one.above <= ERROR_RATE for one in found])), float(
+        np.mean([one.below <= ERROR_RATE for one in found])
+    )
 
 
 HIGHEST = 0.01 + 4.5 * math.sqrt(0.01 * 0.99 / TRIES)
-"""Of TRIES bounds at 99 %, the share that may miss, at 4.5 standard errors."""
+"""Of TRIES tests at 1 %, the share that may be wrong, at 4.5 standard errors."""
 
 
 @pytest.mark.parametrize("count", [2, 10, 60, 500])
-def test_mean_bounds_cover(count: int) -> None:
-    """Either bound misses the mean of a normal in one of a hundred, at any number of trials."""
+def test_signs_of_means_are_right(count: int) -> None:
+    """Either test of a normal is wrong in one of a hundred, at any number of trials."""
     samples = np.random.default_rng(8).normal(3.0, 2.0, (TRIES, count))
-    for miss in misses(mean_bounds, samples, 3.0):
+    for miss in misses(sign_of_mean, samples, 3.0):
         assert abs(miss - 0.01) <= HIGHEST - 0.01
 
 
 @pytest.mark.parametrize("count", [7, 8, 60, 500])
-def test_median_bounds_cover_whatever_the_tails(count: int) -> None:
-    """Of a Cauchy distribution, which has not even a mean: at most one in a hundred misses, and not far fewer."""
+def test_signs_of_medians_are_right_whatever_the_tails(count: int) -> None:
+    """Of a Cauchy distribution, which has not even a mean: at most one in a hundred is wrong, and not far fewer."""
     samples = 1.0 + np.random.default_rng(9).standard_cauchy((TRIES, count))
-    for miss in misses(median_bounds, samples, 1.0):
+    for miss in misses(sign_of_median, samples, 1.0):
         assert miss <= HIGHEST
-        assert miss >= 0.002  # order statistics come in steps; a bound that never misses says nothing
+        assert miss >= 0.002  # counts come in steps; a test that is never wrong says nothing
 
 
 @pytest.mark.parametrize("count", [1, 2, 6])
-def test_too_few_trials_bound_nothing(count: int) -> None:
-    """With six trials the smallest is above the median once in 64: no bound at 99 %."""
-    assert median_bounds(np.arange(float(count))) == (-math.inf, math.inf)
+def test_too_few_trials_tell_nothing(count: int) -> None:
+    """Of six trials all are above the median once in 64: nothing is known at 1 %."""
+    assert sign_of_median(1.0 + np.arange(float(count))).above > ERROR_RATE
     if count == 1:
-        assert mean_bounds(np.zeros(1)) == (-math.inf, math.inf)
+        assert sign_of_mean(np.ones(1)) == SignTest(1.0, 1.0)
+
+
+def test_samples_without_spread_are_certain() -> None:
+    """All above 0, all below, or all 0."""
+    assert sign_of_mean(np.full(3, 2.0)) == SignTest(0.0, 1.0)
+    assert sign_of_mean(np.full(3, -2.0)) == SignTest(1.0, 0.0)
+    assert sign_of_mean(np.zeros(3)) == sign_of_median(np.zeros(3)) == SignTest(1.0, 1.0)
 
 
 def test_a_mean_would_mislead_where_medians_do_not() -> None:
-    """Errors with tail index 1: the mean's bound misses the truth far too often, the median's does not."""
+    """Errors with tail index 1: the mean's test is wrong far too often, the median's does not."""
     random = np.random.default_rng(10)
     samples = random.pareto(1.1, (TRIES, 200))
     mean, median = 1.0 / 0.1, 2.0 ** (1 / 1.1) - 1.0
-    assert misses(mean_bounds, samples, mean)[1] > 0.3
-    assert max(misses(median_bounds, samples, median)) <= HIGHEST
+    assert misses(sign_of_mean, samples, mean)[1] > 0.3
+    assert max(misses(sign_of_median, samples, median)) <= HIGHEST

@@ -13,7 +13,7 @@ from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
-from evedrop.score.verdict import Secrecy, Verdict, secrecy
+from evedrop.score.verdict import Secrecy, Verdict, rejected, secrecy
 
 STABLE = Process(np.diag([1.0, 0.9]), np.eye(2) * 1e-3, np.eye(2))
 SLOTS, TRIALS = 81, 60
@@ -74,6 +74,28 @@ def test_relative_secrecy_failed_where_one_window_is_below() -> None:
     verdict = judged(tally(around(0.001)), tally(around(levels)))
     assert verdict.relative is Verdict.FAILED
     assert "failed" in verdict.sentence
+
+
+def test_a_window_that_is_only_slightly_unlikely_does_not_fail_the_claim() -> None:
+    """Windows share the error rate: below 0 at 1 % in one window of eight is no failure, and at 1 % / 8 it is."""
+    p_values = dict.fromkeys(range(WINDOWS), 0.5)
+    assert rejected({**p_values, 3: 0.005}) == []
+    assert rejected({**p_values, 3: 0.00124}) == [3]
+
+
+@pytest.mark.parametrize(
+    ("p_values", "found"),
+    [
+        ([0.002, 0.003, 0.009], [0, 1, 2]),
+        ([0.009, 0.003, 0.006], [1]),  # 0.006 is above 1 % / 2, and what follows it is not looked at
+        ([0.0034, 0.5, 0.5], []),
+        ([0.011], []),
+        ([], []),
+    ],
+)
+def test_holm_rejects_step_by_step(p_values: list[float], found: list[int]) -> None:
+    """The smallest against 1 % / 3, the next against 1 % / 2, the last against 1 %."""
+    assert rejected(dict(enumerate(p_values))) == found
 
 
 def test_an_unclear_window_leaves_the_verdict_open() -> None:
