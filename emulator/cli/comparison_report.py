@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from evedrop.cli.report import terminal
+from evedrop.cli.report import estimate, terminal
 from evedrop.score.verdict import MARKS, SecrecyKept
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def _schemes(found: Comparison) -> Table:
 def _pairs(found: Comparison) -> Table:
     table = _table("scheme", ())
     table.add_column("adversary", no_wrap=True)
-    for head in ("its error", "theory", "legitimate", "theory", "ratio"):
+    for head in ("its error", "theory", "z", "legitimate", "theory", "ratio"):
         table.add_column(head, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     for name, one in found.schemes.items():
@@ -73,9 +73,10 @@ def _pairs(found: Comparison) -> Table:
                 adversary if cell.match.attack == "none" else f"{adversary} ({cell.match.strategy})",
                 simulated(cell.eavesdropper),
                 theory(cell.eavesdropper),
+                "–" if cell.eavesdropper.z is None else f"{cell.eavesdropper.z:+.1f}",
                 simulated(cell.legitimate),
                 theory(cell.legitimate),
-                f"{cell.ratio:.3g}",
+                estimate(cell.ratio, cell.ratio_error, ".3g"),
                 verdict(cell),
             )
             shown = ""
@@ -83,7 +84,7 @@ def _pairs(found: Comparison) -> Table:
 
 
 def _table(first: str, numbers: tuple[str, ...]) -> Table:
-    table = Table(box=SIMPLE_HEAD)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     table.add_column(first, no_wrap=True)
     for head in numbers:
         table.add_column(head, justify="right", no_wrap=True)
@@ -94,7 +95,7 @@ def simulated(of: SimulatedError) -> str:
     """The mean over trials with its standard error, or the median if the variance is infinite."""
     if of.infinite_variance:
         return f"{of.typical:.3g} med"
-    return f"{of.mean:.3g}" if of.standard_error is None else f"{of.mean:.3g} ± {of.standard_error:.1g}"
+    return estimate(of.mean, of.standard_error, ".3g")
 
 
 def theory(of: SimulatedError) -> str:

@@ -24,18 +24,22 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from evedrop.figures import columns, shown_figure, unloadable_figures
+from evedrop.figures import all_figures, columns, error_column, shown_figure, unloadable_figures, z_column
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
-from evedrop.score.summary import ControllerSummary, LinkSummary, Summary
+from evedrop.score.summary import RARE_SHARE, ControllerSummary, LinkSummary, Summary
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from evedrop.model.theory.design import Design
 
-_DIGEST_WIDTH = 100  # the least width of a terminal, in columns, to show digests
+_DIGEST_WIDTH = (
+    100  # the least width of a terminal, in columns, to show digests, and the standard error of every figure
+)
+_LARGE_COUNT = 1e7
+_SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE = 0.01, 1e5, -4  # beyond them estimates have exponents
 
 
 class _Unfailing:
@@ -147,18 +151,32 @@ def closing_table(summary: Summary, width: int) -> Table:
     title = f"{summary.scenario} · {summary.slots:,} slots · {trials} · {rate}"
     if summary.failed_expectations:
         title += f" · {summary.failed_expectations} of {len(summary.expectations)} expectations FAILED"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    wide = width >= _DIGEST_WIDTH
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=wide, collapse_padding=not wide)
     table.add_column("receiver", no_wrap=True)
     shown = columns("column", summary.mode)
+    compared = {figure: z for peer in summary.peers.values() for figure, z in peer.z.items() if z is not None}
     for column in shown:
-        table.add_column(column.heading, justify="right", no_wrap=True)
-    wide = width >= _DIGEST_WIDTH
+        heading = column.heading if wide else column.heading.replace(" ", "\n", 1)
+        table.add_column(heading, justify="right", no_wrap=True)
+    if compared:
+        table.add_column("z", justify="right", no_wrap=True)
     if wide:
         table.add_column("digest", no_wrap=True)
     for name, peer in summary.peers.items():
         table.add_row(
             name,
-            *(_figure(shown_figure(peer.all_figures, names), column.format) for column, names in shown.items()),
+            *(
+                estimate(
+                    shown_figure(peer.all_figures, names),
+                    shown_figure(peer.standard_errors, names)
+                    if wide or not compared.keys().isdisjoint(names)
+                    else None,
+                    column.format,
+                )
+                for column, names in shown.items()
+            ),
+            *([_figure(shown_figure(peer.z, list(compared)), "+.1f")] if compared else []),
             *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
@@ -185,7 +203,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
                 f"{name}: its error has infinite variance, so the mean over trials says nothing; "
                 f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
             )
-    for line in (*_application_lines(summary), *_expectation_lines(summary)):
+    for line in (*_rare_lines(summary), *_application_lines(summary), *_expectation_lines(summary)):
         console.print(line)
     surprising = summary.surprising
     if surprising is not None:
@@ -208,6 +226,23 @@ def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:
                 f"the link of {name} let {link.rate:.5g} of its packets through; its model predicts "
                 f"{link.expected_rate:.5g}, and for this run an interval of {low:.5g} to {high:.5g}"
             )
+
+
+def _rare_lines(summary: Summary) -> Iterator[str]:
+    """A line for each receiver whose expected error is carried by events that so few trials need not meet."""
+    for name, peer in summary.peers.items():
+        rare = peer.rare_events
+        if rare is not None and rare.share > RARE_SHARE and summary.trials > 1:
+            enough = f"{_count(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
+            yield (
+                f"{name}: {100 * rare.share:.2g} % of its expected error is carried by events of which {summary.trials:,} trials "
+                f"contain fewer than one on average, so its mean and standard error are probably too small; {enough} would "
+                f"leave {100 * RARE_SHARE:.2g} %"
+            )
+
+
+def _count(number: float) -> str:
+    return f"{number:,.0f}" if number < _LARGE_COUNT else f"{number:.1e}"
 
 
 def _application_lines(summary: Summary) -> Iterator[str]:
@@ -241,13 +276,18 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     """Print the table of a sweep: one row for each point and peer."""
     shown = Table(box=SIMPLE_HEAD)
     figures = columns("sweep_column")
-    for heading in (*keys, "peer", *(column.heading for column in figures), "relative secrecy"):
+    compared = [z_column(name) for name in all_figures() if z_column(name) in table.schema.names]
+    for heading in (*keys, "peer", *(column.heading for column in figures), "z", "relative secrecy"):
         shown.add_column(heading, justify="left" if heading in {"peer", "relative secrecy"} else "right", no_wrap=True)
     for row in table.to_pylist():
         shown.add_row(
             *(f"{row[key]}" for key in keys),
             row["peer"],
-            *(_figure(shown_figure(row, names), column.format) for column, names in figures.items()),
+            *(
+                estimate(shown_figure(row, names), shown_figure(row, list(map(error_column, names))), column.format)
+                for column, names in figures.items()
+            ),
+            _figure(shown_figure(row, compared), "+.1f"),
             row["relative_secrecy"] or "–",
         )
     console = terminal()
@@ -312,6 +352,24 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
 def _figure(value: float | None, how: str = ".4g") -> str:
     """A figure of the summary as text; a dash for None."""
     return "–" if value is None else format(value, how)
+
+
+def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
+    """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error."""
+    if value is None or not error or not math.isfinite(value):
+        return _figure(value, how)
+    place = math.floor(math.log10(float(f"{error:.0e}")))
+    if abs(value) < _LARGE_NUMBER and (place >= _LEAST_PLACE or abs(value) >= _SMALL_NUMBER):
+        places = max(0, -place)
+        return f"{value:.{places}f} ± {error:.{places}f}"
+    digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
+    return f"{_scientific(value, digits)} ± {_scientific(error, 0)}"
+
+
+def _scientific(value: float, digits: int) -> str:
+    """A number with this many decimal digits and a short exponent: 2.3e-4."""
+    mantissa, exponent = f"{value:.{digits}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
 
 
 def _number(value: float) -> str:

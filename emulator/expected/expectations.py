@@ -17,6 +17,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt
+from evedrop.model.theory.rare_events import Streaks, streaks
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
@@ -109,6 +110,11 @@ class Expectation:
         if self._outcomes is not None:
             return theory.limit_trace(self.process, self._outcomes)
         return math.nan if self._known is None else modulated.limit_of(self.process, *self._known)
+
+    def streaks(self, slots: int) -> Streaks | None:
+        """What streaks carry of its error in slots 0 … slots−1; None unless a closed form knows them (docs/mathematics.md)."""
+        outcomes = None if self.closed is not None else self._outcomes
+        return None if outcomes is None else streaks(self.process, outcomes, slots)
 
     @property
     def infinite_variance(self) -> bool:

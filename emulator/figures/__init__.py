@@ -33,7 +33,7 @@ FIGURES: Registry[Figure] = Registry(
 )
 """Name in the summary → figure."""
 
-_TAKEN = ("error_quantiles", "infinite_variance", "digest")
+_TAKEN = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "digest")
 """The other entries of a receiver in the summary, which no figure can be named after."""
 
 
@@ -67,6 +67,11 @@ def figures_of(receiver: str) -> dict[str, type[Figure]]:
     return {name: one for name, one in all_figures().items() if one.of == "receiver" or receiver != LEGITIMATE}
 
 
+def estimated_figures() -> dict[str, type[Figure]]:
+    """Name → figure, for all that a run estimates: all but those of theory."""
+    return {name: one for name, one in all_figures().items() if one.rests_on != "theory"}
+
+
 def expectable_figures() -> dict[str, type[Figure]]:
     """Name → figure, for all that an expectation can name."""
     return {name: one for name, one in all_figures().items() if one.only_in_mode is None}
@@ -89,6 +94,16 @@ def columns(where: Literal["column", "sweep_column"], mode: str | None = None) -
 def shown_figure(row: Mapping[str, Any], names: Sequence[str]) -> float | None:
     """The value that a column or a curve shows: the first of these figures that a row has; None if it has none of them."""
     return next((float(row[name]) for name in names if row.get(name) is not None), None)
+
+
+def error_column(figure: str) -> str:
+    """The column of a sweep's table that has the standard error of a figure."""
+    return f"{figure}_standard_error"
+
+
+def z_column(figure: str) -> str:
+    """The column of a sweep's table that has the z of a figure."""
+    return f"{figure}_z"
 
 
 def _names() -> list[str]:

@@ -7,7 +7,15 @@ from typing import final
 
 import numpy as np
 
-from evedrop.figures.figure import FigureColumn, FigureTally, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure
+from evedrop.figures.figure import (
+    FigureColumn,
+    FigureTally,
+    MeanFigure,
+    ReceiverTotals,
+    ScoredSlots,
+    TotalsFigure,
+    TrialTotals,
+)
 from evedrop.model.process import Floats
 
 
@@ -17,6 +25,7 @@ class MeanTraceCovariance(MeanFigure, TotalsFigure):
 
     meaning = "of tr P, the error covariance that the receiver believes"
     by_trial = False
+    of_error = True
     rests_on = "recorded trials"
     column = FigureColumn("believed tr P", 3)
     sweep_column = FigureColumn("believed tr P", 2)
@@ -25,6 +34,11 @@ class MeanTraceCovariance(MeanFigure, TotalsFigure):
     def of_totals(cls, totals: ReceiverTotals) -> float:
         """Its mean over the run."""
         return totals.trace / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """The sum of tr P over the slots of every trial, (R,); None if not every trial's is known."""
+        return totals.trace
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:

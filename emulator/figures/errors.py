@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.figures.figure import COVARIANCE_ONLY, FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure
+from evedrop.figures.figure import (
+    COVARIANCE_ONLY,
+    FigureColumn,
+    MeanFigure,
+    ReceiverTotals,
+    ScoredSlots,
+    TotalsFigure,
+    TrialTotals,
+)
 from evedrop.model.process import Floats
 
 
 class MeanError(MeanFigure, TotalsFigure):
     """The mean of the mode's error: |x − x̂|², or in a covariance-only study the trace of the actual covariance."""
 
+    of_error = True
+    expected = "expected_trace_covariance"
     sweep_column = FigureColumn("mean error", 0)
     sweep_picture = "marks"
 
@@ -18,6 +28,11 @@ class MeanError(MeanFigure, TotalsFigure):
     def of_totals(cls, totals: ReceiverTotals) -> float:
         """Its mean over the run."""
         return totals.error / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """Its sum over the slots of every trial, (R,)."""
+        return totals.error
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:

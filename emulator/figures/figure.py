@@ -91,6 +91,18 @@ class FigureTally(ABC):
         return None
 
 
+@dataclass
+class TrialTotals:
+    """The totals of one receiver for each trial, (R,) each. Each entry is a sum over slots."""
+
+    error: Floats
+    trace: Floats | None
+    """None: not known trial by trial."""
+    received: NDArray[np.int64]
+    """Late packets are included here and in `used`."""
+    used: NDArray[np.int64]
+
+
 @dataclass(kw_only=True)
 class ReceiverTotals:
     """The totals of one receiver. Each entry is a sum over slots and trials."""
@@ -132,6 +144,12 @@ class Figure(ABC):
     """Its description, with its unit."""
     by_trial: ClassVar[bool] = False
     """Whether every trial has it, so that it has quantiles over trials."""
+    averages_trials: ClassVar[bool] = False
+    """Whether it is the mean over trials of what every trial has, so that it has a standard error; otherwise it has none."""
+    of_error: ClassVar[bool] = False
+    """Whether it is a mean of errors or covariances: no standard error where theory says that their variance is infinite."""
+    expected: ClassVar[str | None] = None
+    """The figure of theory that it estimates, if there is one: the summary then has its z."""
     needs_states: ClassVar[bool] = False
     """Whether it needs states and estimates; it is null in modes without them."""
     needs_theory: ClassVar[bool] = False
@@ -162,6 +180,12 @@ class TotalsFigure(Figure):
     @abstractmethod
     def of_totals(cls, totals: ReceiverTotals) -> float:
         """The figure of a whole run; NaN if it has none."""
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """What it is the mean of, summed over the slots of every trial, (R,); None if that is not known."""
+        del totals
+        return None
 
 
 @final
@@ -204,6 +228,7 @@ class MeanFigure(Figure):
     """A mean over slots and trials."""
 
     by_trial = True
+    averages_trials = True
 
     @staticmethod
     @abstractmethod

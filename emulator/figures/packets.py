@@ -6,7 +6,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.figures.figure import FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure
+from evedrop.figures.figure import FigureColumn, MeanFigure, ReceiverTotals, ScoredSlots, TotalsFigure, TrialTotals
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
 
@@ -23,6 +23,11 @@ class ReceivedFraction(MeanFigure, TotalsFigure):
     def of_totals(cls, totals: ReceiverTotals) -> float:
         """The fraction over the run."""
         return (totals.received + totals.late) / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """Counts of packets received in every trial, (R,)."""
+        return totals.received.astype(np.float64)
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -42,6 +47,11 @@ class UsedFraction(MeanFigure, TotalsFigure):
     def of_totals(cls, totals: ReceiverTotals) -> float:
         """The fraction over the run."""
         return (totals.used + totals.late_used) / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """Counts of packets received and used in every trial, (R,)."""
+        return totals.used.astype(np.float64)
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:

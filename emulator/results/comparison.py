@@ -15,6 +15,7 @@ from typing import Any
 import pyarrow as pa
 
 from evedrop.results.writer import plain
+from evedrop.score.summary import RareEvents
 from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict
 
 _NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
@@ -69,6 +70,10 @@ class SimulatedError:
     """Level → quantile over trials of a trial's mean error."""
     infinite_variance: bool
     theory: Theory | None
+    z: float | None = None
+    """How many standard errors the mean is above theory; None without them, and where theory knows only a bound."""
+    rare_events: RareEvents | None = None
+    """As in the summary."""
 
     @property
     def typical(self) -> float:
@@ -85,6 +90,8 @@ class Cell:
     """The legitimate estimator in the same simulation: an attack may affect it, too."""
     eavesdropper: SimulatedError | None = None
     secrecy: Secrecy | None = None
+    ratio_error: float | None = None
+    """Standard error of the ratio; None for one trial, and for a ratio of medians."""
 
     @property
     def betrayed(self) -> bool:
@@ -128,6 +135,7 @@ class Cell:
             "eavesdropper": asdict(self.eavesdropper),
             "legitimate": asdict(self.legitimate),
             "ratio": self.ratio,
+            "ratio_standard_error": self.ratio_error,
             "verdict": verdict.value,
             "secrecy": asdict(self.secrecy.summary),
         }
@@ -268,12 +276,17 @@ def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
             "adversary": adversary,
             "not_defined": cell.match.not_defined,
             "eavesdropper_error": None if other is None else other.mean,
+            "eavesdropper_standard_error": None if other is None else other.standard_error,
             "eavesdropper_median": None if other is None else other.quantiles["0.5"],
             "eavesdropper_theory": None if other is None or other.theory is None else other.theory.mean,
+            "eavesdropper_z": None if other is None else other.z,
             "legitimate_error": None if user is None else user.mean,
+            "legitimate_standard_error": None if user is None else user.standard_error,
             "legitimate_median": None if user is None else user.quantiles["0.5"],
             "legitimate_theory": None if user is None or user.theory is None else user.theory.mean,
+            "legitimate_z": None if user is None else user.z,
             "ratio": cell.ratio,
+            "ratio_standard_error": cell.ratio_error,
             "verdict": None if cell.verdict is None else cell.verdict.value,
             "packet_bits": one.needs.packet_bits,
             "secret_bits_per_slot": one.needs.secret_bits_per_slot,

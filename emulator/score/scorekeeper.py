@@ -12,9 +12,10 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.expected.expectations import ExpectedTraceStream, expectations_of
+from evedrop.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
 from evedrop.figures import figures_of
 from evedrop.figures.figure import ScoredSlots
+from evedrop.figures.standard_error import z_of
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
@@ -26,7 +27,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
-from evedrop.score.summary import PeerSummary, Summary, Surprising, Verification
+from evedrop.score.summary import RARE_SHARE, PeerSummary, RareEvents, Summary, Surprising, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
@@ -72,6 +73,7 @@ class Scorekeeper:
             tally.add(slots.first, *one)
             if tally.conditional is not None:
                 tally.conditional.add(receiver.action)
+            tally.add_traces(receiver.traces_of_trials)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
                 tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)
@@ -135,10 +137,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
     expected = expectations_of(scenario)
-    peers = {
-        name: _peer(name, tally, expected[name].infinite_variance, digests[name], ending.mode)
-        for name, tally in tallies.items()
-    }
+    peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
     applications = {} if loop is None else {name: one.summary() for name, one in loop.applications.items()}
     user = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
@@ -174,16 +173,34 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     )
 
 
-def _peer(name: str, tally: Tally, infinite_variance: bool, digest: str | None, mode: str) -> PeerSummary:
+def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mode: str) -> PeerSummary:
     """A receiver's entry of the summary."""
+    infinite_variance = expected.infinite_variance
     figures: dict[str, float | None] = {}
     of_mode: dict[str, float | None] = {}
+    errors: dict[str, float | None] = {}
     for figure, one in figures_of(name).items():
-        if one.only_in_mode is None:
-            figures[figure] = None if one.not_in_mode == mode else tally.figure(figure)
-        elif one.only_in_mode == mode:
-            of_mode[figure] = tally.figure(figure)
-    return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode)
+        if one.only_in_mode not in {None, mode}:
+            continue
+        found = None if one.not_in_mode == mode else tally.figure(figure)
+        (figures if one.only_in_mode is None else of_mode)[figure] = found
+        if one.rests_on != "theory":
+            meaningless = found is None or (one.of_error and infinite_variance)
+            errors[figure] = None if meaningless else tally.standard_error(figure)
+    known = {**figures, **of_mode}
+    z = {
+        figure: z_of(known[figure], known[one.expected], errors[figure])
+        for figure, one in figures_of(name).items()
+        if one.expected is not None and figure in errors
+    }
+    rare = rare_events_of(expected, tally)
+    return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
+
+
+def rare_events_of(expected: Expectation, tally: Tally) -> RareEvents | None:
+    """The rare events of a receiver over the slots so far; None if they are unknown."""
+    streaks = expected.streaks(tally.done) if tally.alike else None
+    return None if streaks is None else RareEvents(streaks.share(tally.trials), streaks.trials_for(RARE_SHARE))
 
 
 def _quantiles(tally: Tally) -> dict[str, float] | None:

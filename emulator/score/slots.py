@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 
@@ -37,6 +38,11 @@ class ReceiverSlots:
     """Counts of the late packets that were delivered according to the router, (c, R)."""
     unsent: NDArray[np.uint32] | None = None
     """Counts of the trials without a packet according to the router, (c,); None: every trial had one."""
+
+    @property
+    def traces_of_trials(self) -> Floats | None:
+        """Trace of P of every trial, (c, R); None unless all trials are recorded."""
+        return kernels.traces(self.P) if self.P.shape[3] == self.action.shape[1] else None
 
     def part(self, trials: slice) -> ReceiverSlots:
         """The same for some of the trials; what is counted over all trials stays as it is."""

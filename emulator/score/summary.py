@@ -25,6 +25,20 @@ Found = float | int | str | None
 """The value found for an expectation. None: the run does not tell, or a receiver that must be in step never was."""
 
 
+RARE_SHARE = 0.01
+"""The share of an expected error that rare events may carry without being reported."""
+
+
+@dataclass(frozen=True)
+class RareEvents:
+    """The events that carry a receiver's expected error, but that too few trials meet."""
+
+    share: float
+    """The share of the expected error that is carried by events of which fewer than one is expected in all trials."""
+    trials: float
+    """The number of trials for which this share would be RARE_SHARE."""
+
+
 @dataclass(frozen=True)
 class PeerSummary:
     """The entry of a receiver."""
@@ -36,6 +50,12 @@ class PeerSummary:
     digest: str | None
     mode_figures: Mapping[str, float | None] = field(default_factory=dict)
     """The figures that only the run's mode has."""
+    standard_errors: Mapping[str, float | None] = field(default_factory=dict)
+    """Name of a figure → its standard error, for figures that are estimated; None if it has none."""
+    z: Mapping[str, float | None] = field(default_factory=dict)
+    """Name of a figure that theory expects → how many standard errors it is above its expectation; None if that is unknown."""
+    rare_events: RareEvents | None = None
+    """None: unknown."""
 
     @property
     def all_figures(self) -> dict[str, float | None]:
@@ -48,11 +68,11 @@ class PeerSummary:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of summary.json."""
-        own = {name: getattr(self, name) for name in _PEER}
+        own = {name: _entry(getattr(self, name)) for name in _PEER}
         return {**self.figures, **own, **self.mode_figures}
 
 
-_PEER = ("error_quantiles", "infinite_variance", "digest")
+_PEER = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "digest")
 
 
 @dataclass(frozen=True)
@@ -254,7 +274,7 @@ def _peer_fields(peer: Mapping[str, Any]) -> dict[str, Any]:
     start, stop = names.index(_PEER[0]), names.index(_PEER[-1])
     return {
         "figures": {name: peer[name] for name in names[:start]},
-        **{name: peer[name] for name in _PEER},
+        **{name: peer[name] for name in _PEER if name in peer},  # those of an older version have fewer
         "mode_figures": {name: peer[name] for name in names[stop + 1 :]},
     }
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.figures import figure
-from evedrop.figures.figure import ReceiverTotals, TotalsFigure
+from evedrop.figures.figure import ReceiverTotals, TotalsFigure, TrialTotals
+from evedrop.figures.standard_error import standard_error
 from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
@@ -106,11 +107,17 @@ class Tally(ReceiverTotals):
     """As in `Account`."""
     delays: NDArray[np.int64] = field(init=False)
     """As in `Account`; empty until something is counted."""
+    traces: Floats | None = field(init=False)
+    """Sum of tr P of each trial, (R,); None once slots were added whose tr P is not known trial by trial."""
+    packets: NDArray[np.int64] = field(init=False)
+    """Counts of the packets that each trial received, and used, late ones included, (2, R)."""
 
     def __post_init__(self) -> None:
         self.window_errors = np.zeros((WINDOWS + 1, self.trials))
         self.bursts = np.zeros(COUNTED_BURSTS, np.int64)
         self.delays = np.zeros(0, np.int64)
+        self.traces = np.zeros(self.trials)
+        self.packets = np.zeros((2, self.trials), np.int64)
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
         """Add the c slots from `first` on: their errors (c, R), sums, and expected traces (c,)."""
@@ -128,6 +135,14 @@ class Tally(ReceiverTotals):
             if inside.size:
                 self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
 
+    def add_traces(self, traces: Floats | None) -> None:
+        """Add tr P of some slots and of every trial, (c, R); None if it is not known."""
+        if traces is None:
+            self.traces = None
+        elif self.traces is not None:
+            for row in traces:  # slot by slot: the same bits however the slots are divided
+                self.traces += row
+
     def account(
         self,
         delivered: Flags,
@@ -136,7 +151,10 @@ class Tally(ReceiverTotals):
         unsent: NDArray[np.uint32] | None = None,
     ) -> None:
         """Compare the journal with the receiver's action (c, R): delivered in time (c, R), reason → lost (c,), unsent (c,)."""
-        self.unexplained += int(np.count_nonzero(delivered != (action != Action.LOST)))
+        received = action != Action.LOST
+        self.unexplained += int(np.count_nonzero(delivered != received))
+        self.packets[0] += _counts_of_trials(received)
+        self.packets[1] += _counts_of_trials(received & (action != Action.DISCARDED))
         count = delivered.size - int(np.count_nonzero(delivered))
         for reason, counts in lost.items():
             self.lost[reason] = self.lost.get(reason, 0) + int(counts.sum())
@@ -155,6 +173,7 @@ class Tally(ReceiverTotals):
         """Compare the late packets that the router delivered in each slot, (c, R), with those that the receiver took."""
         self.late += int(taken.sum())
         self.late_used += int(used.sum())
+        self.packets += taken.sum(axis=0, dtype=np.int64), used.sum(axis=0, dtype=np.int64)
         self.unexplained += int(np.count_nonzero(delivered != taken))
 
     def count(self, account: Account) -> None:
@@ -171,6 +190,40 @@ class Tally(ReceiverTotals):
             return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
         value = found.of_totals(self) if self.offered else math.nan
         return None if math.isnan(value) else value
+
+    @property
+    def alike(self) -> bool:
+        """Whether there are slots, and every trial has the same: trials in memory may be cut short at different slots."""
+        return self.done > 0 and self.offered == self.done * self.trials
+
+    def of_trials(self, name: str) -> Floats | None:
+        """What a figure is the mean of, for every trial, (R,).
+
+        None if the figure is no such mean, if that is not known, or if trials were cut short at different slots.
+        """
+        found = figure(name)
+        if not (found.averages_trials and self.alike):
+            return None
+        if issubclass(found, TotalsFigure):
+            error: Floats = self.window_errors.sum(axis=0)
+            sums = found.sums_of_trials(TrialTotals(error, self.traces, self.packets[0], self.packets[1]))
+            return None if sums is None else sums / self.done
+        return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if found.by_trial else None
+
+    def standard_error(self, name: str) -> float | None:
+        """The standard error of a figure of the run; None if it has none."""
+        return standard_error(self.of_trials(name))
+
+
+def _counts_of_trials(flags: Flags) -> NDArray[np.int64]:
+    """The number of flags (c, R) that are set in each trial, (R,). Bytes are added up, which takes a tenth of the time."""
+    counts = np.zeros(flags.shape[1], np.int64)
+    for first in range(0, len(flags), _BYTE):
+        counts += flags[first : first + _BYTE].view(np.uint8).sum(axis=0, dtype=np.uint8)
+    return counts
+
+
+_BYTE = 255  # the largest count in a byte
 
 
 def window_means(tally: Tally) -> Floats:
@@ -206,4 +259,7 @@ def merged(parts: Sequence[Tally]) -> Tally:
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
     conditional = [part.conditional for part in parts if part.conditional is not None]
     total.conditional = ConditionalError.merged(conditional) if conditional else None
+    total.packets = np.concatenate([part.packets for part in parts], axis=1)
+    traces = [part.traces for part in parts if part.traces is not None]
+    total.traces = np.concatenate(traces) if len(traces) == len(parts) else None
     return total

@@ -22,6 +22,7 @@ import numpy as np
 from evedrop.errors import Interrupted, RunError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
+from evedrop.figures.standard_error import ratio_error, standard_error, z_of
 from evedrop.memory.montecarlo import Merger, Plan, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
@@ -33,7 +34,7 @@ from evedrop.results.folder import make_private, new_folder, private_pictures, w
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
-from evedrop.score.scorekeeper import verdicts
+from evedrop.score.scorekeeper import rare_events_of, verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.signals import stop_on_signals
 from evedrop.studies.matchups import Group, Matchups
@@ -125,7 +126,15 @@ def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
     secrecy = {one.eavesdropper: one for one in verdicts(group.scenario, totals)}
     return {
-        one.adversary: Cell(one, measured[LEGITIMATE], measured[one.receiver], secrecy[one.receiver])
+        one.adversary: Cell(
+            one,
+            measured[LEGITIMATE],
+            measured[one.receiver],
+            secrecy[one.receiver],
+            None
+            if measured[LEGITIMATE].infinite_variance or measured[one.receiver].infinite_variance
+            else ratio_error(trial_means(totals[one.receiver]), trial_means(totals[LEGITIMATE])),
+        )
         for one in group.matches
     }
 
@@ -146,13 +155,16 @@ def _needs(scenario: Scenario, user: Tally) -> Needs:
 def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expectation) -> SimulatedError:
     means = trial_means(tally)
     heavy = expected.infinite_variance
-    spread = None if heavy or len(means) < 2 else float(np.std(means, ddof=1)) / math.sqrt(len(means))
+    error = None if heavy else standard_error(means)
+    mean, theory = MeanSquaredError.of_totals(tally), _theory(scenario, receiver, expected)
     return SimulatedError(
-        MeanSquaredError.of_totals(tally),
-        spread,
+        mean,
+        error,
         {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
         heavy,
-        _theory(scenario, receiver, expected),
+        theory,
+        None if theory is None or theory.bound else z_of(mean, theory.mean, error),
+        rare_events_of(expected, tally),
     )
 
 

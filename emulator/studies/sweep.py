@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
-from evedrop.figures import all_figures
+from evedrop.figures import all_figures, error_column, estimated_figures, z_column
 from evedrop.loading import load, value_of
 from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
@@ -196,8 +196,12 @@ def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[s
             "slots": scenario.slots,
             "trials": summary.trials,
             **{figure: peer.figure(figure) for figure in all_figures()},
+            **{error_column(name): peer.standard_errors.get(name) for name in estimated_figures()},
+            **{z_column(name): peer.z.get(name) for name, one in all_figures().items() if one.expected is not None},
             **{f"error_quantile_{level}": value for level, value in (peer.error_quantiles or {}).items()},
             "infinite_variance": peer.infinite_variance,
+            "rare_share": None if peer.rare_events is None else peer.rare_events.share,
+            "rare_trials": None if peer.rare_events is None else peer.rare_events.trials,
             **{
                 column: value
                 for application, entry in summary.applications.items()

@@ -66,7 +66,8 @@ def draw(path: Path, found: Comparison) -> None:
 
 def _facts(one: SchemeResult) -> Iterator[str]:
     needs = one.needs
-    yield f"{_number(one.legitimate.typical)}"
+    error = one.legitimate.standard_error
+    yield _number(one.legitimate.typical) + (f"\n± {_number(error)}" if error else "")
     yield "needed" if needs.acknowledgements else "–"
     yield f"{needs.packet_bits}" + (f" × {needs.sent_fraction:.2f}" if needs.sent_fraction < 0.995 else "")
     once = f" (+ {needs.initial_secret_bits})" if needs.initial_secret_bits else ""

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from evedrop.figures import all_figures, shown_figure
+from evedrop.figures import all_figures, error_column, shown_figure
 from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _COLOURS = (BLUE, RED, ORANGE, GREEN, GREY, "#7b3294", "#00a6d6", "#8c564b")
@@ -18,7 +18,10 @@ _MOST_PANELS = 6
 
 
 def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
-    """Draw the table of a sweep over these keys as `path`.png and `path`.pdf: simulated errors as marks, theory as lines."""
+    """Draw the table of a sweep over these keys as `path`.png and `path`.pdf: simulated errors as marks, theory as lines.
+
+    Bars at the marks are standard errors.
+    """
     rows = table.to_pylist()
     marks, lines = (
         [name for name, one in all_figures().items() if one.sweep_picture == way] for way in ("marks", "lines")
@@ -33,12 +36,15 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
                 theory = [_height(row, lines) for row in mine]
                 numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
                 one.plot(x, theory, "-" if numbers else "_", color=colour, linewidth=1.2, markersize=26)
-                one.plot(
+                one.errorbar(
                     x,
                     [_height(row, marks) for row in mine],
-                    mark,
+                    [_height(row, [error_column(name) for name in marks]) for row in mine],
+                    fmt=mark,
                     color=colour,
                     markerfacecolor="white",
+                    elinewidth=1.0,
+                    capsize=2.5,
                     label=peer,
                 )
                 if not numbers:
@@ -50,7 +56,7 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
         limits = [limit for one in axes for limit in one.get_ylim()]
         for one in axes:
             one.set_ylim(min(limits), max(limits))
-        axes[0].set_ylabel("mean error over slots (lines: theory)")
+        axes[0].set_ylabel("mean error ± standard error (lines: theory)")
         axes[0].legend()
 
 

@@ -42,7 +42,8 @@ def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario
     summary = results.typed_summary
     assert summary_text(summary) == text
     figures = [name for name in FIGURES if figure(name).only_in_mode in {None, mode.value}]
-    order = [*figures[:5], "error_quantiles", "infinite_variance", "digest", *figures[5:]]
+    others = ["error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "digest"]
+    order = [*figures[:5], *others, *figures[5:]]
     assert [list(peer) for peer in results.summary["peers"].values()] == [order] * len(summary.peers)
     outages = [ConnectionOutage("smart", 3, None, 0.5), ConnectionOutage("router", 4, 9, 1.0, shard=2)]
     write_summary(tmp_path / "run", replace(summary, outages=outages))

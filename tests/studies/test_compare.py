@@ -121,6 +121,12 @@ def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) ->
             assert cell.secrecy is not None
             assert cell.eavesdropper.mean == peer["mean_squared_error"]
             assert cell.eavesdropper.quantiles == peer["error_quantiles"]
+            assert cell.eavesdropper.standard_error == peer["standard_errors"]["mean_squared_error"]
+            assert cell.eavesdropper.z == pytest.approx(peer["z"]["mean_squared_error"])
+            rare = cell.eavesdropper.rare_events
+            assert (None if rare is None else asdict(rare)) == peer["rare_events"]
+            medians = cell.eavesdropper.infinite_variance or cell.legitimate.infinite_variance
+            assert (cell.ratio_error is None) is medians
             assert cell.legitimate.mean == alone["peers"]["legitimate"]["mean_squared_error"]
             assert asdict(cell.secrecy.summary) == alone["secrecy"][cell.match.receiver]
 
@@ -356,8 +362,9 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
         *("secret_bits_per_slot", "initial_secret_bits"),
     }
     cell = scheme["against"]["forges"]
-    assert set(cell) == {"reads_as", "attack", "eavesdropper", "legitimate", "ratio", "verdict", "secrecy"}
-    measured = {"mean", "standard_error", "quantiles", "infinite_variance", "theory"}
+    ratio = {"ratio", "ratio_standard_error"}
+    assert set(cell) == {"reads_as", "attack", "eavesdropper", "legitimate", "verdict", "secrecy"} | ratio
+    measured = {"mean", "standard_error", "quantiles", "infinite_variance", "theory", "z", "rare_events"}
     assert set(cell["eavesdropper"]) == set(cell["legitimate"]) == measured
     assert set(cell["legitimate"]["theory"]) == {"mean", "last", "limit", "bound"}
     assert cell["legitimate"]["theory"]["limit"] == "inf"

@@ -122,6 +122,10 @@ def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: P
             assert row["infinite_variance"] == peer["infinite_variance"]
             for figure in expectable_figures():
                 assert row[figure] == peer[figure]
+            for figure, error in peer["standard_errors"].items():
+                assert row[f"{figure}_standard_error"] == error
+            assert row["mean_squared_error_z"] == peer["z"]["mean_squared_error"]
+            assert {"share": row["rare_share"], "trials": row["rare_trials"]} == peer["rare_events"]
             for level, value in peer["error_quantiles"].items():
                 assert row[f"error_quantile_{level}"] == value
             verdict = alone["secrecy"].get(name, {})

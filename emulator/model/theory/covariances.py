@@ -323,7 +323,8 @@ def _fixed_point(F: Floats, source: Floats) -> Floats:
         return np.asarray(solve_discrete_lyapunov(F, source))
 
 
-def _block_length(A: Floats) -> int:
+def block_length(A: Floats) -> int:
+    """The number of powers of A, (n, n), to compute at once: 256, or fewer if their entries would become too large."""
     power, length = A, 1
     while length < _BLOCK:
         power = power @ power
@@ -343,7 +344,7 @@ def _block_tables(
     """
     A, Q = (np.frombuffer(one).reshape(n, n) for one in (dynamics, noise))
     with np.errstate(over="ignore", invalid="ignore"):
-        length = _block_length(A)
+        length = block_length(A)
         diffusion, spread = np.empty((length, n, n)), np.empty((length, n, n))
         E, W = np.zeros((n, n)), np.zeros((n, n))
         for j in range(length):
@@ -352,13 +353,13 @@ def _block_tables(
             W = carried + Q
             diffusion[j], spread[j] = E, W
         weights = 2.0 * misled * np.cumsum(kept ** np.arange(length))
-        found = (_powers(A, length), _powers(math.sqrt(kept) * A, length), diffusion, spread, weights)
+        found = (powers_of(A, length), powers_of(math.sqrt(kept) * A, length), diffusion, spread, weights)
     for table in found:
         table.flags.writeable = False
     return found
 
 
-def _powers(A: Floats, length: int) -> Floats:
+def powers_of(A: Floats, length: int) -> Floats:
     """A, A², … A^length, (length, n, n), by doubling."""
     powers = A[None]
     while len(powers) < length:

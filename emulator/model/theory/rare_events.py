@@ -1,0 +1,114 @@
+"""How much of an expected error rare events carry, and how many trials it takes to meet them, behind independent losses.
+
+A *streak* begins where the error leaves 0, where an innovation misleads the receiver, or in slot 0 if its packet was not
+used; it lasts until a state, or the next misleading innovation, replaces the error. Long streaks are rare, and may
+nevertheless carry most of the expectation: a mean over too few trials then misses it, and its standard error does not show that.
+
+Source: docs/mathematics.md, rare events.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from evedrop.model.process import Floats, Process
+from evedrop.model.theory.covariances import (
+    Outcomes,
+    block_length,
+    expected_traces,
+    misled_covariances,
+    powers_of,
+)
+
+LARGEST_RUN = 2**22
+"""The most numbers, slots × n², in the covariances of a run for which the streaks of a misled receiver are computed."""
+_REST = 1e-9  # the share of the expectation that is left out, in the longest streaks
+
+
+@final
+@dataclass(frozen=True)
+class Streaks:
+    """What streaks carry of Σ_k tr E P_k over the slots of a run; rows: those begun by a loss, by being misled, and in slot 0."""
+
+    number: Floats
+    """Expected number, in one trial, of streaks that last for more than l slots, (3, L) for l = 0, 1, …."""
+    carried: Floats
+    """What streaks carry in their slot number l, (3, L); the longest ones, which carry next to nothing, are left out."""
+    total: float
+    """Σ_k tr E P_k."""
+
+    def share(self, trials: int) -> float:
+        """The share of the expectation in slots that fewer than one streak of all trials is expected to reach, 0 … 1."""
+        if self.total == 0.0:
+            return 0.0
+        met = float(self.carried[self.number * trials >= 1.0].sum()) / self.total
+        return 1.0 - met if met < 1.0 - _REST else 0.0
+
+    def trials_for(self, share: float) -> float:
+        """The number of trials for which this share is left in such slots; inf if it exceeds double precision. share > 1e-9."""
+        if self.total == 0.0:
+            return 1.0
+        order = np.argsort(-self.number, axis=None, kind="stable")
+        met = np.cumsum(self.carried.reshape(-1)[order])
+        last = int(np.searchsorted(met, (1.0 - share) * self.total))
+        number = float(self.number.reshape(-1)[order[min(last, len(order) - 1)]])
+        return max(1.0, float(np.ceil(1.0 / number))) if number > 0.0 else math.inf
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
+    """The streaks of a receiver in slots 0 … slots−1.
+
+    None if its error leaves double precision, for a genie, whose slots differ, and for a misled receiver in a run that is too
+    long (LARGEST_RUN).
+
+    Source: docs/mathematics.md, rare events.
+    """
+    if outcomes.leaked or (outcomes.misled and slots * process.n**2 > LARGEST_RUN):
+        return None
+    total = float(expected_traces(process, outcomes, slots).sum())
+    if not math.isfinite(total):
+        return None
+    kept, lost, misled = outcomes.kept, outcomes.predicted, outcomes.misled
+    begun = np.cumsum(lost * _in_step(outcomes, slots))
+    spread = np.cumsum(misled_covariances(process, slots), axis=0) if misled else None
+    F = math.sqrt(kept) * process.A
+    powers = np.concatenate([np.eye(process.n)[None], powers_of(F, block_length(F))])
+    base, noise, found = powers[0], 0.0, np.zeros((2, 3, 0))
+    while found.shape[2] < slots and found[1].sum() < (1.0 - _REST) * total:
+        length = np.arange(found.shape[2], min(slots, found.shape[2] + len(powers) - 1))
+        F_l, after = (powers @ base)[: len(length)], slots - 1 - length
+        base = powers[-1] @ base
+        q = _traces(F_l, process.Q)
+        u = np.empty(len(length))
+        for i, one in enumerate(q):
+            u[i] = noise
+            noise = kept * noise + lost * one
+        often = kept**length
+        number = [often * begun[after], often * misled * after, often * outcomes.initial]
+        carried = [
+            begun[after] * (q + u),
+            np.zeros(len(length)) if spread is None else misled * (_traces(F_l, spread[after]) + after * u),
+            outcomes.initial * (_traces(F_l, process.initial_covariance) + u),
+        ]
+        found = np.concatenate([found, [number, carried]], axis=2)
+    return Streaks(found[0], found[1], total)
+
+
+def _in_step(outcomes: Outcomes, slots: int) -> Floats:
+    """The probability that the error is 0 before slot k, for k = 0 … slots−1, (slots,); 0 for k = 0."""
+    found = np.zeros(slots)
+    before = 1.0 - outcomes.initial
+    for k in range(1, slots):
+        found[k] = before
+        before = outcomes.state + outcomes.decoded * before
+    return found
+
+
+def _traces(F: Floats, P: Floats) -> Floats:
+    """Tr F_l P Fᵀ_l, (L,), of F (L, n, n) and P (n, n) or (L, n, n)."""
+    return np.asarray(np.einsum("lij,lij->l", F @ P, F))

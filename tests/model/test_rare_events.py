@@ -1,0 +1,130 @@
+"""Tests of the streaks that carry an expected error, against enumerations of all courses of a run."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from evedrop.model.process import Floats, Process
+from evedrop.model.theory import rare_events
+from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_traces
+from evedrop.model.theory.rare_events import Streaks, streaks
+
+PLANE = Process(
+    np.array([[1.1, 0.3], [0.0, 0.7]]), np.array([[0.5, 0.1], [0.1, 0.3]]), np.array([[9.0, 1.0], [1.0, 4.0]])
+)
+STABLE = Process(np.array([[0.9]]), np.array([[1.0]]), np.array([[1.0]]))
+LEGITIMATE = Outcomes.legitimate(0.8, 0.3)
+MISLED = Outcomes.eavesdropper(0.7, 0.4, 0.9, 0.3)
+SMART = Outcomes.eavesdropper(0.7, 0.4, 1.0, 0.0)
+LOST, MISLEADING, FIRST = range(3)
+
+
+def enumerated(process: Process, outcomes: Outcomes, slots: int) -> tuple[Floats, Floats]:
+    """The numbers and carried errors of `Streaks`, (3, slots) each, from every course that a run can take."""
+    number, carried = np.zeros((2, 3, slots))
+    sigma = [process.initial_covariance]
+    for _ in range(1, slots):
+        sigma.append(process.A @ sigma[-1] @ process.A.T + process.Q)
+    odds = {name: getattr(outcomes, name) for name in ("predicted", "decoded", "state", "misled")}
+    for unused in (False, True):
+        for course in itertools.product(odds, repeat=slots - 1):
+            weight = outcomes.initial if unused else 1.0 - outcomes.initial
+            weight *= math.prod(odds[outcome] for outcome in course)
+            P = process.initial_covariance * unused
+            kind, length = (FIRST, 0) if unused else (None, 0)
+            for k in range(slots):
+                if k:
+                    outcome = course[k - 1]
+                    length += 1
+                    moved = process.A @ P @ process.A.T
+                    if outcome == "state":
+                        P, kind = np.zeros_like(P), None
+                    elif outcome == "misled":
+                        P, kind, length = 2.0 * process.A @ sigma[k - 1] @ process.A.T, MISLEADING, 0
+                    elif outcome == "predicted":
+                        P = moved + process.Q
+                        kind, length = (LOST, 0) if kind is None else (kind, length)
+                    else:
+                        P = moved
+                if kind is not None:
+                    number[kind, length] += weight
+                    carried[kind, length] += weight * float(np.trace(P))
+    return number, carried
+
+
+def found_in(process: Process, outcomes: Outcomes, slots: int) -> Streaks:
+    """The streaks of a run that has them."""
+    found = streaks(process, outcomes, slots)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("process", [PLANE, STABLE], ids=["plane", "stable"])
+@pytest.mark.parametrize(
+    "outcomes", [LEGITIMATE, MISLED, SMART, NOBODY], ids=["legitimate", "misled", "smart", "nobody"]
+)
+def test_streaks_are_those_of_all_courses_of_a_run(process: Process, outcomes: Outcomes) -> None:
+    """Numbers and carried errors agree with the enumeration of every course of six slots, kind by kind and slot by slot."""
+    found = found_in(process, outcomes, 6)
+    number, carried = enumerated(process, outcomes, 6)
+    assert found.number == pytest.approx(number, rel=1e-12, abs=1e-15)
+    assert found.carried == pytest.approx(carried, rel=1e-12, abs=1e-15)
+    assert found.total == pytest.approx(carried.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART], ids=["legitimate", "misled", "smart"])
+def test_streaks_of_a_long_run_carry_the_whole_expectation(outcomes: Outcomes) -> None:
+    """Over several blocks of powers, all but the share that is left out is carried; the numbers fall with the length."""
+    found = found_in(STABLE, outcomes, 3000)
+    assert found.total == pytest.approx(float(expected_traces(STABLE, outcomes, 3000).sum()), rel=1e-12)
+    assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
+    assert np.all(np.diff(found.number) <= 0.0)
+
+
+def test_share_is_of_streaks_that_too_few_trials_meet() -> None:
+    """The share falls with the trials, and `trials_for` gives the number at which it reaches a level."""
+    found = found_in(PLANE, SMART, 200)
+    shares = [found.share(trials) for trials in (1, 10, 100, 10_000, 10**9)]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 0.1
+    assert shares[-1] < 0.001
+    for level in (0.2, 0.05, 0.001):
+        trials = int(found.trials_for(level))
+        assert found.share(trials) <= level < found.share(trials - 1)
+
+
+def test_share_of_an_initial_covariance_that_no_trial_misses_packets_of() -> None:
+    """A first packet that one trial in a thousand loses carries nearly all of the error if nothing else does."""
+    process = Process(np.array([[0.5]]), np.array([[1e-9]]), np.array([[1.0]]))
+    found = found_in(process, Outcomes.plain(0.999), 50)
+    assert found.share(40) > 0.99
+    assert found.share(1001) < 0.01
+    assert found.trials_for(0.05) == 1000.0
+
+
+def test_a_receiver_without_error_has_no_rare_events() -> None:
+    """A perfect link has no error that anything could carry."""
+    found = found_in(STABLE, Outcomes.plain(1.0), 20)
+    assert (found.total, found.share(1), found.trials_for(0.05)) == (0.0, 0.0, 1.0)
+
+
+def test_a_number_of_trials_beyond_double_precision_is_infinite() -> None:
+    """A start that grows faster than its streak dies out is carried by a streak that no number of trials meets."""
+    process = Process(np.array([[1e3]]), np.array([[1.0]]), np.array([[1.0]]))
+    found = found_in(process, Outcomes.plain(1.0 - 1e-5), 70)
+    assert found.share(10**9) > 0.99
+    assert found.trials_for(0.05) == math.inf
+
+
+def test_streaks_are_unknown_where_they_cannot_be_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A genie, an error beyond double precision, and a misled receiver in too long a run have none."""
+    assert streaks(STABLE, Outcomes.genie(0.7, 0.4), 5) is None
+    assert streaks(PLANE, NOBODY, 10_000) is None
+    monkeypatch.setattr(rare_events, "LARGEST_RUN", 19)
+    assert streaks(PLANE, MISLED, 5) is None
+    assert streaks(PLANE, MISLED, 4) is not None
+    assert streaks(PLANE, SMART, 5) is not None

@@ -1,0 +1,335 @@
+"""Standard errors, z and rare events: of every figure, against the recorded trials, and calibrated over many studies."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from evedrop.api import montecarlo, run
+from evedrop.cli.report import closing_table, estimate, print_summary
+from evedrop.expected.expectations import expectations_of
+from evedrop.figures.figure import MeanFigure, ScoredSlots, TotalsFigure
+from evedrop.figures.packets import UsedFraction
+from evedrop.figures.standard_error import ratio_error, standard_error, z_of
+from evedrop.loading import load
+from evedrop.memory.montecarlo import Merger, Plan
+from evedrop.memory.simulation import Mode
+from evedrop.memory.trials import carry_out, tasks_of
+from evedrop.model.process import Floats
+from evedrop.results.reading import Results
+from evedrop.scenario import Scenario
+from evedrop.score.scorekeeper import Ending
+from evedrop.score.summary import RARE_SHARE, Summary
+from evedrop.score.sums import Tally
+from tests.builders import scalar_tables
+
+ALONE = Plan(workers=1)
+
+
+def of_trials(results: Results, receiver: str, value: Callable[[dict[str, Any]], float]) -> Floats:
+    """The mean over slots of a value of the recorded rows, for every trial, (R,)."""
+    sums = np.zeros(results.summary["trials"])
+    for row in results.trials.to_pylist():
+        if row["peer"] == receiver:
+            sums[row["trial"] - results.summary["first_trial"]] += value(row)
+    means: Floats = sums / results.summary["slots"]
+    return means
+
+
+def textbook(means: Floats) -> float:
+    """The standard error of a mean of independent numbers."""
+    return math.sqrt(sum((one - means.mean()) ** 2 for one in means) / (len(means) - 1) / len(means))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Seven trials in memory, all recorded."""
+    folder = tmp_path_factory.mktemp("recorded")
+    return montecarlo("eavesdroppers", slots=300, trials=7, record_trials=7, out=folder, plan=ALONE, expect=[])
+
+
+@pytest.mark.parametrize("receiver", ["legitimate", "naive", "suspicious", "smart"])
+def test_standard_errors_are_those_of_the_trials_means(recorded: Results, receiver: str) -> None:
+    """Of every figure that is estimated, from the rows of the recorded trials; z is the distance from theory in them."""
+    peer = recorded.summary["peers"][receiver]
+    values: dict[str, Callable[[dict[str, Any]], float]] = {
+        "mean_squared_error": lambda row: float(row["squared_error"]),
+        "mean_trace_covariance": lambda row: float(row["trace_covariance"]),
+        "received_fraction": lambda row: float(row["action"] != "dropped"),
+        "used_fraction": lambda row: float(row["action"] not in ("dropped", "discarded")),
+    }
+    expected = {name: of_trials(recorded, receiver, value) for name, value in values.items()}
+    assert list(peer["standard_errors"]) == list(expected)
+    for name, means in expected.items():
+        assert peer[name] == pytest.approx(means.mean(), rel=1e-12), name
+        assert peer["standard_errors"][name] == pytest.approx(textbook(means), rel=1e-9), name
+    distance = peer["mean_squared_error"] - peer["expected_trace_covariance"]
+    assert peer["z"] == {"mean_squared_error": distance / peer["standard_errors"]["mean_squared_error"]}
+
+
+def test_late_packets_count_in_the_trials_too() -> None:
+    """A packet that comes late is received in its trial: the mean of the trials is the figure."""
+    scenario = load("late", {"slots": 200, "trials": 6, "expect": []})
+    totals = merged(scenario).totals
+    for name, tally in totals.tallies.items():
+        for figure in ("received_fraction", "used_fraction"):
+            means = tally.of_trials(figure)
+            assert means is not None
+            assert means.mean() == pytest.approx(tally.figure(figure), rel=1e-12), (name, figure)
+    assert any(tally.late for tally in totals.tallies.values())
+
+
+def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_path: Path) -> None:
+    """In shards too; unless all trials are recorded, the believed covariance has none."""
+    some: dict[str, Any] = {"slots": 300, "trials": 7, "expect": [], "view": "off"}
+    live = run("eavesdroppers", record_trials=7, shards=2, out=tmp_path / "live", **some)
+    others = run("eavesdroppers", record_trials=1, out=tmp_path / "others", **some)
+    for name, peer in recorded.summary["peers"].items():
+        same, unrecorded = (one.summary["peers"][name] for one in (live, others))
+        assert same["standard_errors"] == pytest.approx(peer["standard_errors"], rel=1e-9)
+        assert same["z"] == pytest.approx(peer["z"], rel=1e-9)
+        assert same["rare_events"] == peer["rare_events"]
+        assert unrecorded["standard_errors"].pop("mean_trace_covariance") is None
+        assert unrecorded["standard_errors"] == pytest.approx(
+            {name: error for name, error in peer["standard_errors"].items() if name != "mean_trace_covariance"},
+            rel=1e-9,
+        )
+
+
+def test_workers_do_not_change_standard_errors() -> None:
+    """Two tasks of several blocks and one of all give the same bits."""
+    scenario = load("eavesdroppers", {"slots": 20, "trials": 1100, "expect": []})
+    one, three = (summary_of_study(scenario, workers) for workers in (1, 3))
+    assert one.peers == three.peers
+
+
+def test_one_trial_has_no_standard_error() -> None:
+    """Its slots depend on each other, so it has no z either."""
+    summary = summary_of_study(load("eavesdroppers", {"slots": 50, "trials": 1, "expect": []}))
+    for peer in summary.peers.values():
+        assert set(peer.standard_errors.values()) | set(peer.z.values()) == {None}
+
+
+def test_infinite_variance_leaves_only_counts_a_standard_error() -> None:
+    """The error and the believed covariance have none, and no z."""
+    peer = summary_of_study(load("numerical", {"trials": 20, "expect": []})).peers["smart"]
+    assert peer.infinite_variance
+    assert {name for name, error in peer.standard_errors.items() if error is None} == {
+        "mean_squared_error",
+        "mean_trace_covariance",
+    }
+    assert peer.z == {"mean_squared_error": None}
+
+
+def test_a_covariance_only_study_has_the_z_of_its_own_figure() -> None:
+    """The mean actual trace stands beside theory; there is no squared error."""
+    scenario = load("eavesdroppers", {"slots": 50, "trials": 20, "expect": []})
+    peer = summary_of_study(scenario, mode=Mode.COVARIANCE_ONLY).peers["smart"]
+    error, z = peer.standard_errors["mean_actual_trace_covariance"], peer.z["mean_actual_trace_covariance"]
+    found, expected = peer.figure("mean_actual_trace_covariance"), peer.figure("expected_trace_covariance")
+    assert None not in (error, z, found, expected)
+    assert z == (found - expected) / error  # type: ignore[operator]
+    assert peer.standard_errors["mean_squared_error"] is peer.z["mean_squared_error"] is None
+    assert peer.standard_errors["mean_trace_covariance"] is not None
+
+
+def test_trials_that_were_cut_short_have_no_standard_errors() -> None:
+    """Where they reached different slots; before the first slot there are none either."""
+    tally = Tally(9, 3)
+    assert tally.standard_error("mean_squared_error") is None
+    tally.done, tally.offered = 4, 4 * 3
+    tally.window_errors[0] = 1.0, 2.0, 4.0
+    assert tally.standard_error("mean_squared_error") == pytest.approx(
+        np.std([0.25, 0.5, 1.0], ddof=1) / math.sqrt(3.0)
+    )
+    tally.offered += 1
+    assert tally.standard_error("mean_squared_error") is None
+
+
+def test_a_figure_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mean that is kept for all trials together, and totals that say nothing about trials."""
+
+    class Kept(MeanFigure):
+        by_trial = False
+
+        @staticmethod
+        def values(slots: ScoredSlots) -> Floats:
+            return slots.error
+
+    tally = Tally(9, 3, done=4, offered=12)
+    monkeypatch.setattr("evedrop.score.sums.figure", lambda _: Kept)
+    assert tally.of_trials("kept") is None
+    monkeypatch.setattr("evedrop.score.sums.figure", lambda _: UsedFraction)
+    assert tally.of_trials("used") is not None
+    monkeypatch.setattr(UsedFraction, "sums_of_trials", TotalsFigure.sums_of_trials)
+    assert tally.of_trials("used") is None
+
+
+def test_a_summary_of_an_older_version_can_be_read(recorded: Results) -> None:
+    """Its receivers have no standard errors."""
+    text = json.loads(json.dumps(recorded.summary))
+    for peer in text["peers"].values():
+        for name in ("standard_errors", "z", "rare_events"):
+            del peer[name]
+    peer = Summary.read(text).peers["smart"]
+    assert (peer.standard_errors, peer.z, peer.rare_events) == ({}, {}, None)
+    assert peer.figures == recorded.typed_summary.peers["smart"].figures
+    assert closing_table(Summary.read(text), 100).row_count == 4
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.012345, 0.00041, "0.0123 ± 0.0004"),
+        (0.0123, 0.00096, "0.012 ± 0.001"),
+        (3453.02, 401.1, "3453 ± 401"),
+        (7.5, 0.22, "7.5 ± 0.2"),
+        (0.9000123, 0.000073, "0.90001 ± 0.00007"),
+        (0.00040389, 0.0000115, "4.0e-4 ± 1e-5"),
+        (2.6e7, 5.7e6, "2.6e7 ± 6e6"),
+        (-1e6, 2e8, "-1e6 ± 2e8"),
+        (0.0, 1e-9, "0e0 ± 1e-9"),
+        (0.25, None, "0.25"),
+        (0.25, 0.0, "0.25"),
+        (math.inf, 1.0, "inf"),
+        (None, None, "–"),
+    ],
+)
+def test_an_estimate_has_the_digits_of_its_error(value: float | None, error: float | None, text: str) -> None:
+    """A digit of the error, and the estimate to its place; small and large ones with exponents."""
+    assert estimate(value, error) == text
+
+
+def test_a_standard_error_needs_finite_trials() -> None:
+    """Two of them at least; z needs an error above 0."""
+    assert standard_error(None) is standard_error(np.ones(1)) is None
+    assert standard_error(np.array([1.0, math.inf])) is standard_error(np.array([1e200, -1e200])) is None
+    assert standard_error(np.array([1.0, 3.0])) == 1.0
+    assert z_of(3.0, 2.0, 0.5) == 2.0
+    assert z_of(3.0, 2.0, 0.0) is z_of(3.0, None, 1.0) is z_of(None, 2.0, 1.0) is z_of(math.inf, 2.0, 1.0) is None
+
+
+def test_the_error_of_a_ratio_is_that_of_leaving_trials_out() -> None:
+    """The jackknife agrees to a per cent; the numerator and the denominator are of the same trials."""
+    random = np.random.default_rng(4)
+    under = random.exponential(size=400) + 1.0
+    over = 3.0 * under + random.normal(size=400)
+    left = (over.sum() - over) / (under.sum() - under)
+    jackknife = math.sqrt(399 / 400 * ((left - left.mean()) ** 2).sum())
+    assert ratio_error(over, under) == pytest.approx(jackknife, rel=0.01)
+    assert ratio_error(over, 0.0 * under) is None
+    assert ratio_error(over[:1], under[:1]) is None
+
+
+def report_of(summary: Summary, capsys: pytest.CaptureFixture[str]) -> str:
+    """The closing report of a summary."""
+    print_summary(summary, "folder")
+    return capsys.readouterr().out
+
+
+def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.CaptureFixture[str]) -> None:
+    """A first packet that is lost once in a thousand trials: a sentence in 40 trials, none in 4000, none in one."""
+    tables = scalar_tables(0.5, 1e-9, encoding={"scheme": "plain"}, legitimate={"link": {"quality": 0.999}}, slots=5)
+    few, many, one = (
+        summary_of_study(Scenario.read({**tables, "trials": trials, "seed": 2})) for trials in (40, 4000, 1)
+    )
+    rare = few.peers["legitimate"].rare_events
+    assert rare is not None
+    assert rare.share > 0.9
+    assert rare.trials > 40
+    said = "of its expected error is carried by events of which 40 trials contain fewer than one"
+    assert said in report_of(few, capsys)
+    assert many.peers["legitimate"].rare_events is not None
+    assert many.peers["legitimate"].rare_events.share < RARE_SHARE
+    for summary in (many, one):
+        assert "is carried by events" not in report_of(summary, capsys)
+
+
+def test_rare_events_are_unknown_without_single_slots(recorded: Results) -> None:
+    """For a link with a memory and for a genie; the numbers of the others are those of theory."""
+    for name, scenario in (("legitimate", "bursts"), ("genie", "bayesian")):
+        assert (
+            summary_of_study(load(scenario, {"slots": 30, "trials": 3, "expect": []})).peers[name].rare_events is None
+        )
+    for name, expected in expectations_of(load(recorded.folder)).items():
+        streaks = expected.streaks(300)
+        assert streaks is not None
+        assert recorded.summary["peers"][name]["rare_events"] == {
+            "share": streaks.share(7),
+            "trials": streaks.trials_for(RARE_SHARE),
+        }
+
+
+def test_the_closing_table_fits_80_columns(recorded: Results) -> None:
+    """With the standard error and z of the error; in a wide terminal every figure has its standard error."""
+    shown = {}
+    for width in (80, 140):
+        console = Console(width=width, file=StringIO())
+        with console.capture() as captured:
+            console.print(closing_table(recorded.typed_summary, width))
+        shown[width] = captured.get()
+    assert max(map(len, shown[80].splitlines())) <= 80
+    assert "…" not in shown[80]
+    assert shown[80].count(" ± ") == 4
+    assert shown[140].count(" ± ") == 4 * 4
+
+
+def merged(scenario: Scenario, workers: int = 1, mode: Mode = Mode.EXACT) -> Merger:
+    """The trials of a scenario, in as many tasks as for this many workers."""
+    merger = Merger(scenario, mode)
+    for task in tasks_of(scenario, mode, workers):
+        merger.add(carry_out(task, lambda _: None, lambda: False))
+    return merger
+
+
+def summary_of_study(scenario: Scenario, workers: int = 1, mode: Mode = Mode.EXACT) -> Summary:
+    """The summary of a study, in memory."""
+    return merged(scenario, workers, mode).summary(Ending(1.0))
+
+
+STUDY_TRIALS = 200
+
+
+def z_of_studies(count: int) -> Floats:
+    """Z of the legitimate and of a smart receiver's error in independent studies, (count, 2)."""
+    tables = scalar_tables(
+        0.7,
+        1.0,
+        eavesdroppers={"smart": {"strategy": "smart", "link": {"quality": 0.8}}},
+        slots=30,
+        trials=STUDY_TRIALS,
+    )
+    found = []
+    for study in range(count):
+        peers = summary_of_study(Scenario.read({**tables, "first_trial": study * STUDY_TRIALS})).peers
+        found.append([peers[name].z["mean_squared_error"] for name in ("legitimate", "smart")])
+    return np.array(found)
+
+
+def check_calibration(z: Floats) -> None:
+    """Beyond 1.96 in 5 % of the studies: within the interval that contains a binomial count but once in a thousand."""
+    from scipy.stats import binom
+
+    for one in z.T:
+        outside = int(np.count_nonzero(np.abs(one) > 1.96))
+        low, high = binom.interval(0.999, len(one), 0.05)
+        assert low <= outside <= high, outside
+
+
+def test_z_is_calibrated() -> None:
+    """Over 200 small studies of a process with light tails."""
+    check_calibration(z_of_studies(200))
+
+
+@pytest.mark.long
+def test_z_is_calibrated_over_a_thousand_studies() -> None:
+    """Over 1000 small studies of a process with light tails."""
+    check_calibration(z_of_studies(1000))
