@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
-from evedrop.model.eavesdroppers.tracker import Tracker
+from evedrop.model.eavesdroppers.tracker import CAPACITY, Tracker
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
@@ -139,6 +139,38 @@ def test_it_is_the_exact_posterior(process: Process, learns_at: int) -> None:
     assert batch.slots == len(pairs)
 
 
+def distances(process: Process, capacity: int, lossless: bool) -> tuple[np.ndarray, np.ndarray]:
+    """How far 40 trackers with this room are from the exact mean without a leak, as a share of the start's size.
+
+    (slots, trials), and the number of packets so far.
+    """
+    gamma, words = np.ones((6, 40), bool) if lossless else coins(0.7, 6, 40), Words(process, 6)
+    scale = float(np.sqrt(np.trace(process.initial_covariance + process.Q)))
+    found = np.zeros(gamma.shape)
+    for r in range(40):
+        one = Tracker(Knowledge(process, 1.0, {}, {}), Batch(6, 1, r), capacity)
+        heard: dict[int, np.ndarray] = {}
+        belief = one.prior()
+        for slot in slots(process, Batch(6, 1, r), gamma[:, r : r + 1]):
+            belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
+            if slot.gamma[0]:
+                heard[slot.k] = slot.z[:, 0]
+            found[slot.k, r] = np.abs(belief.x_hat[:, 0] - words.posterior(slot.k, heard, None)[0]).max() / scale
+    return found, gamma.cumsum(axis=0)
+
+
+@pytest.mark.parametrize("lossless", [True, False])
+@pytest.mark.parametrize("process", [CLOSE, RESTLESS, STABLE], ids=["close", "restless", "stable"])
+def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Process, lossless: bool) -> None:
+    """Exact up to the fifth packet by default, and up to the sixth with room for 16; beyond that 2 % off at most."""
+    found, packets = distances(process, CAPACITY, lossless)
+    assert found[packets <= 5].max() < 1e-7
+    assert found.max() < 0.02
+    if lossless:
+        assert found[packets == 6].max() > 1e-4
+    assert distances(process, 16, lossless)[0].max() < 1e-7
+
+
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING], ids=["unstable", "drifting"])
 @pytest.mark.thorough
 def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> None:
@@ -228,9 +260,9 @@ def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
 
 @pytest.mark.thorough
 def test_more_room_changes_little() -> None:
-    """Where the tracks stay within a slot's noise, twice as many histories change its mean error by less than 2 %."""
+    """Where the tracks stay within a slot's noise, 16 times the room changes its mean error by less than 2 %."""
     batch, gamma, means = Batch(60, 200), coins(0.9, 60, 200), []
-    for capacity in (8, 16):
+    for capacity in (CAPACITY, 128):
         one, total = Tracker(Knowledge(RESTLESS, 1.0, {}, {}), batch, capacity), 0.0
         belief = one.prior()
         for slot in slots(RESTLESS, batch, gamma):
