@@ -126,9 +126,9 @@ class Following:
 
     @property
     def _end_of_block(self) -> int:
-        """The slot up to which deliveries may be taken at once: none beyond the end of a report, or the next absence."""
+        """The slot up to which deliveries may be taken at once: the end of a report. An absence begins at a barrier."""
         k, batch = self._k, self._brief.flow.batch
-        return min(k - k % batch + batch, self._brief.slots, *(start for start in self._outages if start > k))
+        return min(k - k % batch + batch, self._brief.slots)
 
 
 @final

@@ -154,6 +154,11 @@ MEASURED: dict[str, Any] = {
     "plant__noise": [[1e-3, 0.0], [0.0, 1e-3]],
 }
 LIVE["filtered"] = {"trials": 2, **MEASURED}
+LIVE["filtered and betrayed"] = {
+    "trials": 2,
+    **MEASURED,
+    "eavesdroppers__smart": {"strategy": "replay-informed", "learns_at": 40, "reads_as": "smart", "link": {"quality": 0.8}},
+}
 
 
 def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted(tmp_path: Path) -> None:

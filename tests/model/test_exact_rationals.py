@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.links.link import Chain
@@ -300,6 +300,7 @@ def test_schedules_by_holding_time(
 @given(
     st.floats(0.0, 1.0, exclude_min=True), st.floats(0.0, 1.0, exclude_min=True), st.integers(0, 4), st.integers(0, 4)
 )
+@example(1.0, 1.0, 0, 0)
 def test_the_limiting_distribution(mu: float, mu_d: float, innovations: int, drops: int) -> None:
     """π_0 and the probabilities of words and steps, down to links that hardly ever lose and states that are hardly ever sent."""
     assume(mu * mu_d > 1e-300)
