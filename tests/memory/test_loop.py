@@ -157,7 +157,12 @@ LIVE["filtered"] = {"trials": 2, **MEASURED}
 LIVE["filtered and betrayed"] = {
     "trials": 2,
     **MEASURED,
-    "eavesdroppers__smart": {"strategy": "replay-informed", "learns_at": 40, "reads_as": "smart", "link": {"quality": 0.8}},
+    "eavesdroppers__smart": {
+        "strategy": "replay-informed",
+        "learns_at": 40,
+        "reads_as": "smart",
+        "link": {"quality": 0.8},
+    },
 }
 
 

@@ -187,6 +187,6 @@ def step_probabilities(mu: float, mu_d: float, steps: int) -> Floats:
     """
     in_sync = in_sync_probability(mu, mu_d)
     not_the_state = (1.0 - mu) + mu * (1.0 - mu_d)
-    probabilities = (1.0 - mu) * in_sync * not_the_state ** np.maximum(np.arange(steps) - 1.0, 0.0)
+    probabilities: Floats = (1.0 - mu) * in_sync * not_the_state ** np.maximum(np.arange(steps) - 1.0, 0.0)
     probabilities[:1] = in_sync
     return probabilities
