@@ -13,7 +13,8 @@ import numpy as np
 
 from evedrop.model.acknowledgements import rates_of
 from evedrop.model.process import Floats, Process
-from evedrop.model.reference import ReferenceCode
+from evedrop.model.reference_code import ReferenceCode
+from evedrop.model.reference_floor import reference_floor
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
@@ -38,10 +39,14 @@ class Closed:
     """Probabilities that a packet is acknowledged and the receiver heard it, and that it is acknowledged and it did not."""
     chain: SensorChain | None
     """The sensor's behaviour; None if it sends in every slot."""
+    bound: bool = False
+    """Whether this is only a lower bound, in every slot; its limit is exact."""
 
     @cached_property
     def traces(self) -> Floats:
         """The traces of all slots, (slots,)."""
+        if self.bound:
+            return reference_floor(self.process, self.received, self.acknowledged, self.slots)
         if self.chain is not None:
             found = self.chain.covariances(self.process, self.slots)
         else:
@@ -56,6 +61,9 @@ class Closed:
             if len(self.chain.start) * self.process.n**2 > theory.LARGEST_OPERATOR:
                 return float("nan")
             return float(np.trace(self.chain.limit(self.process)))
+        if self.bound:
+            # After the first critical slot it knows less and less, in the end no more than a receiver that hears nothing.
+            return theory.limit_trace(self.process, theory.NOBODY)
         if self.acknowledged[1] > 0.0:
             return float("inf")
         return theory.limit_trace(self.process, Outcomes.plain(self.received))
@@ -93,8 +101,9 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
     kind = SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
     # Unless acknowledgements are forged the user never misses a reference, so it knows more about each slot.
     told = receiver != LEGITIMATE or table.attack == "forge"
-    if kind == "reference" and told and not ReferenceCode(process).decorrelates:
-        return Closed(process, scenario.slots, quality[receiver], split, None)
+    if kind in ("reference", "open-loop") and told:
+        bound = kind == "reference" and split[1] > 0.0 and ReferenceCode(process).decorrelates
+        return Closed(process, scenario.slots, quality[receiver], split, None, bound)
     if kind == "scheduled":
         chain = scheduled(threshold, quality[receiver], split)
         return Closed(process, scenario.slots, quality[receiver], split, chain)

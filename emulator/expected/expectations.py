@@ -64,6 +64,8 @@ class Expectation:
     """For a receiver without the secret and without a theory of its own: the genie, which no such receiver outperforms."""
     closed: Closed | None = None
     """The closed form of a receiver whose slots differ."""
+    closed_bound: Closed | None = None
+    """A lower bound for such a receiver, in place of a closed form."""
 
     @property
     def known(self) -> bool:
@@ -86,6 +88,8 @@ class Expectation:
     @property
     def bound(self) -> Expectation | None:
         """A lower bound on the receiver's error, if theory knows only that."""
+        if self.closed_bound is not None:
+            return Expectation(self.process, self.law, None, closed=self.closed_bound)
         if self.known or self.law is None or self.bound_at is None:
             return None
         return Expectation(self.process, self.law, self.bound_at)
@@ -135,9 +139,11 @@ def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
     """Maps the quality of a receiver's link to the frequencies of its actions; None if these are unknown."""
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     if receiver == LEGITIMATE:
-        return legitimate_outcomes(scheme)
-    table = scenario.eavesdroppers[receiver]
-    return eavesdropper_outcomes(scheme, table.strategy, table.parameters)
+        table = scenario.acknowledgements
+        forged = table is not None and table.attack == "forge" and LEGITIMATE in scheme.closed_forms
+        return None if forged else legitimate_outcomes(scheme)
+    eavesdropper = scenario.eavesdroppers[receiver]
+    return eavesdropper_outcomes(scheme, eavesdropper.strategy, eavesdropper.parameters)
 
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
@@ -150,16 +156,19 @@ def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     """Receiver → theory's expectation of it."""
-    return {
-        name: Expectation(
+    found = {}
+    for name in scenario.receivers:
+        closed = closed_of(scenario, name)
+        bound = closed is not None and closed.bound
+        found[name] = Expectation(
             scenario.process.process,
             law_of(scenario.schedule(name)),
             outcomes_of(scenario, name),
             bound_of(scenario, name),
-            closed_of(scenario, name),
+            None if bound else closed,
+            closed if bound else None,
         )
-        for name in scenario.receivers
-    }
+    return found
 
 
 def _genie(mu_d: float, quality: float) -> Outcomes:

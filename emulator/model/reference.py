@@ -1,176 +1,244 @@
-"""Packets that contain the state minus a reference, and receivers that read them from what they know of the reference.
+"""Receivers of packets that contain the state minus a reference, or the state itself with the reference of later packets.
 
-A packet is z = x_k − L^{k−t} x_t, with t in the header, or x_k itself with t = −1. How a receiver reads the packet depends
-on its knowledge of x_t.
+A packet is z = x_k − L_{t,k} x_t, with t in the header, or x_k itself. How a receiver reads the packet depends on its knowledge
+of x_t.
 
 Source: docs/mathematics.md, acknowledged references.
 """
 
 from __future__ import annotations
 
-from functools import cached_property
-from typing import final
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.kernels.elementary import inverse
+from evedrop.kernels.current import kernels
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception, trace_of
-from evedrop.model.theory.covariances import radius
-from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
+from evedrop.model.reference_code import NONE, ReferenceCode, initial_factor
+from evedrop.model.theory.horizon import UNIT_ROUNDOFF
 
 Slots = NDArray[np.int64]
 
-NONE = -1
-"""The reference slot of a packet that contains the state itself."""
-_DOUBLINGS = 60
-_MOST_SLOTS = 2**62
+_NEGLIGIBLE = 1e-75  # of the noise: the square of such a deviation is lost in rounding, and its own square in underflow
 
 
-@final
-class ReferenceCode:
-    """How a reference is carried from slot to slot: by L = A, or, for stable A, by L = Σ A⁻ᵀ Σ⁻¹."""
+class Content(IntEnum):
+    """What a packet contains: the second number of a header that has two."""
 
-    def __init__(self, process: Process) -> None:
-        self._process = process
-        self.decorrelates = radius(process) < 1.0 and np.linalg.matrix_rank(process.A) == process.n
-        """Whether A is stable, so that a packet is made independent of the state it leads to."""
-
-    @cached_property
-    def L(self) -> Floats:
-        """The matrix L, (n, n)."""
-        A = self._process.A
-        if not self.decorrelates:
-            return A
-        sigma = stationary_covariance(self._process)
-        return product(product(sigma, inverse(A).T.copy()), inverse(sigma))
-
-    @cached_property
-    def longest(self) -> int:
-        """The largest age of a reference in slots: beyond it, L^m x_t of a stable A is so large that x_k is lost in rounding."""
-        if not self.decorrelates:
-            return _MOST_SLOTS
-        sigma = stationary_covariance(self._process)
-        n = self._process.n
-        least = min(float(self._process.Q[i, i]) for i in range(n))
-        limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * least
-
-        def carried(power: Floats, spread: Floats) -> Floats:
-            return product(product(power, spread), power.T.copy())
-
-        def within(spread: Floats) -> bool:
-            return sum(float(spread[i, i]) for i in range(n)) <= limit
-
-        # L^m Σ L^mᵀ grows with m, because A Σ Aᵀ ≤ Σ. So the largest m is found bit by bit, from powers of L by doubling.
-        powers = [self.L]
-        slots, grown = 0, sigma
-        with np.errstate(over="ignore", invalid="ignore"):
-            while len(powers) < _DOUBLINGS and within(carried(powers[-1], sigma)):
-                powers.append(product(powers[-1], powers[-1]))
-            for j in reversed(range(len(powers))):
-                further = carried(powers[j], grown)
-                if within(further):
-                    slots, grown = slots + 2**j, further
-        return slots
-
-    def carry(self, reference: Floats) -> Floats:
-        """L times a reference, (n, R)."""
-        return product(self.L, reference)
+    STATE = 0
+    """x_k. The header's slot t is the reference of the sensor's next packets, carried by L."""
+    CODED = 1
+    """x_k − L_{t,k} x_t."""
+    OPEN_LOOP = 2
+    """x_k − A^{k−t} x_t."""
 
 
-def stationary_covariance(process: Process) -> Floats:
-    """Σ = A Σ Aᵀ + Q of a stable process, (n, n), by doubling, with the same bits on every machine."""
-    sigma, power = process.Q, process.A
-    for _ in range(_DOUBLINGS):
-        sigma = sigma + product(product(power, sigma), power.T.copy())
-        power = product(power, power)
-    return sigma
+class _Known(NamedTuple):
+    """A receiver's knowledge of (x, r) after slot s, in which it last read a packet; r is the reference carried to s.
+
+    Their errors are the columns of [X; D] times independent standard normal variables.
+    """
+
+    x: Floats
+    """(n, R)."""
+    r: Floats
+    """(n, R)."""
+    X: Floats
+    """(n, n, R)."""
+    D: Floats
+    """(n, n, R)."""
+    s: Slots
+    """(R,)."""
+    t: Slots
+    """The reference's slot, (R,); NONE: none is known."""
+    by: Slots
+    """`Content` of the packets with this reference, (R,)."""
+
+    def taken(self, some: NDArray[np.intp]) -> _Known:
+        """The same in some of the trials."""
+        return _Known(*(part[..., some] for part in self))  # type: ignore[arg-type]
+
+    def replaced(self, some: NDArray[np.intp], other: _Known) -> _Known:
+        """The same with other knowledge in some of the trials."""
+        parts = [part.copy() for part in self]
+        for part, values in zip(parts, other, strict=True):
+            part[..., some] = values
+        return _Known(*parts)  # type: ignore[arg-type]
 
 
 class ReferenceReceiver(Receiver):
-    """The exact MMSE reader for L = A; for a decorrelating code, a reader that decodes what it can and otherwise predicts.
+    """The exact MMSE reader of packets with references: a Kalman filter of the state x and the reference r.
 
-    x_k = z + L^{k−t} x_t, so x̂_k = z + L^{k−t} x̂_t, whose only error is that of x̂_t. For L = A nothing that is heard after
-    slot t adds knowledge of x_t, so this is optimal. Its memory, all carried to the current slot: the estimate of the last
-    slot in which it read a packet, with its covariance; the same for that packet's reference; and both slots. An
-    acknowledged slot in between, in which it heard nothing, is predicted from the former.
+    From slot to slot x ← A x + w, and r ← L x if the last packet was acknowledged, else L r. It learns which of the two
+    happened from the header of the next packet that it hears, and only then repeats the slots since the last one. A packet shows
+    x or x − r, without noise. The errors' covariance is carried as a factor, so nothing cancels.
 
-    Unless acknowledgements are forged, the legitimate estimator always has the reference, because it acknowledged it.
+    A user whose acknowledgements are not forged always has the reference, because it acknowledged it: r has no error.
+
+    Source: docs/mathematics.md, acknowledged references.
     """
 
     def __init__(self, process: Process, trials: int) -> None:
         super().__init__(process, trials)
         self._code = ReferenceCode(process)
-        self._terms: list[Floats] = [process.Q[:, :, None]]
+        self._noise: list[Floats] = [np.zeros_like(process.Q), process.noise_factor]
+        self._negligible = _NEGLIGIBLE * float(np.abs(process.noise_factor).max())
 
     def prior(self, first: int = 0) -> Belief:
         """x̂ = 0, P = Σ, as the estimate of the slot before, or before slot 0 of slot 0 itself; no reference."""
         belief = super().prior(first)
-        none = np.full(self.trials, NONE, np.int64)
-        last = np.full(self.trials, max(0, first - 1), np.int64)
-        return belief._replace(memory=(belief.x_hat, belief.P, belief.x_hat, np.zeros_like(belief.P), last, none))
+        before = max(0, first - 1)
+        X = np.repeat(initial_factor(self.process, before)[:, :, None], self.trials, axis=2)
+        slots = (np.full(self.trials, value, np.int64) for value in (before, NONE, Content.STATE))
+        return belief._replace(memory=_Known(belief.x_hat, belief.x_hat, X, np.zeros_like(X), *slots))
 
     def act(self, k: int, gamma: Flags) -> Codes:
         """Not available: the action depends on the packet's header."""
         raise NotImplementedError("the action in a slot depends on the packet's header; γ alone does not tell it")
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if no packet is read; otherwise (z, 0), or z plus the knowledge of the reference.
+        """(A x̂, A P Aᵀ + Q) if no packet is read; otherwise (z, 0), or z plus what is known of the reference.
 
         A packet without a header has no reference: it is taken for the state.
         """
-        latest, spread, kept, kept_spread, last, named = self._carried(k, belief)
-        t = np.full(self.trials, NONE, np.int64) if heard.header is None else heard.header[0]
-        state = heard.gamma & (t == NONE)
-        old = heard.gamma & (t >= 0) & (t == named)
-        new = heard.gamma & ~old & (t >= last) & (t < k)
-        reference = np.where(old, kept, latest)
-        certainty = np.where(old, kept_spread, spread + self._diffused_since(k, last, t, new))
-        exact = trace_of(certainty) == 0.0
-        if self._code.decorrelates:
-            young = (t >= 0) & (k - np.where(new | old, t, 0) <= self._code.longest)
-            old, new = old & exact & young, new & exact & young
-        decoded = old | new
+        known = _Known(*belief.memory)
+        t, content = self._header(heard)
+        by = np.where(content == Content.OPEN_LOOP, content, Content.CODED)
+        named = heard.gamma & (t >= self._code.oldest(k)) & (t < k)
+        old = named & (t == known.t) & (by == known.by)
+        new = named & ~old & (t >= known.s)
+        state = heard.gamma & (content == Content.STATE)
+        followed = old | new
+        read = state | followed
+        x_hat = self.process.predict(belief.x_hat) if k else belief.x_hat.copy()
+        P = self.process.diffuse(self.process.carry(belief.P)) if k else belief.P.copy()
         action = np.where(heard.gamma, np.uint8(Action.DISCARDED), np.uint8(Action.LOST))
-        action[decoded] = Action.INNOVATION
-        action[state | (decoded & exact)] = Action.STATE
-        predicted = self.process.predict(belief.x_hat) if k else belief.x_hat
-        x_hat = np.where(state, heard.z, np.where(decoded, np.where(decoded, heard.z, 0.0) + reference, predicted))
-        unread = self.process.diffuse(self.process.carry(belief.P)) if k else belief.P
-        P = np.where(state, 0.0, np.where(decoded, certainty, unread))
-        read = state | decoded
-        memory = (
-            np.where(read, x_hat, latest),
-            np.where(read, P, spread),
-            np.where(new, reference, kept),
-            np.where(new, certainty, kept_spread),
-            np.where(read, k, last),
-            np.where(state, NONE, np.where(decoded, t, named)),
-        )
-        return Belief(x_hat, P, action, memory)
+        alone = np.flatnonzero(state & ~followed)
+        if len(alone):
+            known = known.replaced(alone, self._only_state(k, heard.z[:, alone]))
+        some = np.flatnonzero(followed)
+        if len(some):
+            before = known.taken(some)._replace(t=t[some], by=by[some])
+            after = self._filtered(k, before, new[some], state[some], heard.z[:, some])
+            known = known.replaced(some, after)
+        places = np.flatnonzero(read)
+        if len(places):
+            x_hat[:, places] = known.x[:, places]
+            P[:, :, places] = _squared(known.X[:, :, places])
+            exact = ~known.X[:, :, places].any(axis=(0, 1))
+            action[places] = np.where(exact, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
+        return Belief(x_hat, P, action, known)
 
-    def _carried(self, k: int, belief: Belief) -> tuple[Floats, Floats, Floats, Floats, Slots, Slots]:
-        """The memory, carried from slot k − 1 to k."""
-        latest, spread, kept, kept_spread, last, named = belief.memory
-        if k == 0:
-            return latest, spread, kept, kept_spread, last, named
-        if self._code.decorrelates:
-            # A reference too old to be named again is dropped before it overflows.
-            latest = np.where(k - last <= self._code.longest, latest, 0.0)
-            kept = np.where(k - named <= self._code.longest, kept, 0.0)
-        carry, widen = self._code.carry, self.process.carry
-        return carry(latest), widen(spread), carry(kept), widen(kept_spread), last, named
+    def informed(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """The belief after slot k once that slot's true state x (n, R) is known as well; the reference stays as it was.
 
-    def _diffused_since(self, k: int, last: Slots, t: Slots, where: Flags) -> Floats:
-        """Σ A^j Q A^jᵀ over k−t ≤ j < k−last, (n, n, R): process noise up to slot t, carried to k; 0 outside `where`."""
+        As a reference, x_k has the rounding of the sensor's arithmetic, which grows with every later reference made from it.
+        """
+        known = _Known(*belief.memory)
+        alone, some = np.flatnonzero(known.t == NONE), np.flatnonzero(known.t != NONE)
+        after = known.replaced(alone, self._only_state(k, x[:, alone]))
+        if len(some):
+            states = np.ones(len(some), np.bool_)
+            after = after.replaced(some, self._filtered(k, known.taken(some), ~states, states, x[:, some]))
+        X = np.zeros_like(after.X)
+        for i in range(len(x)):
+            X[i, i] = UNIT_ROUNDOFF * (np.abs(x[i]) + self._code.deviation(k)[i])
+        return Belief(x, np.zeros_like(belief.P), belief.action, after._replace(X=X))
+
+    def _header(self, heard: Reception) -> tuple[Slots, Slots]:
+        """The slot and the content that the header names; without a second number, a packet with a reference is coded."""
+        if heard.header is None:
+            return np.full(self.trials, NONE, np.int64), np.full(self.trials, Content.STATE, np.int64)
+        t, *more = heard.header
+        return t, more[0] if more else np.where(t == NONE, Content.STATE, Content.CODED)
+
+    def _only_state(self, k: int, z: Floats) -> _Known:
+        """The knowledge after a packet that contains the state and names no reference that can be followed."""
+        n, count = z.shape
+        nothing = np.zeros((n, n, count))
+        slots = (np.full(count, value, np.int64) for value in (k, NONE, Content.STATE))
+        return _Known(z, np.zeros_like(z), nothing, nothing, *slots)
+
+    def _filtered(self, k: int, known: _Known, new: Flags, state: Flags, z: Floats) -> _Known:
+        """The knowledge after a packet of slot k with the reference of slot `known.t`.
+
+        new: whether this reference is new, so that t ≥ s; state: whether the packet contains the state.
+        """
         n = self.process.n
-        total = np.zeros((n, n, self.trials))
-        if not np.any(where & (t > last)):
-            return total
-        nearest, farthest = k - np.where(where, t, k), np.where(where, k - last, 0)
-        for j in range(int(nearest[where].min()), int(farthest.max())):
-            while len(self._terms) <= j:
-                self._terms.append(self.process.carry(self._terms[-1]))
-            total += np.where(where & (nearest <= j) & (j < farthest), self._terms[j], 0.0)
-        return total
+        x, r, X, R, noise = self._repeated(k, known, new)
+        shown = np.where(state, x, x - r)
+        top = np.where(state, X, X - R)
+        joint = np.concatenate([np.concatenate([noise, top], axis=1), np.concatenate([0.0 * noise, R], axis=1)])
+        joint = np.where(np.abs(joint) < self._negligible, 0.0, joint)
+        factors = kernels.triangular_factors(joint.transpose(2, 0, 1).copy())
+        white = _solved(factors[:, :n, :n], z - shown)
+        r = r + product(factors[:, n:, :n].copy(), white.T[:, :, None].copy())[:, :, 0].T
+        D = factors[:, n:, n:].transpose(1, 2, 0)
+        # A coded packet shows x − r exactly, so that the errors of x and r are the same from here on.
+        return known._replace(
+            x=np.where(state, z, z + r), r=r, X=np.where(state, 0.0, D), D=D, s=np.full_like(known.s, k)
+        )
+
+    def _repeated(self, k: int, known: _Known, new: Flags) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """The slots after s up to k: x, r (n, R), the columns of their errors (n, m, R), and noise in x alone (n, n, R)."""
+        s, t = known.s, known.t
+        begun = new & (t == s)
+        x, r = known.x, np.where(begun, known.x, known.r)
+        X, R = known.X, np.where(begun, known.X, known.D)
+        later = new & (t > s)
+        if later.any():
+            # The noise between s and t is in both x and r.
+            X, R = (np.concatenate([part, np.zeros_like(known.X)], axis=1) for part in (X, R))
+        open_loop = known.by == Content.OPEN_LOOP
+        for j in range(int(s.min()) + 1, k + 1):
+            moved, carried = s < j, np.where(new, t < j, s < j)
+            x, X = (
+                np.where(moved, self._times(self.process.A, x), x),
+                np.where(moved, self._times(self.process.A, X), X),
+            )
+            r, R = (np.where(carried, self._carried(j, part, open_loop), part) for part in (r, R))
+            begins = later & (t == j)
+            if begins.any():
+                X[:, self.process.n :, begins] = self._noise_over((t - s)[begins])
+                r, R = np.where(begins, x, r), np.where(begins, X, R)
+        return x, r, X, R, self._noise_over(k - np.where(new, t, s))
+
+    def _carried(self, j: int, part: Floats, open_loop: Flags) -> Floats:
+        """References, or columns of their errors, carried from slot j − 1 to j."""
+        if not open_loop.any():
+            return self._times(self._code.at(j), part)
+        by_A = self._times(self.process.A, part)
+        return by_A if open_loop.all() else np.where(open_loop, by_A, self._times(self._code.at(j), part))
+
+    def _times(self, M: Floats, part: Floats) -> Floats:
+        """M times every column, (n, …, R)."""
+        return product(M, part.reshape(len(part), -1)).reshape(part.shape)
+
+    def _noise_over(self, slots: Slots) -> Floats:
+        """Factors of Σ_{l<m} A^l Q A^lᵀ, the noise of m slots, for each of the slots' numbers (R,): (n, n, R)."""
+        while len(self._noise) <= int(slots.max()):
+            grown = np.concatenate([product(self.process.A, self._noise[-1]), self.process.noise_factor], axis=1)
+            self._noise.append(kernels.triangular_factors(grown[None])[0])
+        return np.array([self._noise[m] for m in slots.tolist()]).transpose(1, 2, 0)
+
+
+def _solved(L: Floats, z: Floats) -> Floats:
+    """L⁻¹ z of many triangular matrices (R, n, n) and vectors (n, R); 0 where a row has no variance."""
+    y = np.zeros_like(z)
+    for i in range(len(z)):
+        rest = z[i]
+        for j in range(i):
+            rest = rest - L[:, i, j] * y[j]
+        pivot = L[:, i, i]
+        y[i] = np.where(pivot > 0.0, rest / np.where(pivot > 0.0, pivot, 1.0), 0.0)
+    return y
+
+
+def _squared(X: Floats) -> Floats:
+    """X Xᵀ of every trial, (n, n, R)."""
+    factors = X.transpose(2, 0, 1).copy()
+    squares: Floats = product(factors, factors.swapaxes(1, 2).copy()).transpose(1, 2, 0)
+    return squares

@@ -149,7 +149,7 @@ def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
         return Match(scheme, adversary, not_defined="there are no acknowledgements to attack")
     strategy = adversary if attack == "none" else SCHEMES[scheme].best_reader
     where, why = STRATEGIES[strategy].only_against or (scheme, "")
-    if scheme != where:
+    if scheme not in ((where,) if isinstance(where, str) else where):
         return Match(scheme, adversary, not_defined=why)
     table = _eavesdropper(scenario, scheme, strategy)
     parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}

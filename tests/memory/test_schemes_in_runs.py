@@ -25,6 +25,7 @@ from tests.builders import digests_of, part_of
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
+MIXED = [[1.2, 0.1], [0.0, 0.5]]
 LATE = {"quality": 0.8, "delay": {"model": "constant", "value": 1.0}, "duplicate": 0.1}
 JAM = {"from": 10, "to": 20, "jam": "acknowledgements"}
 PAUSE = {"from": 12, "to": 17, "pause": "legitimate"}
@@ -32,11 +33,12 @@ RUNS: dict[str, dict[str, Any]] = {
     "acknowledged": {"A": UNSTABLE, "attack": {"attack": "critical", "jammer": "ref"}, "event": [JAM]},
     "cipher": {"A": STABLE},
     "encrypted-schedule": {"A": STABLE, "threshold": 2, "attack": {"attack": "forge"}, "event": [PAUSE]},
+    "open-loop": {"A": MIXED, "attack": {"attack": "forge"}, "event": [JAM, PAUSE]},
     "scheduled": {"A": STABLE, "threshold": 3, "attack": {"attack": "all"}, "event": [JAM]},
     "twin-track": {"A": UNSTABLE, "reads_as": "tracker"},
     "withholding": {"A": STABLE, "state_probability": 0.5},
 }
-NEEDS = ("acknowledged", "encrypted-schedule", "scheduled")
+NEEDS = ("acknowledged", "encrypted-schedule", "open-loop", "scheduled")
 SILENT = ("scheduled", "withholding")
 
 
@@ -220,8 +222,11 @@ def test_whose_reference_is_kept_and_whose_is_lost() -> None:
     scenario = scenario_of("acknowledged", event=[], eavesdroppers=eavesdroppers)
     found = expectations_of(scenario)
     assert np.allclose(found["ref"].traces(30), found["legitimate"].traces(30), rtol=1e-9)
-    assert found["listener"].traces(30)[-1] > 100.0
-    assert (found["listener"].limit, found["listener"].infinite_variance) == (np.inf, True)
+    assert not found["listener"].known
+    floor = found["listener"].bound
+    assert floor is not None
+    assert floor.traces(30)[-1] > 100.0
+    assert (floor.limit, found["listener"].infinite_variance) == (np.inf, True)
     assert np.isfinite(found["ref"].limit)
     jammed_later = scenario_of("acknowledged", eavesdroppers=eavesdroppers)
     assert not expectations_of(jammed_later)["listener"].known

@@ -38,6 +38,7 @@ LEGITIMATE = {
     "encrypted-schedule": STATES,
     "twin-track": STATES,
     "acknowledged": STATES,
+    "open-loop": STATES,
     "scheduled": None,
 }
 

@@ -36,6 +36,7 @@ def test_the_built_in_classes_say_what_theory_knows() -> None:
     assert {name for name in SCHEMES if SCHEMES[name].closed_forms} == {
         "acknowledged",
         "encrypted-schedule",
+        "open-loop",
         "scheduled",
     }
     assert {name for name in SCHEMES if SCHEMES[name].error_floor is not Scheme.error_floor} == {"cipher", "twin-track"}
@@ -76,6 +77,7 @@ def test_the_bits_of_packets_and_secrets_are_counted() -> None:
         "cipher": (128, 128, 0),
         "encrypted-schedule": (192, 128, 0),
         "innovation": (128, 192, 0),
+        "open-loop": (256, 0, 0),
         "plain": (128, 0, 0),
         "scheduled": (128, 0, 0),
         "twin-track": (128, 64, 256),

@@ -41,7 +41,9 @@ def test_it_says_what_the_class_says() -> None:
     assert kind.streams(GIVEN) == ("noise",)
     assert kind.betrayed(GIVEN) == 4
     assert kind.follows_gamma(GIVEN) is False
-    assert stand_in(only_against=None).only_against is None
+    assert stand_in({**FACTS, "only_against": [["a", "b"], "why"]}).only_against == (("a", "b"), "why")
+    for nothing in (None, [["a", 3], "why"], [3, "why"], ["a", 3]):
+        assert stand_in({**FACTS, "only_against": nothing}).only_against is None
 
 
 @pytest.mark.parametrize(

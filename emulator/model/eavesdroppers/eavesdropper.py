@@ -39,8 +39,8 @@ class Eavesdropper(Receiver):
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     pools_links: ClassVar[bool] = False
     """Whether it has several links instead of one; it hears what any of them delivers."""
-    only_against: ClassVar[tuple[str, str] | None] = None
-    """The only scheme that `evedrop compare` sets it against, and what it would be against any other; None: all schemes."""
+    only_against: ClassVar[tuple[str | tuple[str, ...], str] | None] = None
+    """The only scheme, or schemes, that `evedrop compare` sets it against, and what it would be against any other; None: all."""
     inverts_noise: ClassVar[bool] = False
     """Whether it uses the inverse of Q, so that Q must not be singular."""
 

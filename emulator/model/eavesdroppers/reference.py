@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Reception
@@ -14,12 +12,15 @@ from evedrop.streams import Batch
 class Reference(PacketReader):
     """Follows the headers as the legitimate estimator does; it needs no knowledge, because the code has no secret.
 
-    Intended only for the scheme `acknowledged`, against which it is optimal for unstable A.
+    Intended only for the schemes `acknowledged` and `open-loop`, against which it is optimal.
 
     Source: docs/mathematics.md, acknowledged references.
     """
 
-    only_against = ("acknowledged", "follows references, and there are none: it is the same as naive here")
+    only_against = (
+        ("acknowledged", "open-loop"),
+        "follows references, and there are none: it is the same as naive here",
+    )
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
@@ -31,10 +32,7 @@ class Reference(PacketReader):
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """It can read every packet with a reference to slot k; its previous reference stays valid."""
-        _, _, kept, kept_spread, _, named = belief.memory
-        known = super().knowing(k, x, belief)
-        slot = np.full(self.trials, k, np.int64)
-        return known._replace(memory=(known.x_hat, known.P, kept, kept_spread, slot, named))
+        return self._reader.informed(k, x, belief)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Reads with the reference that the header names."""

@@ -50,11 +50,13 @@ class StandIns:
         return type(name.rpartition(":")[2], (base,), said)
 
 
-def _only_against(found: Any) -> tuple[str, str] | None:
-    """A scheme and a reason, if that is what the class says."""
-    if isinstance(found, list) and len(found) == 2 and all(isinstance(one, str) for one in found):
-        return found[0], found[1]
-    return None
+def _only_against(found: Any) -> tuple[str | tuple[str, ...], str] | None:
+    """A scheme, or several, and a reason, if that is what the class says."""
+    if not isinstance(found, list) or len(found) != 2 or not isinstance(found[1], str):
+        return None
+    if isinstance(found[0], list) and all(isinstance(one, str) for one in found[0]):
+        return tuple(found[0]), found[1]
+    return (found[0], found[1]) if isinstance(found[0], str) else None
 
 
 def _wrong(what: str, found: Any, expected: str) -> NoAnswer:

@@ -7,45 +7,50 @@ from types import MappingProxyType
 
 import numpy as np
 
-from evedrop.model.process import Floats, Process
+from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Flags, Receiver
-from evedrop.model.reference import NONE, ReferenceCode, ReferenceReceiver
+from evedrop.model.reference import ReferenceReceiver
+from evedrop.model.reference_code import NONE, ReferenceCode
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch
 
 
 class AcknowledgedEncoder(Encoder):
-    """z_k = x_k − L^{k−t} x_t, with t the last acknowledged slot; x_k itself before the first acknowledgement."""
+    """z_k = x_k − L_{t,k} x_t, with t the last acknowledged slot; x_k itself before the first acknowledgement."""
 
-    def __init__(self, process: Process, trials: int) -> None:
-        self._code = ReferenceCode(process)
-        self._reference = np.zeros((process.n, trials))
+    def __init__(self, code: ReferenceCode, n: int, trials: int) -> None:
+        self._code = code
+        self._reference = np.zeros((n, trials))
         self._slot = np.full(trials, NONE, np.int64)
         self._k = NONE
-        self._x: Floats
+        self._read: Floats
 
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - references say more
         """The packet of slot k, which must follow the slot before."""
-        self._slot = np.where(k - self._slot <= self._code.longest, self._slot, NONE)
-        self._reference = self._code.carry(np.where(self._slot == NONE, 0.0, self._reference))
-        self._k, self._x = k, x.copy()
+        if k:
+            self._slot = np.where(self._slot >= self._code.oldest(k), self._slot, NONE)
+            self._reference = product(self._code.at(k), np.where(self._slot == NONE, 0.0, self._reference))
         # Where there is no reference, 0 is subtracted: x − 0 is x.
-        return Packet(x - self._reference, np.zeros(x.shape[1], np.bool_), self._slot[None].copy())
+        z = x - self._reference
+        # The state as the user reads it, to the last bit: the rounding of x would grow with each reference made from another.
+        self._k, self._read = k, z + self._reference
+        return Packet(z, np.zeros(x.shape[1], np.bool_), self._slot[None].copy())
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
         """Make x_k the reference where slot k is acknowledged. Raises ValueError if k is not the slot just sent."""
         if k != self._k:
             raise ValueError(f"acknowledgements of slot {k} after slot {self._k} was sent; expected those of that slot")
-        self._reference = np.where(acknowledged, self._x, self._reference)
+        self._reference = np.where(acknowledged, self._read, self._reference)
         self._slot = np.where(acknowledged, k, self._slot)
 
 
 class Acknowledged(Scheme):
     """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
 
-    There is no secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme
-    therefore depends on acknowledgements that are neither blocked nor forged.
+    The reference is carried so that a packet is independent of the state it is sent for, unless A is singular. There is no
+    secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme therefore
+    depends on acknowledgements that are neither blocked nor forged.
 
     Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
     """
@@ -61,7 +66,7 @@ class Acknowledged(Scheme):
         return NoInnovations(
             self.process,
             batch.trials,
-            lambda: AcknowledgedEncoder(self.process, batch.trials),
+            lambda: AcknowledgedEncoder(ReferenceCode(self.process), self.process.n, batch.trials),
             lambda: self.estimator(keys, batch),
         )
 

@@ -1,0 +1,61 @@
+"""State-secrecy code with L = A, for comparison: an eavesdropper that lost the reference learns the stable modes again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import final
+
+import numpy as np
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Receiver
+from evedrop.model.reference import Content, ReferenceReceiver
+from evedrop.model.reference_code import NONE, ReferenceCode
+from evedrop.model.schemes.acknowledged import AcknowledgedEncoder
+from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.streams import Batch
+
+
+@final
+class OpenLoopEncoder(AcknowledgedEncoder):
+    """z_k = x_k − A^{k−t} x_t, with t the last acknowledged slot; x_k itself before the first acknowledgement."""
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
+        """The packet of slot k, which must follow the slot before."""
+        packet = super().encode(k, x, predicted)
+        assert packet.header is not None  # noqa: S101 - it is the base class's packet
+        content = np.where(packet.header == NONE, Content.STATE, Content.OPEN_LOOP)
+        return packet._replace(header=np.concatenate([packet.header, content]))
+
+
+class OpenLoop(Scheme):
+    """Subtracts a reference that the user has, carried by A; an eavesdropper that missed it follows the stable modes later.
+
+    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
+    """
+
+    best_reader = "reference"
+    closed_forms = MappingProxyType({"legitimate": "open-loop", "reference": "open-loop"})
+    needs_acknowledgements = True
+    reads_packets = True
+    header = ("slot t of the reference; −1: there is none", "0: z is the state; 2: z is the state minus A^{k−t} x_t")
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The references; nothing is secret."""
+        code = ReferenceCode(self.process, open_loop=True)
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: OpenLoopEncoder(code, self.process.n, batch.trials),
+            lambda: self.estimator(keys, batch),
+        )
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
+        """A receiver that keeps the references it may have acknowledged."""
+        return ReferenceReceiver(self.process, batch.trials)
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet, whichever acknowledgements arrive."""
+        return Outcomes.plain(mu)
