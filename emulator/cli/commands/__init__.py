@@ -26,6 +26,7 @@ MODULES: Mapping[str, str] = {
     "sweep": "sweep",
     "compare": "compare",
     "design": "design",
+    "cost": "cost",
     "figures": "figures",
     "view": "view",
     "diff": "diff",

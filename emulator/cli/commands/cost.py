@@ -1,0 +1,67 @@
+"""`evedrop cost`: the energy that secrecy costs a house."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from evedrop.cli.options import as_json, entries, loaded, scenario
+from evedrop.command import Command
+
+if TYPE_CHECKING:
+    from evedrop.studies.secrecy_cost import MeanEstimate, SecrecyCost
+
+
+def cost(options: argparse.Namespace) -> int:
+    """Compare a house's scheme with `plain`, day by day."""
+    from evedrop.cli.report import ProgressLine
+    from evedrop.memory.montecarlo import teller
+    from evedrop.studies.secrecy_cost import secrecy_cost
+
+    options.trials = 100 if options.trials is None else options.trials
+    scenario = loaded(options)
+    total = scenario.trials * scenario.slots
+    with ProgressLine(total, "trial-slots", options.json) as line:
+        found = secrecy_cost(scenario, teller(line.tell, total))
+    if options.json:
+        print(json.dumps(asdict(found)))
+    else:
+        _print(found)
+    return 0
+
+
+def _print(found: SecrecyCost) -> None:
+    """Print the table."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from evedrop.cli.report import terminal
+
+    names = {"scheme": found.scheme, "plain": "plain", "truth": "the truth"}
+    table = Table(box=SIMPLE_HEAD)
+    table.add_column("")
+    for heading in ("mean", "standard error", "95 % interval"):
+        table.add_column(heading, justify="right")
+    for name, one in found.more_than_plain.items():
+        table.add_row(f"{name.replace('_', ' ')}: {found.scheme} less plain", *_cells(one, 1.0, " Wh"))
+    for pair, measures in found.differences.items():
+        ours, _, theirs = pair.partition("_from_")
+        for measure, one in measures.items():
+            table.add_row(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(one, 100.0, " %"))
+    console = terminal()
+    console.print(
+        f"{found.trials} days, each with {found.scheme} and with plain, over the same link and with the same noise"
+    )
+    console.print(table)
+
+
+def _cells(one: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
+    mean, error, low, high = (f"{scale * value:.3g}" for value in (one.mean, one.standard_error, one.low, one.high))
+    return f"{mean}{unit}", f"{float(error):.2g}", f"{low} to {high}{unit}"
+
+
+COMMANDS = (
+    Command("cost", cost, "the energy that secrecy costs a house, against plain", (scenario, entries, as_json)),
+)

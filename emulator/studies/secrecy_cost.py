@@ -1,0 +1,128 @@
+"""The energy that secrecy costs a house: its scheme against `plain`, over the same link, on the same days.
+
+A trial is run with the scenario's scheme and with `plain`, with the same noise of the plant and the same losses, and each
+time beside a controller that sees the truth. Every figure is made from differences within a trial, so its standard error is
+that of the mean of the trials' differences.
+
+Source: docs/microgrid.md, what does secrecy cost in energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from evedrop.applications.microgrid.energy import Meter, energy
+from evedrop.applications.microgrid.household_tally import HouseholdTable, PerfectLoop
+from evedrop.errors import UsageError
+from evedrop.loading import checked
+from evedrop.memory.simulation import Simulation
+from evedrop.model.process import Floats
+from evedrop.scenario import Scenario
+from evedrop.scenario.controlled import controlled_plant
+
+_SIDE_BY_SIDE = 50  # trials
+MEASURES = ("net", "total", "summed")
+"""The fields of `EnergyDifference`."""
+
+
+@dataclass(frozen=True)
+class MeanEstimate:
+    """The mean over trials of a figure."""
+
+    mean: float
+    standard_error: float
+    low: float
+    """The 95 % interval of the mean, by Student's t, is from here to `high`."""
+    high: float
+
+    @classmethod
+    def of_trials(cls, trials: Floats) -> MeanEstimate:
+        """From the figure of each trial, (R,), R ≥ 2."""
+        from scipy.special import stdtrit  # noqa: PLC0415 - 0.2 s that only this needs
+
+        mean, error = float(np.mean(trials)), float(np.std(trials, ddof=1)) / len(trials) ** 0.5
+        reach = float(stdtrit(len(trials) - 1, 0.975)) * error
+        return cls(mean, error, mean - reach, mean + reach)
+
+
+@dataclass(frozen=True)
+class SecrecyCost:
+    """What a scheme costs a house."""
+
+    scheme: str
+    trials: int
+    more_than_plain: Mapping[str, MeanEstimate]
+    """`net_energy` and `total_energy`: the house's with the scheme less that with `plain`, in Wh."""
+    differences: Mapping[str, Mapping[str, MeanEstimate]]
+    """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a share."""
+
+
+def secrecy_cost(scenario: Scenario, tell: Callable[[int], None]) -> SecrecyCost:
+    """Compare a scenario's scheme with `plain`; tell gets the trial-slots done since its last call.
+
+    Raises UsageError for a scenario without a household, or with fewer than two trials.
+    """
+    loop = controlled_plant(scenario)
+    if "household" not in scenario.applications or loop is None:
+        raise UsageError(f"{scenario.title}: there is no household with a controller; try the scenario microgrid")
+    if scenario.trials < 2:
+        raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
+    end = scenario.first_trial + scenario.trials
+    bounds = [*range(scenario.first_trial, end, _SIDE_BY_SIDE), end]
+    parts = [_meters_of(scenario, range(*pair), tell) for pair in pairwise(bounds)]
+    plain, truth, plain_truth = (Meter.of_all(list(meters)) for meters in zip(*parts, strict=True))
+    more = {
+        "net_energy": plain.bought - plain.sold - (plain.other_bought - plain.other_sold),
+        "total_energy": plain.bought + plain.sold - (plain.other_bought + plain.other_sold),
+    }
+    pairs = {"scheme_from_plain": plain, "scheme_from_truth": truth, "plain_from_truth": plain_truth}
+    return SecrecyCost(
+        scenario.encoding.scheme,
+        scenario.trials,
+        {name: MeanEstimate.of_trials(1000.0 * energy(power, loop.slot_seconds)) for name, power in more.items()},
+        {
+            name: {measure: MeanEstimate.of_trials(getattr(meter.difference, measure)) for measure in MEASURES}
+            for name, meter in pairs.items()
+        },
+    )
+
+
+def _meters_of(scenario: Scenario, trials: range, tell: Callable[[int], None]) -> tuple[Meter, Meter, Meter]:
+    """For some trials, the grid power of scheme and plain, of scheme and truth, and of plain and truth."""
+    found = [Meter.zero(len(trials)) for _ in range(3)]
+    tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
+    alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
+    ours, plain = (
+        _grid_powers(checked(one, scenario.title), trials)
+        for one in (alone, {**alone, "encoding": {"scheme": "plain"}})
+    )
+    for (power, truth), (other, other_truth) in zip(ours, plain, strict=True):
+        pairs = ((power, other), (power, truth), (other, other_truth))
+        found = [meter.then(*pair) for meter, pair in zip(found, pairs, strict=True)]
+        tell(power.size)
+    return found[0], found[1], found[2]
+
+
+def _grid_powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:
+    """The house's grid power, and that of a controller that sees the truth, in kW, (c, R) each, some slots at a time."""
+    loop, table = controlled_plant(scenario), scenario.applications["household"]
+    assert loop is not None  # noqa: S101 - there is a controller
+    assert isinstance(table, HouseholdTable)  # noqa: S101 - by its name
+    grid, plant = loop.input(table.grid), loop.plant
+    perfect = PerfectLoop(
+        loop.process, plant, loop.strategy(loop.assignment, len(trials)), loop.period, loop.disturbances
+    )
+    for chunk in Simulation(scenario, trials).chunks():
+        slots = chunk.slots
+        assert slots is not None  # noqa: S101 - there are states in this mode
+        assert slots.inputs is not None  # noqa: S101 - there is a controller
+        states = slots.x if slots.true is None else slots.true
+        power, seen = np.empty(slots.inputs.failed.shape), np.empty(slots.inputs.failed.shape)
+        for row, (x, u) in enumerate(zip(states, slots.inputs.u, strict=True)):
+            power[row], seen[row] = plant.limited(u)[grid], perfect.follow(x, u)[grid]
+        yield power, seen

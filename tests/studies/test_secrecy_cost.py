@@ -1,0 +1,111 @@
+"""What secrecy costs a house: pairs of days, by hand and by the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_rel
+
+from evedrop.api import montecarlo
+from evedrop.loading import load
+from evedrop.memory.montecarlo import Plan
+from evedrop.model.process import Floats
+from evedrop.studies.secrecy_cost import MeanEstimate, secrecy_cost
+from tests.conftest import Evedrop
+
+SLOTS, TRIALS = 700, 4
+OTHERS: dict[str, Any] = {"eavesdroppers": {}, "expect": []}
+
+
+def grid_powers(folder: Path, **changes: Any) -> Floats:
+    """The grid power of every slot and trial of a study of its own, (slots, trials), by what the plant does."""
+    options = {"slots": SLOTS, "trials": TRIALS, "record_trials": TRIALS, "first_trial": 2, **OTHERS, **changes}
+    results = montecarlo("microgrid", out=folder, plan=Plan(workers=1), **options)
+    assert results.inputs is not None
+    table = results.inputs.to_pydict()
+    found = np.empty((SLOTS, TRIALS))
+    for slot, trial, u in zip(table["slot"], table["trial"], table["u"], strict=True):
+        found[slot, trial - 2] = np.clip(u[1], -3.0, 3.0)
+    return found
+
+
+def test_figures_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
+    """From three studies of the same trials: with the scheme, with plain, and with a controller that sees the truth."""
+    ours = grid_powers(tmp_path / "ours")
+    plain = grid_powers(tmp_path / "plain", encoding={"scheme": "plain"})
+    truth = grid_powers(tmp_path / "truth", controller__acts_on="truth")
+    found = secrecy_cost(load("microgrid", {"slots": SLOTS, "trials": TRIALS, "first_trial": 2}), lambda _: None)
+    more = found.more_than_plain["net_energy"]
+    differences = (ours - plain).sum(axis=0) / 3.6
+    assert more.mean == pytest.approx(differences.mean(), rel=1e-6)
+    interval = ttest_rel(ours.sum(axis=0) / 3.6, plain.sum(axis=0) / 3.6).confidence_interval()
+    assert [more.low, more.high] == pytest.approx([interval.low, interval.high], rel=1e-6)
+    for name, one, other in (
+        ("scheme_from_plain", ours, plain),
+        ("scheme_from_truth", ours, truth),
+        ("plain_from_truth", plain, truth),
+    ):
+        summed = np.abs(one - other).sum(axis=0) / np.abs(other).sum(axis=0)
+        figure = found.differences[name]["summed"]
+        assert figure.mean == pytest.approx(summed.mean(), rel=1e-9)
+        assert figure.standard_error == pytest.approx(summed.std(ddof=1) / 2.0, rel=1e-6)
+        totals = np.abs(one).sum(axis=0), np.abs(other).sum(axis=0)
+        total = np.abs(totals[0] - totals[1]) / totals[1]
+        assert found.differences[name]["total"].mean == pytest.approx(total.mean(), rel=1e-6)
+
+
+def test_sets_of_trials_side_by_side_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same bits with two trials at a time."""
+    scenario = load("microgrid", {"slots": 130, "trials": 5})
+    whole = secrecy_cost(scenario, lambda _: None)
+    monkeypatch.setattr("evedrop.studies.secrecy_cost._SIDE_BY_SIDE", 2)
+    done: list[int] = []
+    assert secrecy_cost(scenario, done.append) == whole
+    assert sum(done) == 130 * 5
+
+
+def test_a_controller_that_sees_the_truth_pays_nothing() -> None:
+    """Its inputs do not depend on packets, so that all differences are 0 in every trial."""
+    found = secrecy_cost(load("microgrid", {"slots": 130, "trials": 2, "controller.acts_on": "truth"}), lambda _: None)
+    nothing = MeanEstimate(0.0, 0.0, 0.0, 0.0)
+    assert set(found.more_than_plain.values()) == {nothing}
+    assert {one for measures in found.differences.values() for one in measures.values()} == {nothing}
+
+
+@pytest.mark.long
+def test_a_days_cost_is_that_of_the_document() -> None:
+    """Twenty whole days at μ_d = 0.1, within five standard errors of the table of docs/microgrid.md, made from a hundred."""
+    found = secrecy_cost(load("microgrid", {"trials": 20}), lambda _: None)
+    documented = {"net": 1.13e-5, "total": 2.00e-4, "summed": 8.59e-3}
+    for measure, one in found.differences["scheme_from_plain"].items():
+        assert one.mean == pytest.approx(documented[measure], abs=5.0 * one.standard_error), measure
+    more = found.more_than_plain
+    assert more["net_energy"].mean == pytest.approx(0.0924, abs=5.0 * more["net_energy"].standard_error)
+    assert more["total_energy"].mean == pytest.approx(4.62, abs=5.0 * more["total_energy"].standard_error)
+    assert more["total_energy"].low > 0.0
+
+
+def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
+    """The same figures in both, and one line for a scenario or a number of trials that cannot be used."""
+    command = ("cost", "microgrid", "--trials", "2", "--slots", "200")
+    shown, entry = evedrop(*command), evedrop(*command, "--json")
+    assert (shown.status, entry.status) == (0, 0)
+    found = json.loads(entry.out)
+    assert (found["scheme"], found["trials"]) == ("innovation", 2)
+    mean = found["more_than_plain"]["net_energy"]["mean"]
+    (line,) = (line for line in shown.out.splitlines() if "net energy: innovation less plain" in line)
+    assert f" {mean:.3g} Wh" in line
+    share = found["differences"]["scheme_from_plain"]["summed"]["mean"]
+    (line,) = (line for line in shown.out.splitlines() if "summed: innovation from plain" in line)
+    assert f" {100.0 * share:.3g} %" in line
+    for words, said in (
+        (("cost", "vehicle"), "there is no household with a controller"),
+        (("cost", "microgrid", "--trials", "1"), "--trials 1: expected 2 or more"),
+    ):
+        refused = evedrop(*words)
+        assert refused.status == 2
+        assert said in refused.err
