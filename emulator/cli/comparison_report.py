@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from evedrop.cli.report import estimate, terminal
+from evedrop.cli.report import terminal
+from evedrop.figures.text import estimate, figure_text
 from evedrop.score.verdict import MARKS, SecrecyKept
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def _pairs(found: Comparison) -> Table:
                 adversary if cell.match.attack == "none" else f"{adversary} ({cell.match.strategy})",
                 simulated(cell.eavesdropper),
                 theory(cell.eavesdropper),
-                "–" if cell.eavesdropper.z is None else f"{cell.eavesdropper.z:+.1f}",
+                figure_text(cell.eavesdropper.z, "+.1f"),
                 simulated(cell.legitimate),
                 theory(cell.legitimate),
                 estimate(cell.ratio, cell.ratio_error, ".3g"),

@@ -25,6 +25,7 @@ from rich.progress import (
 from rich.table import Table
 
 from evedrop.figures import all_figures, columns, error_column, shown_figure, unloadable_figures, z_column
+from evedrop.figures.text import estimate, figure_text
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
@@ -39,7 +40,6 @@ _DIGEST_WIDTH = (
     100  # the least width of a terminal, in columns, to show digests, and the standard error of every figure
 )
 _LARGE_COUNT = 1e7
-_SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE = 0.01, 1e5, -4  # beyond them estimates have exponents
 
 
 class _Unfailing:
@@ -176,7 +176,7 @@ def closing_table(summary: Summary, width: int) -> Table:
                 )
                 for column, names in shown.items()
             ),
-            *([_figure(shown_figure(peer.z, list(compared)), "+.1f")] if compared else []),
+            *([figure_text(shown_figure(peer.z, list(compared)), "+.1f")] if compared else []),
             *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
@@ -262,7 +262,7 @@ def _expectation_lines(summary: Summary) -> Iterator[str]:
 def _loop_line(controller: ControllerSummary) -> str:
     """The line about a closed loop."""
     errors = ", ".join(
-        f"{_figure(error)} {name.replace('_', ' the ')}" for name, error in controller.mean_squared_errors.items()
+        f"{figure_text(error)} {name.replace('_', ' the ')}" for name, error in controller.mean_squared_errors.items()
     )
     line = f"controller {controller.strategy}, {controller.decisions:,} decisions; the estimator's error is {errors}"
     if controller.failed_fraction:
@@ -287,7 +287,7 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
                 estimate(shown_figure(row, names), shown_figure(row, list(map(error_column, names))), column.format)
                 for column, names in figures.items()
             ),
-            _figure(shown_figure(row, compared), "+.1f"),
+            figure_text(shown_figure(row, compared), "+.1f"),
             row["relative_secrecy"] or "–",
         )
     console = terminal()
@@ -347,29 +347,6 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
     """The interval of perfect secrecy; closed at its upper end, unless that is 1 and the error is bounded there."""
     low, high = interval
     return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
-
-
-def _figure(value: float | None, how: str = ".4g") -> str:
-    """A figure of the summary as text; a dash for None."""
-    return "–" if value is None else format(value, how)
-
-
-def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
-    """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error."""
-    if value is None or not error or not math.isfinite(value):
-        return _figure(value, how)
-    place = math.floor(math.log10(float(f"{error:.0e}")))
-    if abs(value) < _LARGE_NUMBER and (place >= _LEAST_PLACE or abs(value) >= _SMALL_NUMBER):
-        places = max(0, -place)
-        return f"{value:.{places}f} ± {error:.{places}f}"
-    digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
-    return f"{_scientific(value, digits)} ± {_scientific(error, 0)}"
-
-
-def _scientific(value: float, digits: int) -> str:
-    """A number with this many decimal digits and a short exponent: 2.3e-4."""
-    mantissa, exponent = f"{value:.{digits}e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
 
 
 def _number(value: float) -> str:

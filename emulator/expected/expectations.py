@@ -66,6 +66,8 @@ class Expectation:
     """The closed form of a receiver whose slots differ."""
     closed_bound: Closed | None = None
     """A lower bound for such a receiver, in place of a closed form."""
+    of_model: bool = False
+    """Whether the process is only the model of a plant: then it is not the errors of a run that theory expects."""
 
     @property
     def known(self) -> bool:
@@ -167,6 +169,7 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
             bound_of(scenario, name),
             None if bound else closed,
             closed if bound else None,
+            scenario.plant is not None,
         )
     return found
 

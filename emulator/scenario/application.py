@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from evedrop.errors import NotRegistered
+from evedrop.figures import error_column
+from evedrop.figures.standard_error import standard_error
+from evedrop.figures.text import estimate
 from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
@@ -28,7 +31,7 @@ Summary = Mapping[str, Any]
 """An application's entry of the summary: its figures by name, and under `receivers` those of each receiver."""
 Kind = Literal["inputs", "disturbances", "states"]
 """A kind of quantity that has names."""
-RECEIVERS = "receivers"
+RECEIVERS, STANDARD_ERRORS = "receivers", "standard_errors"
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,24 @@ class ApplicationTally(ABC):
     @abstractmethod
     def summary(self) -> Summary:
         """The summary's entry: every figure, a number or None; under `receivers`, each receiver's figures by its name."""
+
+    @property
+    def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
+        """The place of a figure in the summary's entry → what it is the mean of, for every trial, (R,); by default none.
+
+        These figures have standard errors, at the same places of `standard_errors` in the entry.
+        """
+        return {}
+
+    def entry(self) -> Summary:
+        """The summary's entry, with the standard errors of its figures if there are any."""
+        errors: dict[str, Any] = {}
+        for (*outer, name), values in self.of_trials.items():
+            inner = errors
+            for part in outer:
+                inner = inner.setdefault(part, {})
+            inner[name] = standard_error(values)
+        return {**self.summary(), **({STANDARD_ERRORS: errors} if errors else {})}
 
 
 @dataclass(frozen=True)
@@ -191,15 +212,34 @@ class Application(ABC):
     def figure(cls, summary: Summary, path: Sequence[str]) -> float | None:
         """A figure by its path, as in an expectation but without the application's name: FIGURE, or RECEIVER and FIGURE."""
         inner: Any = summary
-        for part in (RECEIVERS, *path) if len(path) > 1 else path:
+        for part in _place(path):
             inner = inner[part]
         return None if inner is None else float(inner)
 
     @classmethod
+    def standard_error(cls, summary: Summary, path: Sequence[str]) -> float | None:
+        """The standard error of a figure by its path, as above; None if it has none."""
+        inner: Any = summary.get(STANDARD_ERRORS, {})
+        for part in _place(path):
+            inner = {} if inner is None else inner.get(part)
+        return None if inner is None else float(inner)
+
+    @classmethod
+    def text(cls, summary: Summary, path: Sequence[str], how: str = ".4g") -> str:
+        """A figure by its path, as above, with its standard error: 0.0123 ± 0.0004; how: its format without one."""
+        return estimate(cls.figure(summary, path), cls.standard_error(summary, path), how)
+
+    @classmethod
     def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:
         """Its columns in a receiver's row of a sweep's table: column → value."""
-        own = {name: cls.figure(summary, (name,)) for name in cls.figures}
-        return own | {name: cls.figure(summary, (receiver, name)) for name in cls.receiver_figures}
+        paths = {name: [name] for name in cls.figures} | {name: [receiver, name] for name in cls.receiver_figures}
+        found = {name: cls.figure(summary, path) for name, path in paths.items()}
+        return found | {error_column(name): cls.standard_error(summary, path) for name, path in paths.items()}
+
+
+def _place(path: Sequence[str]) -> Sequence[str]:
+    """The place of a figure in its application's entry of the summary."""
+    return (RECEIVERS, *path) if len(path) > 1 else path
 
 
 APPLICATIONS: Registry[Application] = Registry(

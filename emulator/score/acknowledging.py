@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.figures.standard_error import standard_error
 from evedrop.model.acknowledgements import WayBackSpec, rates_of
 from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.receiver import Flags
@@ -77,10 +78,12 @@ class Detection:
         start = None if spec.attack == "none" else 0 if spec.spans is None else min(s for s, _ in spec.spans)
         raised = self.first >= 0
         true = raised & (self.first >= start) if start is not None else np.zeros_like(raised)
+        delays = None if start is None else (self.first[true] - start + 1).astype(np.float64)
         return DetectionSummary(
             attack_from=start,
             alarms=int(np.count_nonzero(raised)),
             false_alarms=int(np.count_nonzero(raised & ~true)),
             mean_delay=float((self.first[true] - start + 1).mean()) if true.any() and start is not None else None,
             first_alarm=int(self.first[raised].min()) if raised.any() else None,
+            standard_errors={"mean_delay": standard_error(delays)},
         )

@@ -12,6 +12,7 @@ from typing import final
 
 import numpy as np
 
+from evedrop.figures.standard_error import standard_error
 from evedrop.model.input_aware import Offset
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
@@ -21,7 +22,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS, ApplicationTally
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.score.slots import InputSlots
-from evedrop.score.summary import ControllerSummary, PeerSummary
+from evedrop.score.summary import ControllerSummary, PeerSummary, StandardErrors
 
 ESTIMATORS = ("ignoring_input", "knowing_input")
 
@@ -92,6 +93,8 @@ class LoopTally:
         """Trial-slots in which the plant clipped an input."""
         self.other_error = 0.0
         """Sum of squared errors of the estimator that is not in the loop."""
+        self.of_trials: Floats = np.zeros((4, trials))
+        """The slots of each trial, and its shares of the three totals above, in their order."""
         self.applications: dict[str, ApplicationTally] = {}
         """Application → its totals, for those that the scenario uses."""
 
@@ -115,7 +118,10 @@ class LoopTally:
             application.add(acted.true, inputs.u, acted.estimates)
         self.trial_slots += inputs.failed.size
         self.failed += int(np.count_nonzero(inputs.failed))
-        self.clipped += int(np.count_nonzero(self._plant.clips(inputs.u)))
+        clipped = self._plant.clips(inputs.u)
+        self.clipped += int(np.count_nonzero(clipped))
+        self.of_trials[0] += len(clipped)
+        self.of_trials[1:3] += np.count_nonzero(inputs.failed, axis=0), np.count_nonzero(clipped, axis=0)
         if self._offset is None:
             return
         error = acted.x - acted.estimates[LEGITIMATE]
@@ -123,6 +129,7 @@ class LoopTally:
             error[row] -= self._sign * self._offset.next(action, u)
         error *= error
         self.other_error += float(error.sum(axis=(1, 2)).sum())
+        self.of_trials[3] += error.sum(axis=(0, 1))
 
     @classmethod
     def merged(cls, parts: Sequence[LoopTally | None]) -> LoopTally | None:
@@ -136,6 +143,7 @@ class LoopTally:
             whole.failed += part.failed
             whole.clipped += part.clipped
             whole.other_error += part.other_error
+        whole.of_trials = np.concatenate([part.of_trials for part in known], axis=1)
         whole.applications = {
             name: type(one).merged([part.applications[name] for part in known])
             for name, one in known[0].applications.items()
@@ -165,4 +173,18 @@ class LoopTally:
             mean_squared_errors=dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
             mean_trace_covariance=user.figure("mean_trace_covariance"),
             digest=digest,
+            standard_errors=self._standard_errors(user, knows),
         )
+
+    def _standard_errors(self, user: PeerSummary, knows: bool) -> StandardErrors:
+        """The standard errors of the figures; user: the summary's entry on the legitimate estimator."""
+        slots, *totals = self.of_trials
+        alike = bool(slots.all()) and bool((slots == slots[0]).all())
+        failed, clipped, other = (standard_error(total / slots) if alike else None for total in totals)
+        errors = [user.standard_errors.get("mean_squared_error"), other if self._offset else None]
+        return {
+            "failed_fraction": failed,
+            "clipped_fraction": clipped,
+            "mean_squared_errors": dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
+            "mean_trace_covariance": user.standard_errors.get("mean_trace_covariance"),
+        }

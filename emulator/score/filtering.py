@@ -11,6 +11,7 @@ from typing import final
 
 import numpy as np
 
+from evedrop.figures.standard_error import standard_error, z_of
 from evedrop.model.local_filter import LocalFilter, Steps
 from evedrop.model.process import Floats
 from evedrop.names import SENSOR
@@ -43,6 +44,8 @@ class FilterTally:
         self.slots = 0
         self.sums: dict[str, float] = {}
         """Sensor or receiver → sum of squared errors."""
+        self.of_trials: dict[str, Floats] = {}
+        """The same for each trial, (R,)."""
 
     @classmethod
     def of(cls, scenario: Scenario) -> FilterTally | None:
@@ -56,6 +59,7 @@ class FilterTally:
         self.count += errors[SENSOR].size
         for name, error in errors.items():
             self.sums[name] = self.sums.get(name, 0.0) + float(error.sum(axis=1).sum())
+            self.of_trials[name] = self.of_trials.get(name, 0.0) + error.sum(axis=0)
 
     @classmethod
     def merged(cls, parts: Sequence[FilterTally | None]) -> FilterTally | None:
@@ -70,6 +74,9 @@ class FilterTally:
             whole.count += part.count
             for name, value in part.sums.items():
                 whole.sums[name] = whole.sums.get(name, 0.0) + value
+        whole.of_trials = {
+            name: np.concatenate([part.of_trials[name] for part in known]) for name in known[0].of_trials
+        }
         return whole
 
     def summary(self, scenario: Scenario) -> FilterSummary:
@@ -85,4 +92,9 @@ class FilterTally:
         mean = (sum(traces) + (self.slots - len(traces)) * last) / max(1, self.slots)
         errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
         own = errors.pop(SENSOR, None)
-        return FilterSummary(mean if self.slots else None, own, errors)
+        mean_trace = mean if self.slots else None
+        alike = all(self.slots * len(one) == self.count for one in self.of_trials.values())
+        spread = {name: standard_error(one / self.slots) if alike else None for name, one in self.of_trials.items()}
+        error = spread.pop(SENSOR, None)
+        of_mean = {"mean_squared_error": error, "mean_true_squared_errors": spread}
+        return FilterSummary(mean_trace, own, errors, of_mean, z_of(own, mean_trace, error))

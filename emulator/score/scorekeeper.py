@@ -14,7 +14,7 @@ import numpy as np
 
 from evedrop.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
 from evedrop.figures import figures_of
-from evedrop.figures.figure import ScoredSlots
+from evedrop.figures.figure import COVARIANCE_ONLY, ScoredSlots
 from evedrop.figures.standard_error import z_of
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
@@ -138,7 +138,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
-    applications = {} if loop is None else {name: one.summary() for name, one in loop.applications.items()}
+    applications = {} if loop is None else {name: one.entry() for name, one in loop.applications.items()}
     user = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
@@ -187,13 +187,13 @@ def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mo
         if one.rests_on != "theory":
             meaningless = found is None or (one.of_error and infinite_variance)
             errors[figure] = None if meaningless else tally.standard_error(figure)
-    known = {**figures, **of_mode}
+    known, comparable = {**figures, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
     z = {
-        figure: z_of(known[figure], known[one.expected], errors[figure])
+        figure: z_of(known[figure], known[one.expected], errors[figure]) if comparable else None
         for figure, one in figures_of(name).items()
         if one.expected is not None and figure in errors
     }
-    rare = rare_events_of(expected, tally)
+    rare = rare_events_of(expected, tally) if comparable else None
     return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
 
 

@@ -25,6 +25,8 @@ Found = float | int | str | None
 """The value found for an expectation. None: the run does not tell, or a receiver that must be in step never was."""
 
 
+StandardErrors = Mapping[str, float | Mapping[str, float | None] | None]
+"""Figure → its standard error, None if it has none; for figures by name, such as those of receivers, a further mapping."""
 RARE_SHARE = 0.01
 """The share of an expected error that rare events may carry without being reported."""
 
@@ -128,6 +130,7 @@ class DetectionSummary:
     false_alarms: int
     mean_delay: float | None
     first_alarm: int | None
+    standard_errors: StandardErrors = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,7 @@ class ControllerSummary:
     mean_squared_errors: Mapping[str, float | None]
     mean_trace_covariance: float | None
     digest: str | None
+    standard_errors: StandardErrors = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,9 @@ class FilterSummary:
     mean_trace_covariance: float | None
     mean_squared_error: float | None
     mean_true_squared_errors: Mapping[str, float]
+    standard_errors: StandardErrors = field(default_factory=dict)
+    z: float | None = None
+    """How many standard errors `mean_squared_error` is above its expectation, `mean_trace_covariance`."""
 
 
 @dataclass(frozen=True)

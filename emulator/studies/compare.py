@@ -163,8 +163,8 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
         {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
         heavy,
         theory,
-        None if theory is None or theory.bound else z_of(mean, theory.mean, error),
-        rare_events_of(expected, tally),
+        None if theory is None or theory.bound or expected.of_model else z_of(mean, theory.mean, error),
+        None if expected.of_model else rare_events_of(expected, tally),
     )
 
 

@@ -178,6 +178,24 @@ def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted
         assert found["mean_true_squared_errors"][name] > transmitted
 
 
+def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> None:
+    """Those of runs of one trial each, which have none; z is the filter's distance from its covariance."""
+    found = in_memory(tmp_path / "run", **MEASURED).summary["filter"]
+    alone = [
+        in_memory(tmp_path / str(trial), trials=1, record_trials=1, first_trial=trial, **MEASURED).summary["filter"]
+        for trial in range(6)
+    ]
+    errors = found["standard_errors"]
+    own = np.array([one["mean_squared_error"] for one in alone])
+    assert errors["mean_squared_error"] == pytest.approx(own.std(ddof=1) / 6**0.5, rel=1e-9)
+    for name, error in errors["mean_true_squared_errors"].items():
+        values = np.array([one["mean_true_squared_errors"][name] for one in alone])
+        assert error == pytest.approx(values.std(ddof=1) / 6**0.5, rel=1e-9)
+    distance = found["mean_squared_error"] - found["mean_trace_covariance"]
+    assert found["z"] == pytest.approx(distance / errors["mean_squared_error"])
+    assert alone[0]["z"] is alone[0]["standard_errors"]["mean_squared_error"] is None
+
+
 def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
     """One measurement of two states: Q has rank one, and the warning says what that gives away."""
     one = {"plant__output_matrix": [[0.0, 1.0]], "plant__measurement_noise": [[0.01]]}
@@ -204,12 +222,16 @@ def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
     assert difference(live, memory).same
     timed = {"mean_solve_seconds", "longest_solve_seconds"}
     for name, value in memory.summary["controller"].items():
-        if name not in {*timed, "mean_squared_errors", "mean_trace_covariance"}:
+        if name not in {*timed, "mean_squared_errors", "mean_trace_covariance", "standard_errors"}:
             assert live.summary["controller"][name] == value, name
-    errors = memory.summary["controller"]["mean_squared_errors"]
-    for name, value in live.summary["controller"]["mean_squared_errors"].items():
-        assert (value is None) == (errors[name] is None)
-        assert value is None or value == pytest.approx(errors[name], rel=1e-12)
+    here, there = (one.summary["controller"] for one in (memory, live))
+    for mine, others in ((here, there), (here["standard_errors"], there["standard_errors"])):
+        for name, value in others["mean_squared_errors"].items():
+            same = mine["mean_squared_errors"][name]
+            assert (value is None) == (same is None)
+            assert value is None or value == pytest.approx(same, rel=1e-9)
+    for name in ("failed_fraction", "clipped_fraction"):
+        assert there["standard_errors"][name] == here["standard_errors"][name]
     assert live.summary["controller"]["mean_solve_seconds"] > 0.0
 
 

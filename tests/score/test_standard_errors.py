@@ -14,11 +14,12 @@ import pytest
 from rich.console import Console
 
 from evedrop.api import montecarlo, run
-from evedrop.cli.report import closing_table, estimate, print_summary
+from evedrop.cli.report import closing_table, print_summary
 from evedrop.expected.expectations import expectations_of
 from evedrop.figures.figure import MeanFigure, ScoredSlots, TotalsFigure
 from evedrop.figures.packets import UsedFraction
 from evedrop.figures.standard_error import ratio_error, standard_error, z_of
+from evedrop.figures.text import estimate
 from evedrop.loading import load
 from evedrop.memory.montecarlo import Merger, Plan
 from evedrop.memory.simulation import Mode

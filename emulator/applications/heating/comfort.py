@@ -14,6 +14,7 @@ from pydantic import Field
 
 from evedrop.model.process import Floats
 from evedrop.scenario.application import (
+    RECEIVERS,
     Application,
     ApplicationTally,
     ControlledPlant,
@@ -95,6 +96,18 @@ class ComfortTally(ApplicationTally):
         whole._known = {name: np.concatenate([part._known[name] for part in parts]) for name in parts[0]._known}
         return whole
 
+    @property
+    def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
+        """Every figure of every trial, (R,); none where trials were cut short at different slots."""
+        slots = int(self._slots[0])
+        if not slots or (self._slots != slots).any():
+            return {}
+        return {
+            ("discomfort",): self._outside * self._hours,
+            ("heating_energy",): self._power * self._hours,
+            **{(RECEIVERS, name, "known_fraction"): counts / slots for name, counts in self._known.items()},
+        }
+
     def summary(self) -> Summary:
         """The summary's entry: means over trials; None before the first slot."""
         slots = int(self._slots.sum())
@@ -153,10 +166,12 @@ class Comfort(Application):
         """The discomfort, the energy, and how often receivers know whether the room is comfortable."""
         if summary["discomfort"] is None:
             return []
-        known = ", ".join(f"{name} {one['known_fraction']:.3f}" for name, one in summary["receivers"].items())
+        known = ", ".join(
+            f"{name} {cls.text(summary, (name, 'known_fraction'), '.3f')}" for name in summary["receivers"]
+        )
         return [
-            f"the room is uncomfortable by {summary['discomfort']:.3g} K h, and the heater gives "
-            f"{summary['heating_energy']:.3g} kWh",
+            f"the room is uncomfortable by {cls.text(summary, ('discomfort',), '.3g')} K h, and the heater gives "
+            f"{cls.text(summary, ('heating_energy',), '.3g')} kWh",
             f"fraction of slots in which each knows whether the room is comfortable: {known}",
         ]
 

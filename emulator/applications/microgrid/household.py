@@ -14,8 +14,18 @@ import numpy as np
 from evedrop.applications.microgrid.energy import energy
 from evedrop.applications.microgrid.household_tally import HouseholdTable, HouseholdTally, guesses_of
 from evedrop.applications.microgrid.privacy import means
+from evedrop.figures.text import estimate
 from evedrop.model.process import Floats
-from evedrop.scenario.application import Application, ControlledPlant, Kind, Panel, PanelCurve, PanelFeed, Summary
+from evedrop.scenario.application import (
+    STANDARD_ERRORS,
+    Application,
+    ControlledPlant,
+    Kind,
+    Panel,
+    PanelCurve,
+    PanelFeed,
+    Summary,
+)
 from evedrop.scenario.table import Table
 
 if TYPE_CHECKING:
@@ -49,21 +59,25 @@ class Household(Application):
     @classmethod
     def lines(cls, summary: Summary) -> list[str]:
         """Energy bought and sold, the cost of secrecy and losses, and what activity receivers detect."""
-        seen = summary["knowing_truth"]
+        seen = {
+            **summary["knowing_truth"],
+            STANDARD_ERRORS: summary.get(STANDARD_ERRORS, {}).get("knowing_truth", {}),
+        }
         lines = [
-            f"the house buys {_kwh(summary['bought_energy'])} kWh and sells {_kwh(summary['sold_energy'])} kWh; a "
-            f"controller that sees the truth, {_kwh(seen['bought_energy'])} and {_kwh(seen['sold_energy'])} kWh"
+            f"the house buys {_kwh(summary, 'bought')} kWh and sells {_kwh(summary, 'sold')} kWh; a "
+            f"controller that sees the truth, {_kwh(seen, 'bought')} and {_kwh(seen, 'sold')} kWh"
         ]
         shares = [summary[f"{name}_difference"] for name in ("net", "total", "summed")]
         if None not in shares:
-            net, total, summed = (f"{100 * share:.2g} %" for share in shares)
+            errors = [cls.standard_error(summary, (f"{name}_difference",)) for name in ("net", "total", "summed")]
+            net, total, summed = (_per_cent(*one) for one in zip(shares, errors, strict=True))
             lines.append(
                 f"grid power differs from that controller's by {net} in net energy, {total} in total, "
                 f"{summed} summed slot by slot"
             )
         areas = {name: one["activity_area"] for name, one in summary["receivers"].items()}
         if None not in areas.values():
-            told = ", ".join(f"{name} {area:.3f}" for name, area in areas.items())
+            told = ", ".join(f"{name} {cls.text(summary, (name, 'activity_area'), '.3f')}" for name in areas)
             windows = f"{summary['active_windows']} active windows of {summary['windows']}"
             lines.append(f"detection of the {windows} (1 is certainty, 0.5 is guessing): {told}")
         return lines
@@ -140,5 +154,9 @@ def _house(table: Table) -> HouseholdTable:
     return table
 
 
-def _kwh(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
+def _per_cent(share: float, error: float | None) -> str:
+    return estimate(100.0 * share, None if error is None else 100.0 * error, ".2g") + " %"
+
+
+def _kwh(summary: Summary, way: str) -> str:
+    return Household.text(summary, (f"{way}_energy",), ".3f")

@@ -19,7 +19,8 @@ from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.controllers.lqr import held
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
-from evedrop.scenario.application import ApplicationTally, ControlledPlant
+from evedrop.model.receiver import Flags
+from evedrop.scenario.application import RECEIVERS, ApplicationTally, ControlledPlant
 from evedrop.scenario.table import Table
 
 Name = Annotated[str, Field(strict=True, min_length=1)]
@@ -100,6 +101,24 @@ class HouseholdTally(ApplicationTally):
             whole._guessed[name] = [np.concatenate(row) for row in rows]
         return whole
 
+    @property
+    def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
+        """Every figure of every trial, (R,); NaN or infinite where it does not exist."""
+        meter, seconds = self.meter, self._slot_seconds
+        apart = meter.difference
+        detected = self._detected(self._active)
+        return {
+            ("bought_energy",): energy(meter.bought, seconds),
+            ("sold_energy",): energy(meter.sold, seconds),
+            ("knowing_truth", "bought_energy"): energy(meter.other_bought, seconds),
+            ("knowing_truth", "sold_energy"): energy(meter.other_sold, seconds),
+            ("net_difference",): apart.net,
+            ("total_difference",): apart.total,
+            ("summed_difference",): apart.summed,
+            **{(RECEIVERS, name, "activity_area"): areas for name, (areas, _) in detected.items()},
+            **{(RECEIVERS, name, "detection_rate"): rates for name, (_, rates) in detected.items()},
+        }
+
     def summary(self) -> dict[str, Any]:
         """The summary's entry: means over trials; None for figures that do not exist."""
         meter, seconds = self.meter, self._slot_seconds
@@ -119,23 +138,37 @@ class HouseholdTally(ApplicationTally):
 
     def _activity(self) -> dict[str, Any]:
         """How well each receiver's guesses detect active windows, over the windows that have ended."""
-        table = self._table
+        active = self._active
+        told = {
+            name: {"activity_area": _mean(areas), "detection_rate": _mean(rates)}
+            for name, (areas, rates) in self._detected(active).items()
+        }
+        return {"windows": len(active), "active_windows": int(active.sum()), "receivers": told}
+
+    @property
+    def _active(self) -> Flags:
+        """Whether the house was active, for each window that has ended, (windows,)."""
         load = privacy.means(self._disturbances[:, self._load], self._period)
-        periods = min(len(loads) for loads in self._guessed.values())
-        active = privacy.active(load[:periods], self._window, table.active_above)
+        return privacy.active(load[: self._periods], self._window, self._table.active_above)
+
+    @property
+    def _periods(self) -> int:
+        return min(len(loads) for loads in self._guessed.values())
+
+    def _detected(self, active: Flags) -> dict[str, Floats]:
+        """Receiver → the area and the rate of its detection, for each trial, (2, R); NaN before a window has ended, (2, 1)."""
         told = {}
         for name, loads in self._guessed.items():
-            figures = np.full((2, 1), np.nan)
+            told[name] = np.full((2, 1), np.nan)
             if len(active):
-                guesses = privacy.means(np.stack(loads[:periods]), self._window).T
-                figures = np.array(
+                guesses = privacy.means(np.stack(loads[: self._periods]), self._window).T
+                told[name] = np.array(
                     [
                         [privacy.area(one, active) for one in guesses],
-                        [privacy.detection_rate(one, active, table.false_alarms) for one in guesses],
+                        [privacy.detection_rate(one, active, self._table.false_alarms) for one in guesses],
                     ]
                 )
-            told[name] = {"activity_area": _mean(figures[0]), "detection_rate": _mean(figures[1])}
-        return {"windows": len(active), "active_windows": int(active.sum()), "receivers": told}
+        return told
 
 
 def _mean(values: Floats) -> float | None:

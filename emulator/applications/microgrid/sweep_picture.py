@@ -7,6 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from evedrop.figures import error_column
 from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _COLOURS = (BLUE, RED, ORANGE, GREEN, GREY)
@@ -24,21 +25,25 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
     x = [float(row[key]) if numbers else float(i) for i, row in enumerate(house)]
     with panels(path, 3, 12.6, 3.9) as (energies, shares, told):
         for name, colour, mark in (("bought", BLUE, "o"), ("sold", GREEN, "s")):
-            energies.plot(x, [row[f"{name}_energy"] for row in house], f"{mark}-", color=colour, label=name)
+            bars = _bars(house, f"{name}_energy")
+            energies.errorbar(
+                x, [row[f"{name}_energy"] for row in house], bars, fmt=f"{mark}-", color=colour, label=name
+            )
         energies.set_ylabel("energy (kWh)")
         energies.set_ylim(bottom=0.0)
         energies.set_title("(a) energy")
         for name, colour, mark in (("net", BLUE, "o"), ("total", GREEN, "s"), ("summed", ORANGE, "D")):
             found = [row[f"{name}_difference"] for row in house]
             percent = [float("nan") if one is None or one <= 0.0 else 100.0 * one for one in found]
-            shares.plot(x, percent, f"{mark}-", color=colour, label=name)
+            bars = [100.0 * one for one in _bars(house, f"{name}_difference")]
+            shares.errorbar(x, percent, bars, fmt=f"{mark}-", color=colour, label=name)
         shares.axhline(_LIMIT, color=GREY, linewidth=0.9, linestyle=":", label=f"the paper: {_LIMIT} %")
         shares.set_yscale("log")
         shares.set_ylabel("difference of grid power (%)")
         shares.set_title("(b) from a controller that sees the truth")
         for peer, colour, mark in zip(peers, _COLOURS * len(peers), _MARKS * len(peers), strict=False):
             areas = [float("nan") if row["activity_area"] is None else row["activity_area"] for row in mine[peer]]
-            told.plot(x, areas, f"{mark}-", color=colour, label=peer)
+            told.errorbar(x, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=colour, label=peer)
         told.axhline(0.5, color=GREY, linewidth=0.9, linestyle=":", label="a coin")
         told.set_ylim(0.4, 1.02)
         told.set_ylabel("area under the curve")
@@ -49,6 +54,12 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
             if not numbers:
                 axes.set_xticks(x, [str(row[key]) for row in house])
             axes.legend()
+
+
+def _bars(rows: list[dict[str, Any]], column: str) -> list[float]:
+    """The standard errors of a column; NaN, which draws nothing, where there is none."""
+    errors = (row[error_column(column)] for row in rows)
+    return [float("nan") if one is None else one for one in errors]
 
 
 def _of_one_line(rows: list[dict[str, Any]], key: str) -> list[dict[str, Any]]:

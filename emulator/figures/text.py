@@ -1,0 +1,30 @@
+"""Figures as text: with their standard errors, to the digits that these leave."""
+
+from __future__ import annotations
+
+import math
+
+_SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE = 0.01, 1e5, -4  # beyond them estimates have exponents
+
+
+def figure_text(value: float | None, how: str = ".4g") -> str:
+    """A figure of the summary as text; a dash for None."""
+    return "–" if value is None else format(value, how)
+
+
+def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
+    """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error."""
+    if value is None or not error or not math.isfinite(value):
+        return figure_text(value, how)
+    place = math.floor(math.log10(float(f"{error:.0e}")))
+    if abs(value) < _LARGE_NUMBER and (place >= _LEAST_PLACE or abs(value) >= _SMALL_NUMBER):
+        places = max(0, -place)
+        return f"{value:.{places}f} ± {error:.{places}f}"
+    digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
+    return f"{_scientific(value, digits)} ± {_scientific(error, 0)}"
+
+
+def _scientific(value: float, digits: int) -> str:
+    """A number with this many decimal digits and a short exponent: 2.3e-4."""
+    mantissa, exponent = f"{value:.{digits}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
