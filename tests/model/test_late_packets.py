@@ -50,7 +50,7 @@ class OneByOne:
 
     def __init__(self, receiver: Receiver, window: int) -> None:
         self.core = ReceiverCore(receiver, window)
-        self.late = np.zeros(receiver.trials, np.uint16)
+        self.late = self.used = np.zeros(receiver.trials, np.uint16)
 
     def take(self, k: int, arrival: Arrival) -> Belief:
         """The belief after a slot."""
@@ -60,7 +60,7 @@ class OneByOne:
             range(k, k + 1),
             Arrivals(heard.gamma[None], heard.z[None], header, {0: arrival.late} if arrival.late else {}),
         )
-        self.late = np.zeros_like(self.late) if found.late is None else found.late[0, 0]
+        self.late, self.used = np.zeros((2, len(self.late)), np.uint16) if found.late is None else found.late[:, 0]
         assert same(found.beliefs.last, self.core.belief)
         return self.core.belief
 
@@ -100,6 +100,12 @@ def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) 
         arrivals = [there[j] & (j + fate.delays[j] == k) for j in range(k)]
         counts = np.sum(arrivals, axis=0) if arrivals else np.zeros(BATCH.trials)
         assert np.array_equal(follower.late, counts)
+        # The eavesdroppers that discard packets discard late ones, too; each packet counts once.
+        assert (
+            np.array_equal(follower.used, counts)
+            if name in {"legitimate", "naive"}
+            else (follower.used <= counts).all()
+        )
         late_seen += int(counts.sum())
     assert late_seen > 0 or window == 0
 
