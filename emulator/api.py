@@ -1,4 +1,4 @@
-"""The Python API: `run`, `montecarlo`, `compare`, `design`, `load_results`, and `design_policy`: each like its command."""
+"""The Python API: a function for each command that computes, with the same name and arguments."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ from evedrop.scenario.words import listed
 if TYPE_CHECKING:
     from evedrop.expected.policies import PolicyDesign
     from evedrop.memory.montecarlo import Plan
-    from evedrop.model.theory.design import Design
+    from evedrop.model.theory.design import Adversary, Design
+    from evedrop.model.theory.schedules import ScheduleDesign
     from evedrop.results.comparison import Comparison
 
+_LONGEST_SCHEDULE = 100  # designed in a minute
 _TWENTIETHS = tuple(float(i) / 20 for i in range(21))
 
-__all__ = ["compare", "design", "design_policy", "load_results", "montecarlo", "run"]
+__all__ = ["compare", "design", "design_policy", "design_schedule", "load_results", "montecarlo", "run"]
 
 
 def run(
@@ -131,14 +133,22 @@ def design(
     Raises ScenarioError with every mistake of the scenario, UsageError if the scheme does not send states and innovations, if
     the losses of a link are not independent and alike in all slots, or if Ω is infinite or no μ_d keeps it.
     """
-    from evedrop.model.theory.design import Adversary  # noqa: PLC0415 - a run does not need it
-    from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - the same
+    from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - a run does not need it
 
     made = _prepared(scenario, changes or {}, beyond_horizon=True)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
+    mu, adversaries, left_out = _adversaries(made)
+    found = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace)
+    return replace(found, left_out=left_out)
+
+
+def _adversaries(made: Scenario) -> tuple[float, list[Adversary], dict[str, str]]:
+    """μ, the eavesdroppers whose error has a closed form, and the strategies of the others. Raises UsageError for other links."""
+    from evedrop.model.theory.design import Adversary  # noqa: PLC0415 - a run does not need it
+
     quality = {}
     for name in made.receivers:
         law = law_of(made.schedule(name))
@@ -157,8 +167,52 @@ def design(
             left_out[name] = table.strategy
         else:
             adversaries.append(Adversary.with_outcomes(name, quality[name], outcomes_at(1.0)))
-    process, mu, mu_d = made.process.process, quality[LEGITIMATE], made.encoding.mu_d
-    return replace(design_of(process, mu, mu_d, adversaries, made.slots, max_trace), left_out=left_out)
+    return quality[LEGITIMATE], adversaries, left_out
+
+
+def design_schedule(
+    scenario: str | Path | Scenario,
+    slots: int,
+    *,
+    max_trace: float | None = None,
+    weight: float = 0.0,
+    block: int = 1,
+    changes: Mapping[str, Any] | None = None,
+) -> ScheduleDesign:
+    """A μ_d for each slot of a short run, against each eavesdropper of a scenario.
+
+    slots: N, from 2 to 100; max_trace: Ω, below which the legitimate trace stays in every slot; weight: of the legitimate
+    error in the sum, which has the eavesdropper's with the rest; block: how many slots share a μ_d; changes: entries by
+    dotted key.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError as `design` does, and for numbers out of range.
+    """
+    from evedrop.model.theory.schedules import ScheduleDesign, best_schedule  # noqa: PLC0415 - a run does not need it
+
+    made = _prepared(scenario, changes or {}, beyond_horizon=True)
+    if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
+        raise UsageError(_not_for(made.encoding.scheme))
+    if not 2 <= slots <= _LONGEST_SCHEDULE:
+        raise UsageError(
+            f"--schedule {slots}: expected a whole number from 2 to {_LONGEST_SCHEDULE}, the slots of the run"
+        )
+    if not 1 <= block < slots:
+        raise UsageError(f"--block {block}: expected a whole number from 1 to {slots - 1}, the slots that share a μ_d")
+    if not 0.0 <= weight <= 1.0:
+        raise UsageError(f"--weight {weight:g}: expected a number from 0 to 1, the weight of the legitimate error")
+    if (max_trace is None or max_trace == math.inf) and weight == 0.0:
+        raise UsageError(
+            "a schedule needs a bound on the legitimate trace or a weight for it: give --max-trace, or --weight"
+        )
+    mu, adversaries, left_out = _adversaries(made)
+    bound, process = math.inf if max_trace is None else max_trace, made.process.process
+    found = {one.name: best_schedule(process, mu, one.outcomes, slots, bound, weight, block) for one in adversaries}
+    if not found:
+        raise UsageError(
+            "a schedule is designed against eavesdroppers whose error has a closed form, and the scenario has none; add one, "
+            "such as --set 'eavesdroppers.genie={strategy = \"genie\", link = {quality = 0.9}}'"
+        )
+    return ScheduleDesign(found, left_out)
 
 
 def design_policy(

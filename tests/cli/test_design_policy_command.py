@@ -112,7 +112,7 @@ def test_in_python(scenario: str) -> None:
             ("--set", 'legitimate.link={loss={model="gilbert-elliott",p=0.1,r=0.5}}'),
             "the link of legitimate is different",
         ),
-        (("--max-trace", "1"), "--max-trace is not for --policy"),
+        (("--max-trace", "1"), "--max-trace is for the design of μ_d and --schedule"),
         (
             ("--set", 'eavesdroppers={deaf={strategy="constant",link={quality=0.5}}}'),
             "expected a strategy of naive, reference or selective",
@@ -130,7 +130,7 @@ def test_options_of_policies_alone_are_refused(evedrop: Evedrop) -> None:
     """They mean nothing for μ_d."""
     done = evedrop("design", "numerical", "--weight", "0.5")
     assert done.status == 2
-    assert "--weight is for --policy" in done.err
+    assert "--weight is for --policy and --schedule; leave it out" in done.err
 
 
 def test_another_scheme_is_refused_with_a_command_that_works(evedrop: Evedrop, tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
-"""`evedrop design`: the choice of μ_d, and of when to send."""
+"""`evedrop design`: the choice of μ_d, for all slots or for each, and of when to send."""
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 from evedrop.cli.options import as_json, changes, changes_of, scenario
 from evedrop.command import Command
@@ -11,51 +13,71 @@ from evedrop.errors import UsageError
 
 
 def design(options: argparse.Namespace) -> int:
-    """Print the admissible μ_d, and the cost and secrecy of each choice; or, with --policy, the best policies of sending."""
-    _check(options)
-    if options.policy:
-        return _policy(options)
-    from evedrop.api import design as design_of
-    from evedrop.cli.report import print_design
-
-    found = design_of(options.scenario, max_trace=options.max_trace, changes=changes_of(options))
-    if options.json:
-        print(json.dumps(found.as_dict(), ensure_ascii=False))
-    else:
-        print_design(found)
-    return 0
-
-
-def _policy(options: argparse.Namespace) -> int:
-    from evedrop.api import design_policy
+    """Print the admissible μ_d, and the cost and secrecy of each choice; or when to send, or a μ_d for each slot."""
+    from evedrop import api
     from evedrop.cli.policy_report import print_policies
+    from evedrop.cli.report import print_design
+    from evedrop.cli.schedule_report import print_schedules
 
-    asked = {key: getattr(options, name) for name, key in _POLICY.items() if getattr(options, name) is not None}
-    found = design_policy(options.scenario, changes=changes_of(options), **asked)
+    kind = "--policy" if options.policy else "--schedule" if options.schedule is not None else None
+    given, changed = _given(options, kind), changes_of(options)
+    if kind == "--policy":
+        policies = api.design_policy(options.scenario, changes=changed, **given)
+        return _show(options, policies, lambda: print_policies(policies))
+    if kind == "--schedule":
+        schedules = api.design_schedule(options.scenario, options.schedule, changes=changed, **given)
+        return _show(options, schedules, lambda: print_schedules(schedules))
+    found = api.design(options.scenario, changes=changed, **given)
+    return _show(options, found, lambda: print_design(found))
+
+
+_OPTIONS: Mapping[str | None, Mapping[str, str]] = {
+    None: {"max_trace": "max_trace"},
+    "--policy": {"weight": "weights", "price": "prices", "states": "states"},
+    "--schedule": {"max_trace": "max_trace", "weight": "weight", "block": "block"},
+}
+"""The design asked for → the options that it takes, with their names in Python."""
+
+
+class _Printable(Protocol):
+    def as_dict(self) -> Mapping[str, object]: ...
+
+
+def _given(options: argparse.Namespace, kind: str | None) -> dict[str, Any]:
+    """The options of a design that were given, by their names in Python. Raises UsageError for those of another one."""
+    takes = _OPTIONS[kind]
+    for name in sorted({name for names in _OPTIONS.values() for name in names}):
+        if getattr(options, name) is not None and name not in takes:
+            able = [f"{one or 'the design of μ_d'}" for one, names in _OPTIONS.items() if name in names]
+            raise UsageError(f"--{name.replace('_', '-')} is for {' and '.join(able)}; leave it out")
+    given = {python: getattr(options, name) for name, python in takes.items() if getattr(options, name) is not None}
+    if kind == "--schedule" and "weight" in given:
+        if len(given["weight"]) > 1:
+            raise UsageError("--weight takes one number for --schedule")
+        (given["weight"],) = given["weight"]
+    return given
+
+
+def _show(options: argparse.Namespace, found: _Printable, show: Callable[[], None]) -> int:
     if options.json:
         print(json.dumps(found.as_dict(), ensure_ascii=False))
     else:
-        print_policies(found)
+        show()
     return 0
-
-
-_POLICY = {"weight": "weights", "price": "prices", "states": "states"}
-
-
-def _check(options: argparse.Namespace) -> None:
-    """Refuse options of another design than the one asked for."""
-    others = ["max_trace"] if options.policy else list(_POLICY)
-    for name in others:
-        if getattr(options, name) is not None:
-            option = f"--{name.replace('_', '-')}"
-            raise UsageError(f"{option} is {'not ' if options.policy else ''}for --policy; leave one of the two out")
 
 
 def _designs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--max-trace", type=float, metavar="Ω", help="find the least μ_d whose limiting trace stays below Ω"
+        "--max-trace",
+        type=float,
+        metavar="Ω",
+        help="find the least μ_d whose limiting trace stays below Ω; with --schedule: the trace stays within Ω in every slot",
     )
-    parser.add_argument(
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument(
+        "--schedule", type=int, metavar="N", help="a μ_d for each of N slots that makes the eavesdropper's error large"
+    )
+    kind.add_argument(
         "--policy",
         action="store_true",
         help="when to send, for a scheme that goes by acknowledgements: the Pareto front",
@@ -65,13 +87,14 @@ def _designs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--price", type=float, nargs="+", metavar="λ", help="costs of a transmission (default 0)")
     parser.add_argument("--states", type=int, metavar="N", help="holding times that are told apart (default 10)")
+    parser.add_argument("--block", type=int, metavar="L", help="slots of --schedule that share a μ_d (default 1)")
 
 
 COMMANDS = (
     Command(
         "design",
         design,
-        "admissible μ_d, secrecy, optimum, per eavesdropper; when to send",
+        "admissible μ_d, secrecy, optimum, per eavesdropper; per slot; when to send",
         (scenario, changes, _designs, as_json),
     ),
 )

@@ -1,0 +1,324 @@
+"""A μ_d for each slot of a short run: the schedule that keeps the user's error low and makes an eavesdropper's large.
+
+Source: docs/mathematics.md, schedules of μ_d.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.errors import UsageError
+from evedrop.model.process import Floats, Process
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt, misled_covariances
+from evedrop.model.theory.leak import RemainingCovariances
+
+_ROUNDING = 1e-12
+_POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
+_MESH, _ZOOM, _NARROW = 17, 4.0, 1e-3
+_PAIR_GAIN = 1e-6
+_GAIN = 1e-10  # an improvement of the sum below which the ascent ends, relative
+
+
+@final
+class SlotRecursion:
+    """E P_k of one receiver for many schedules at once, slot by slot: its map of a slot is affine in μ_d(k).
+
+    E_0 = p_0 Σ0, E_k = kept · A E_{k−1} Aᵀ + p_d Q + p_i f_k + p_l M_k, with probabilities that are affine in μ_d(k).
+
+    Source: docs/mathematics.md, schedules of μ_d.
+    """
+
+    def __init__(self, process: Process, outcomes_at: OutcomesAt, slots: int) -> None:
+        never, always = outcomes_at(0.0), outcomes_at(1.0)
+        self._A, self._Q = process.A, process.Q
+        self._base = _probabilities(never)
+        self._slope = _probabilities(always) - self._base
+        self.initial: Floats = always.initial * process.initial_covariance
+        """E P_0, (n, n): the first packet is always the state."""
+        self._misled = misled_covariances(process, slots)
+        remaining = RemainingCovariances(process) if never.leaked else None
+        self._remaining = np.zeros_like(self._misled)
+        if remaining is not None:
+            for k in range(1, slots):
+                self._remaining[k] = remaining.next()
+
+    def next(self, k: int, E: Floats, mu_d: Floats) -> Floats:
+        """E P_k, (S, n, n), from E P_{k−1}, (S, n, n), with μ_d(k), (S,)."""
+        kept, predicted, misled, leaked = (self._base[:, None] + self._slope[:, None] * mu_d)[:, :, None, None]
+        found: Floats = (
+            kept * (self._A @ E @ self._A.T)
+            + predicted * self._Q
+            + misled * self._misled[k]
+            + leaked * self._remaining[k]
+        )
+        return found
+
+    def traces(self, mu_d: Floats) -> Floats:
+        """Trace of E P_k for k = 0 … N−1 of schedules, (S, N) → (S, N); μ_d(0) is taken as 1."""
+        found = np.empty(mu_d.shape)
+        E = np.broadcast_to(self.initial, (len(mu_d), *self.initial.shape))
+        found[:, 0] = np.trace(self.initial)
+        for k in range(1, mu_d.shape[1]):
+            E = self.next(k, E, mu_d[:, k])
+            found[:, k] = np.trace(E, axis1=1, axis2=2)
+        return found
+
+
+def _probabilities(outcomes: Outcomes) -> Floats:
+    return np.array([outcomes.kept, outcomes.predicted, outcomes.misled, outcomes.leaked])
+
+
+@dataclass(frozen=True)
+class ScheduleProblem:
+    """What a schedule is to reach: the largest Σ_k (1 − weight) tr E Pᵉ_k − weight tr E P_k with tr E P_k ≤ Ω in each slot."""
+
+    user: SlotRecursion
+    eavesdropper: SlotRecursion
+    slots: int
+    max_trace: float
+    """Ω; inf for no bound."""
+    weight: float
+
+    def sums(self, mu_d: Floats) -> Floats:
+        """The sum of each schedule, (S, N) → (S,); −inf for those that violate Ω."""
+        ours, theirs = self.user.traces(mu_d), self.eavesdropper.traces(mu_d)
+        total = ((1.0 - self.weight) * theirs - self.weight * ours).sum(axis=1)
+        return np.where((ours <= self.max_trace * (1.0 + _ROUNDING)).all(axis=1), total, -np.inf)
+
+
+@dataclass(frozen=True)
+class MeanSchedule:
+    """A schedule with the errors that it leads to."""
+
+    mu_d: tuple[float, ...]
+    """μ_d(k) for k = 0 … N−1; the first is 1."""
+    user: tuple[float, ...]
+    """tr E P_k."""
+    eavesdropper: tuple[float, ...]
+    """tr E Pᵉ_k."""
+    value: float
+    """Σ_k (1 − weight) tr E Pᵉ_k − weight tr E P_k."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "mu_d": list(self.mu_d),
+            "user": list(self.user),
+            "eavesdropper": list(self.eavesdropper),
+            "value": self.value,
+        }
+
+
+@dataclass(frozen=True)
+class BestSchedule:
+    """The best schedule found, the best that is constant from slot 1 on, and how far the search was exhaustive."""
+
+    best: MeanSchedule
+    constant: MeanSchedule
+    grid: MeanSchedule
+    """The best schedule of the grid, from which the best one was improved."""
+    exact: bool
+    """Whether `grid` is certainly the best of the grid; otherwise some candidates were dropped."""
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "best": self.best.as_dict(),
+            "constant": self.constant.as_dict(),
+            "grid": self.grid.as_dict(),
+            "exact": self.exact,
+        }
+
+
+@dataclass(frozen=True)
+class ScheduleDesign:
+    """The best schedules against each eavesdropper of a scenario."""
+
+    schedules: dict[str, BestSchedule]
+    left_out: dict[str, str]
+    """Eavesdropper → strategy, for those whose error has no closed form."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The JSON of `evedrop design --schedule`; `left_out` is present only if it has values."""
+        found: dict[str, object] = {"eavesdroppers": {name: one.as_dict() for name, one in self.schedules.items()}}
+        return {**found, "left_out": self.left_out} if self.left_out else found
+
+
+def best_schedule(
+    process: Process,
+    mu: float,
+    eavesdropper_at: OutcomesAt,
+    slots: int,
+    max_trace: float = math.inf,
+    weight: float = 0.0,
+    block: int = 1,
+    levels: int = 11,
+    capacity: int = 100,
+) -> BestSchedule:
+    """The μ_d(k) that maximise an eavesdropper's summed error while the user's stays within Ω in every slot.
+
+    eavesdropper_at: μ_d → its outcomes; block: slots, from slot 1 on, that share a μ_d; levels: the number of μ_d in the grid;
+    capacity: the most candidates that are kept from slot to slot.
+
+    First the best schedule of the grid, by a dynamic program; then each block's μ_d is set to its best real value, in turn,
+    until nothing improves. Raises UsageError if not even sending every state keeps Ω.
+
+    Source: docs/mathematics.md, schedules of μ_d.
+    """
+    user = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), slots)
+    problem = ScheduleProblem(user, SlotRecursion(process, eavesdropper_at, slots), slots, max_trace, weight)
+    least = user.traces(np.ones((1, slots)))[0]
+    worst = int(np.argmax(least))
+    if not least[worst] <= max_trace:
+        raise UsageError(
+            f"no schedule keeps the legitimate trace at or below {max_trace:g} in all slots: with μ_d = 1 in each of them, "
+            f"where it is least, it is {least[worst]:.6g} in slot {worst}; ask for a trace of at least that, or improve the "
+            "legitimate link"
+        )
+    edges = sorted({*range(1, slots, block), slots})
+    blocks = [slice(*one) for one in pairwise(edges)]
+    grid, exact = _best_of_grid(process, problem, blocks, np.linspace(0.0, 1.0, levels), capacity)
+    constant = _ascended(problem, np.ones(slots), [slice(1, slots)])
+    starts = (grid, constant, _lowest(problem, blocks))
+    best = max(
+        (_ascended(problem, start, blocks) for start in starts), key=lambda one: float(problem.sums(one[None])[0])
+    )
+    best = _improved_by_pairs(problem, best, blocks)
+    return BestSchedule(_described(problem, best), _described(problem, constant), _described(problem, grid), exact)
+
+
+def _described(problem: ScheduleProblem, mu_d: Floats) -> MeanSchedule:
+    ours, theirs = problem.user.traces(mu_d[None])[0], problem.eavesdropper.traces(mu_d[None])[0]
+    value = float(problem.sums(mu_d[None])[0])
+    return MeanSchedule(tuple(mu_d.tolist()), tuple(ours.tolist()), tuple(theirs.tolist()), value)
+
+
+def _best_of_grid(
+    process: Process, problem: ScheduleProblem, blocks: list[slice], levels: Floats, capacity: int
+) -> tuple[Floats, bool]:
+    """The best schedule whose μ_d are levels, (N,), and whether the search was exhaustive.
+
+    Forward over the slots, with the candidates that no other one dominates: that has a user's error at most as large in
+    every later slot, an eavesdropper's at least as large, and a sum at least as large so far.
+    """
+    mu_d = np.ones((1, problem.slots))
+    E, F = problem.user.initial[None], problem.eavesdropper.initial[None]
+    value, exact = np.zeros(1), True
+    for one in blocks:
+        count = len(levels)
+        mu_d, E, F, value = (np.repeat(array, count, axis=0) for array in (mu_d, E, F, value))
+        mu_d[:, one] = np.tile(levels, len(mu_d) // count)[:, None]
+        for k in range(one.start, one.stop):
+            E, F = problem.user.next(k, E, mu_d[:, k]), problem.eavesdropper.next(k, F, mu_d[:, k])
+            ours = np.trace(E, axis1=1, axis2=2)
+            value = value + (1.0 - problem.weight) * np.trace(F, axis1=1, axis2=2) - problem.weight * ours
+            kept = ours <= problem.max_trace * (1.0 + _ROUNDING)
+            mu_d, E, F, value = mu_d[kept], E[kept], F[kept], value[kept]
+        later = _later_traces(process, np.stack([E, F]), problem.slots - one.stop)
+        best = _undominated(np.column_stack([-later[0], later[1], value]))
+        if len(best) > capacity:
+            exact = False
+            by_error = best[np.argsort(later[0][best, 0], kind="stable")]
+            # The first one has sent states alone, so it can keep Ω to the end.
+            spread = np.linspace(0, len(best) - 1, capacity).astype(np.int64)
+            best = np.unique(np.append(by_error[spread], best[np.argmax(value[best])]))
+        mu_d, E, F, value = mu_d[best], E[best], F[best], value[best]
+    return mu_d[int(np.argmax(value))].copy(), exact
+
+
+def _later_traces(process: Process, covariances: Floats, slots: int) -> Floats:
+    """Trace of A^m P A^mᵀ for m = 0 … slots, (…, n, n) → (…, slots + 1): all of P that matters later."""
+    found = np.empty((*covariances.shape[:-2], slots + 1))
+    G = np.eye(process.n)
+    for m in range(slots + 1):
+        found[..., m] = (covariances * G).sum(axis=(-2, -1))
+        G = process.A.T @ G @ process.A
+    return found
+
+
+def _undominated(scores: Floats) -> NDArray[np.int64]:
+    """The rows, (S, d), that no other row reaches in every column; of equal rows one. Sums rank them, so one pass is enough."""
+    scale = np.maximum(np.abs(scores).max(axis=0), 1e-300)
+    scores = scores / scale
+    order = np.argsort(-scores.sum(axis=1), kind="stable")
+    kept = np.empty((len(order), scores.shape[1]))
+    found: list[int] = []
+    for row in order.tolist():
+        if not (kept[: len(found)] >= scores[row] - _ROUNDING).all(axis=1).any():
+            kept[len(found)] = scores[row]
+            found.append(row)
+    return np.array(found, np.int64)
+
+
+def _lowest(problem: ScheduleProblem, blocks: list[slice]) -> Floats:
+    """The schedule, (N,), whose blocks have the least μ_d, one after the other, with which sending states keeps Ω later."""
+    mu_d = np.ones(problem.slots)
+    for one in blocks:
+        mu_d[one] = _least_feasible(problem, mu_d, one)
+    return mu_d
+
+
+def _ascended(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Floats:
+    """A schedule, (N,), that no change of a single block improves, from one that keeps Ω.
+
+    The user's error falls with each μ_d, so those of a block that keep Ω are all from the least one on.
+    """
+    mu_d = mu_d.copy()
+    best = float(problem.sums(mu_d[None])[0])
+    while True:
+        before = best
+        for one in blocks:
+            low = _least_feasible(problem, mu_d, one)
+            tried = np.append(np.linspace(low, 1.0, _POINTS), mu_d[one.start])
+            sums = problem.sums(_with(mu_d, one, tried))
+            if sums.max() > best:
+                best = float(sums.max())
+                mu_d[one] = tried[int(np.argmax(sums))]
+        if best - before <= _GAIN * abs(best):
+            return mu_d
+
+
+def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Floats:
+    """A schedule, (N,), that no change of two neighbouring blocks improves by more than 1e-6, as far as a mesh tells."""
+    mu_d = mu_d.copy()
+    while True:
+        before = best = float(problem.sums(mu_d[None])[0])
+        for one, other in pairwise(blocks):
+            middle, width = np.full(2, 0.5), 0.5
+            while width > _NARROW:
+                axes = (np.clip(np.linspace(at - width, at + width, _MESH), 0.0, 1.0) for at in middle)
+                first, second = (axis.reshape(-1) for axis in np.meshgrid(*axes))
+                tried = _with(mu_d, one, first)
+                tried[:, other] = second[:, None]
+                sums = problem.sums(tried)
+                found = int(np.argmax(sums))
+                middle, width = np.array([first[found], second[found]]), width / _ZOOM
+                if sums[found] > best:
+                    best, mu_d = float(sums[found]), tried[found]
+        mu_d = _ascended(problem, mu_d, blocks)
+        if float(problem.sums(mu_d[None])[0]) - before <= _PAIR_GAIN * abs(before):
+            return mu_d
+
+
+def _least_feasible(problem: ScheduleProblem, mu_d: Floats, one: slice) -> float:
+    low, high = 0.0, float(mu_d[one.start])
+    for _ in range(_REFINEMENTS):
+        tried = np.linspace(low, high, _POINTS)
+        feasible = np.isfinite(problem.sums(_with(mu_d, one, tried)))
+        first = int(np.argmax(feasible))  # the last one is feasible, or was
+        if first == 0:
+            return float(tried[0])
+        low, high = float(tried[first - 1]), float(tried[first])
+    return high
+
+
+def _with(mu_d: Floats, one: slice, tried: Floats) -> Floats:
+    found = np.repeat(mu_d[None], len(tried), axis=0)
+    found[:, one] = tried[:, None]
+    return found

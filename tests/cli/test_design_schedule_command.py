@@ -1,0 +1,92 @@
+"""`evedrop design --schedule` as it is typed: keys, numbers, text, refusals."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from evedrop.api import design_schedule
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.schedules import SlotRecursion
+from tests.builders import UNSTABLE
+from tests.conftest import Evedrop
+
+SMART = 'eavesdroppers={smart={strategy="smart",link={quality=0.85}}}'
+MIXED = 'eavesdroppers={smart={strategy="smart",link={quality=0.85}},wise={strategy="bayesian",link={quality=0.85}}}'
+NAIVE = 'eavesdroppers={n={strategy="naive",link={quality=0.5}}}'
+BURSTS = 'legitimate.link={loss={model="gilbert-elliott",p=0.1,r=0.5}}'
+SHORT = ("--schedule", "8", "--max-trace", "0.004")
+
+
+def test_json(evedrop: Evedrop) -> None:
+    """Exactly the promised keys; the user's error within Ω in every slot; what has no closed form is named."""
+    done = evedrop("design", "numerical", *SHORT, "--set", MIXED, "--json")
+    assert (done.status, done.err) == (0, "")
+    found = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert list(found) == ["eavesdroppers", "left_out"]
+    assert found["left_out"] == {"wise": "bayesian"}
+    smart = found["eavesdroppers"]["smart"]
+    assert list(smart) == ["best", "constant", "grid", "exact"]
+    best = smart["best"]
+    assert list(best) == ["mu_d", "user", "eavesdropper", "value"]
+    assert {len(best[key]) for key in ("mu_d", "user", "eavesdropper")} == {8}
+    assert max(best["user"]) <= 0.004 * (1 + 1e-9)
+    assert best["value"] == pytest.approx(sum(best["eavesdropper"]))
+    assert best["value"] > smart["constant"]["value"]
+
+
+def test_for_people(evedrop: Evedrop) -> None:
+    """One row for each slot, what is gained, and how far the search went."""
+    done = evedrop("design", "numerical", "--schedule", "4", "--max-trace", "0.004", "--set", MIXED)
+    assert (done.status, done.err) == (0, "")
+    for words in (
+        "against smart: the sum is",
+        "the best constant μ_d",
+        "user's error",
+        "best schedule",
+        "wise (bayesian)",
+    ):
+        assert words in done.out, words
+
+
+def test_in_python() -> None:
+    """The same from Python; blocks and a weight without Ω."""
+    found = design_schedule(
+        "numerical", 9, weight=0.5, block=4, changes={"process.initial_covariance": [[1, 0], [0, 1]]}
+    )
+    best = found.schedules["smart"].best
+    assert best.mu_d[1] == best.mu_d[4]
+    assert best.mu_d[5] == best.mu_d[8]
+    expected = SlotRecursion(UNSTABLE, lambda mu_d: Outcomes.legitimate(0.9, mu_d), 9)
+    assert best.user == pytest.approx(expected.traces(np.array([best.mu_d]))[0].tolist())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--schedule", "1", "--max-trace", "1"), "--schedule 1: expected a whole number from 2 to 100"),
+        (("--schedule", "101", "--max-trace", "1"), "--schedule 101: expected"),
+        ((*SHORT, "--block", "8"), "--block 8: expected a whole number from 1 to 7"),
+        ((*SHORT, "--block", "0"), "--block 0: expected"),
+        ((*SHORT, "--weight", "2"), "--weight 2: expected a number from 0 to 1"),
+        ((*SHORT, "--weight", "0.2", "0.3"), "--weight takes one number for --schedule"),
+        ((*SHORT, "--states", "4"), "--states is for --policy; leave it out"),
+        (("--schedule", "8"), "give --max-trace, or --weight"),
+        (("--schedule", "8", "--max-trace", "inf"), "give --max-trace, or --weight"),
+        (("--schedule", "8", "--max-trace", "nan"), "no schedule keeps the legitimate trace at or below nan"),
+        (("--schedule", "8", "--max-trace", "1e-4"), "ask for a trace of at least that"),
+        ((*SHORT, "--policy"), "not allowed with argument"),
+        ((*SHORT, "--set", BURSTS), "the link of legitimate is different"),
+        ((*SHORT, "--set", 'encoding={scheme="cipher"}', "--set", NAIVE),
+         "the design of μ_d is for the scheme"),
+        ((*SHORT, "--set", 'eavesdroppers={wise={strategy="bayesian",link={quality=0.85}}}'), "add one, such as"),
+    ],
+)  # fmt: skip
+def test_refusals(evedrop: Evedrop, words: tuple[str, ...], said: str) -> None:
+    """What cannot be designed is refused, with the bound and the remedy."""
+    words = words if "--set" in words else (*words, "--set", SMART)
+    done = evedrop("design", "numerical", *words)
+    assert (done.status, done.out) == (2, "")
+    assert said in done.err

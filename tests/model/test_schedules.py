@@ -1,0 +1,182 @@
+"""Schedules of μ_d: their expectations, and the search for the best."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from evedrop.errors import UsageError
+from evedrop.model.process import Process
+from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
+from evedrop.model.theory.design import Adversary
+from evedrop.model.theory.schedules import BestSchedule, ScheduleProblem, SlotRecursion, best_schedule
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.slot_loop import STABLE
+
+SETTLED = Process(UNSTABLE.A, UNSTABLE.Q, 1e-3 * np.eye(2))
+MU, MU_E = 0.9, 0.85
+EAVESDROPPERS = {
+    "smart": Adversary("smart", MU_E, 1.0, 0.0),
+    "naive": Adversary("naive", MU_E, 1.0, 1.0),
+    "suspicious": Adversary("suspicious", MU_E, 0.8, 0.3),
+    "genie": Adversary("genie", MU_E, 1.0, 0.0, reads_leak=True),
+}
+
+
+def user_at(mu_d: float) -> Outcomes:
+    """The user's outcomes."""
+    return Outcomes.legitimate(MU, mu_d)
+
+
+def problem_of(
+    process: Process, eavesdropper: str, slots: int, max_trace: float, weight: float = 0.0
+) -> ScheduleProblem:
+    """The problem that `best_schedule` solves."""
+    theirs = SlotRecursion(process, EAVESDROPPERS[eavesdropper].outcomes, slots)
+    return ScheduleProblem(SlotRecursion(process, user_at, slots), theirs, slots, max_trace, weight)
+
+
+def mesh_of(slots: int, levels: int) -> np.ndarray:
+    """Every schedule whose μ_d are levels from 0 to 1 from slot 1 on."""
+    grid = list(itertools.product(np.linspace(0.0, 1.0, levels), repeat=slots - 1))
+    return np.column_stack([np.ones(len(grid)), np.array(grid)])
+
+
+@pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
+@pytest.mark.parametrize("process", [UNSTABLE, DRIFTING, STABLE])
+def test_a_constant_schedule_has_the_expectations_of_the_scheme(process: Process, eavesdropper: str) -> None:
+    """With the same μ_d in all slots the traces are those of theory, for user and eavesdropper."""
+    at = EAVESDROPPERS[eavesdropper].outcomes
+    mu_d = np.array([[0.3] * 12, [0.9] * 12])
+    for outcomes_at in (user_at, at):
+        found = SlotRecursion(process, outcomes_at, 12).traces(mu_d)
+        for row, value in zip(found, (0.3, 0.9), strict=True):
+            assert np.allclose(row, expected_traces(process, outcomes_at(value), 12), rtol=1e-9)
+
+
+@pytest.mark.parametrize("eavesdropper", ["user", "smart", "naive"])
+def test_expectations_are_those_of_all_courses(eavesdropper: str) -> None:
+    """E P_k under a schedule that changes is the mean over all losses and packet types, each with its probability."""
+    mu_d, mu = (1.0, 0.2, 0.7, 0.4), MU if eavesdropper == "user" else MU_E
+    A, Q, slots = UNSTABLE.A, UNSTABLE.Q, len(mu_d)
+    misled = misled_covariances(UNSTABLE, slots)
+    expected = np.zeros(slots)
+    for course in itertools.product(itertools.product((True, False), repeat=2), repeat=slots):
+        chance, P = 1.0, UNSTABLE.initial_covariance
+        for k, (heard, state) in enumerate(course):
+            chance *= (mu if heard else 1 - mu) * (mu_d[k] if state else 1 - mu_d[k])
+            predicted = A @ P @ A.T + Q if k else P
+            if not heard:
+                P = predicted
+            elif state:
+                P = np.zeros_like(P)
+            else:
+                P = {"user": predicted - Q, "smart": predicted, "naive": misled[k]}[eavesdropper]
+            expected[k] += (
+                chance / 4.0 ** (slots - 1 - k) * np.trace(P)
+            )  # as often as there are courses of the later slots
+    outcomes_at = user_at if eavesdropper == "user" else EAVESDROPPERS[eavesdropper].outcomes
+    found = SlotRecursion(UNSTABLE, outcomes_at, slots).traces(np.array([mu_d]))[0]
+    assert np.allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
+@pytest.mark.parametrize(
+    ("process", "max_trace", "weight"), [(SETTLED, 0.0015, 0.0), (SETTLED, 0.002, 0.6), (STABLE, 0.03, 0.5)]
+)
+def test_the_program_finds_the_best_of_the_grid(
+    process: Process, eavesdropper: str, max_trace: float, weight: float
+) -> None:
+    """With room for all candidates it is the best of every schedule on the grid, and says so."""
+    problem = problem_of(process, eavesdropper, 5, max_trace, weight)
+    sums = problem.sums(mesh_of(5, 5))
+    found = best_schedule(
+        process, MU, EAVESDROPPERS[eavesdropper].outcomes, 5, max_trace, weight, levels=5, capacity=10_000
+    )
+    assert found.exact
+    assert found.grid.value == pytest.approx(sums.max(), rel=1e-9)
+    assert max(found.grid.user) <= max_trace * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("eavesdropper", "share"), [("smart", 1.0), ("genie", 1.0), ("naive", 0.99), ("suspicious", 0.99)]
+)
+@pytest.mark.parametrize(("process", "max_trace"), [(SETTLED, 0.0015), (UNSTABLE, 0.5), (STABLE, 0.05)])
+def test_the_best_schedule_is_as_good_as_brute_force(
+    process: Process, max_trace: float, eavesdropper: str, share: float
+) -> None:
+    """No schedule on a fine mesh of all does better; against misled eavesdroppers none by more than a hundredth."""
+    problem = problem_of(process, eavesdropper, 4, max_trace)
+    found = best_schedule(process, MU, EAVESDROPPERS[eavesdropper].outcomes, 4, max_trace).best
+    assert found.value >= share * problem.sums(mesh_of(4, 41)).max() * (1 - 1e-12)
+    assert max(found.user) <= max_trace * (1 + 1e-9)
+    assert found.mu_d[0] == 1.0
+    assert found.value == pytest.approx(sum(found.eavesdropper))
+
+
+def test_changes_of_two_neighbours_find_what_changes_of_one_do_not() -> None:
+    """A case in which no single μ_d can be changed for the better at a sum that is a hundredth below brute force."""
+    naive = Adversary("naive", 0.9, 1.0, 1.0)
+    user = SlotRecursion(SETTLED, lambda mu_d: Outcomes.legitimate(0.8, mu_d), 5)
+    problem = ScheduleProblem(user, SlotRecursion(SETTLED, naive.outcomes, 5), 5, 0.0015, 0.0)
+    found = best_schedule(SETTLED, 0.8, naive.outcomes, 5, 0.0015).best
+    assert found.value >= problem.sums(mesh_of(5, 21)).max()
+
+
+@pytest.mark.parametrize("eavesdropper", ["smart", "naive"])
+def test_no_change_of_one_slot_improves_it(eavesdropper: str) -> None:
+    """Every other value of a single μ_d either violates Ω or loses."""
+    slots = 9
+    found = best_schedule(SETTLED, MU, EAVESDROPPERS[eavesdropper].outcomes, slots, 0.004, levels=5, capacity=20).best
+    problem = problem_of(SETTLED, eavesdropper, slots, 0.004)
+    for k in range(1, slots):
+        tried = np.repeat(np.array([found.mu_d]), 101, axis=0)
+        tried[:, k] = np.linspace(0.0, 1.0, 101)
+        assert problem.sums(tried).max() <= found.value * (1 + 1e-4)
+
+
+def test_the_user_is_kept_at_the_bound() -> None:
+    """Against smart: no states until the user's error reaches Ω, then just enough; twice as good as the best constant μ_d."""
+    found = best_schedule(SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 16, 0.005, levels=5, capacity=50)
+    assert found.best.mu_d[1:5] == (0.0,) * 4
+    assert np.allclose(found.best.user[6:], 0.005)
+    assert found.best.value > 1.7 * found.constant.value
+    assert len(set(found.constant.mu_d[1:])) == 1
+    assert max(found.constant.user) <= 0.005 * (1 + 1e-9)
+    assert not found.exact
+    assert list(found.as_dict()) == ["best", "constant", "grid", "exact"]
+
+
+def test_blocks_share_their_probability() -> None:
+    """With blocks of three slots μ_d changes at slots 1, 4, 7 and 10 alone; one block is the best constant."""
+
+    def found(block: int) -> BestSchedule:
+        return best_schedule(
+            SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 12, 0.005, block=block, levels=5, capacity=50
+        )
+
+    thirds, whole = found(3), found(11)
+    mu_d = thirds.best.mu_d
+    assert [mu_d[k] for k in (2, 3, 5, 6, 8, 9, 11)] == [mu_d[k] for k in (1, 1, 4, 4, 7, 7, 10)]
+    assert len(set(mu_d[1:])) > 1
+    assert whole.best.value == pytest.approx(whole.constant.value, rel=1e-9)
+    assert whole.best.value <= thirds.best.value <= found(1).best.value
+
+
+def test_the_weight_of_the_user_raises_the_probabilities() -> None:
+    """Without Ω: at weight 1 every packet is the state, at 0 none; between them the sum is that of the weights."""
+    at = EAVESDROPPERS["smart"].outcomes
+    assert best_schedule(STABLE, MU, at, 6, weight=1.0).best.mu_d == (1.0,) * 6
+    assert best_schedule(STABLE, MU, at, 6).best.mu_d == (1.0,) + (0.0,) * 5
+    found = best_schedule(STABLE, MU, at, 6, weight=0.6).best
+    assert found.value == pytest.approx(0.4 * sum(found.eavesdropper) - 0.6 * sum(found.user))
+
+
+def test_a_trace_that_no_schedule_keeps_is_refused() -> None:
+    """With the least trace that one does, in which slot; that one is then kept."""
+    at = EAVESDROPPERS["smart"].outcomes
+    with pytest.raises(UsageError, match=r"at or below 0\.1 .* it is 0\.2 in slot 0; ask for"):
+        best_schedule(UNSTABLE, MU, at, 6, 0.1)
+    assert best_schedule(UNSTABLE, MU, at, 6, 0.2).best.user[0] == pytest.approx(0.2)
