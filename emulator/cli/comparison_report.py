@@ -11,6 +11,7 @@ from rich.table import Table
 
 from evedrop.cli.report import terminal
 from evedrop.figures.text import estimate, figure_text
+from evedrop.score.summary import RARE_SHARE
 from evedrop.score.verdict import MARKS, SecrecyKept
 
 if TYPE_CHECKING:
@@ -109,6 +110,10 @@ def verdict(cell: Cell) -> str:
     return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
 
 
+def _rare_share(of: SimulatedError | None) -> float:
+    return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.share
+
+
 def _undefined(found: Comparison) -> Iterator[str]:
     """A line for each adversary and reason that a pair is not defined, with its schemes."""
     cells = [cell.match for one in found.schemes.values() for cell in one.cells.values()]
@@ -127,6 +132,16 @@ def _remarks(found: Comparison) -> Iterator[str]:
         yield (
             "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
             "below the expectation of theory"
+        )
+    shares = {
+        name: max((_rare_share(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
+        for name, one in found.schemes.items()
+    }
+    rare = [f"{name} up to {100 * share:.2g} %" for name, share in shares.items() if share > RARE_SHARE]
+    if rare:
+        yield (
+            f"events of which {found.trials:,} trials contain fewer than one on average carry a part of expected errors, whose "
+            f"means and standard errors are then probably too small: {', '.join(rare)}"
         )
     if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
         yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"

@@ -261,8 +261,11 @@ def _expectation_lines(summary: Summary) -> Iterator[str]:
 
 def _loop_line(controller: ControllerSummary) -> str:
     """The line about a closed loop."""
+    scatter = controller.standard_errors.get("mean_squared_errors")
+    of_mean = scatter if isinstance(scatter, Mapping) else {}  # results of an older version have none
     errors = ", ".join(
-        f"{figure_text(error)} {name.replace('_', ' the ')}" for name, error in controller.mean_squared_errors.items()
+        f"{estimate(error, of_mean.get(name))} {name.replace('_', ' the ')}"
+        for name, error in controller.mean_squared_errors.items()
     )
     line = f"controller {controller.strategy}, {controller.decisions:,} decisions; the estimator's error is {errors}"
     if controller.failed_fraction:

@@ -90,8 +90,6 @@ class Cell:
     """The legitimate estimator in the same simulation: an attack may affect it, too."""
     eavesdropper: SimulatedError | None = None
     secrecy: Secrecy | None = None
-    ratio_error: float | None = None
-    """Standard error of the ratio; None for one trial, and for a ratio of medians."""
 
     @property
     def betrayed(self) -> bool:
@@ -107,6 +105,11 @@ class Cell:
         medians = one.infinite_variance or two.infinite_variance
         user, other = (each.quantiles["0.5"] if medians else each.mean for each in (one, two))
         return other / user if user else math.inf
+
+    @property
+    def ratio_error(self) -> float | None:
+        """Standard error of the ratio; None for one trial, and for a ratio of medians."""
+        return None if self.secrecy is None else self.secrecy.ratio_error
 
     @property
     def verdict(self) -> SecrecyKept | None:

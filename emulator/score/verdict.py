@@ -13,9 +13,11 @@ from enum import StrEnum
 import numpy as np
 
 from evedrop.expected.expectations import Expectation
+from evedrop.figures.standard_error import ratio_error
+from evedrop.figures.text import estimate
 from evedrop.model.process import Floats
 from evedrop.score.summary import SecrecySummary
-from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
+from evedrop.score.sums import WINDOWS, Tally, trial_means, window_means, window_of
 
 ERROR_RATE = 0.01
 """Of a verdict: how often `held`, or `failed`, may be said in error."""
@@ -52,6 +54,8 @@ class Secrecy:
     """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
     unknown: str = "no theory covers these links"
     """The end of the sentence where theory makes no claim."""
+    ratio_error: float | None = None
+    """Standard error of the ratio; None for one trial, and where an error has infinite variance."""
 
     @property
     def summary(self) -> SecrecySummary:
@@ -77,7 +81,7 @@ class Secrecy:
             promise = f"theory promises relative secrecy from slot {self.relative_from} on"
         if math.isnan(self.ratio):
             return f"{self.eavesdropper}: nothing was measured; {promise}"
-        times = "∞" if math.isinf(self.ratio) else f"{self.ratio:.3g}"
+        times = "∞" if math.isinf(self.ratio) else estimate(self.ratio, self.ratio_error, ".3g")
         where = f" in slots {self.windows}" if self.windows else ""
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",
@@ -204,6 +208,8 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     else:
         perfect = _perfect(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
     ratio = other.error / user.error if user.error else math.inf if user.done else math.nan
+    scattered = not heavy and user.alike and other.alike
+    scatter = ratio_error(trial_means(other), trial_means(user)) if scattered else None
     return Secrecy(
         name,
         relative,
@@ -215,7 +221,8 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         ratio,
         user.trials,
         "median" if heavy else "mean",
-        *(["no closed form of its error is known"] if other_theory.outcomes_at is None else []),
+        unknown="no closed form of its error is known" if other_theory.outcomes_at is None else Secrecy.unknown,
+        ratio_error=scatter,
     )
 
 

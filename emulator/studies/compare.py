@@ -22,7 +22,7 @@ import numpy as np
 from evedrop.errors import Interrupted, RunError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
-from evedrop.figures.standard_error import ratio_error, standard_error, z_of
+from evedrop.figures.standard_error import standard_error, z_of
 from evedrop.memory.montecarlo import Merger, Plan, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
@@ -126,15 +126,7 @@ def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
     secrecy = {one.eavesdropper: one for one in verdicts(group.scenario, totals)}
     return {
-        one.adversary: Cell(
-            one,
-            measured[LEGITIMATE],
-            measured[one.receiver],
-            secrecy[one.receiver],
-            None
-            if measured[LEGITIMATE].infinite_variance or measured[one.receiver].infinite_variance
-            else ratio_error(trial_means(totals[one.receiver]), trial_means(totals[LEGITIMATE])),
-        )
+        one.adversary: Cell(one, measured[LEGITIMATE], measured[one.receiver], secrecy[one.receiver])
         for one in group.matches
     }
 

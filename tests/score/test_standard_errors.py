@@ -254,6 +254,35 @@ def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.Captur
         assert "is carried by events" not in report_of(summary, capsys)
 
 
+def test_the_report_has_the_standard_errors_of_a_loop(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Of both estimators and of the application; a summary of an older version has none, and is reported all the same."""
+    results = montecarlo("heated-room", slots=300, trials=5, out=tmp_path / "run", plan=ALONE, expect=[])
+    text = report_of(results.typed_summary, capsys)
+    lines = [line for line in text.splitlines() if line.startswith(("controller", "the room", "fraction of"))]
+    assert [line.count(" ± ") for line in lines] == [2, 2, 3]
+    older = json.loads(json.dumps(results.summary))
+    for name in ("controller", "comfort"):
+        del older[name]["standard_errors"]
+    lines = [
+        line for line in report_of(Summary.read(older), capsys).splitlines() if line.startswith(("contr", "the room"))
+    ]
+    assert [line.count(" ± ") for line in lines] == [0, 0]
+
+
+def test_the_ratio_of_a_verdict_has_a_standard_error(recorded: Results, tmp_path: Path) -> None:
+    """That of the trials' pairs of means; none for one trial, nor where an error has infinite variance."""
+    user, other = (
+        of_trials(recorded, name, lambda row: float(row["squared_error"])) for name in ("legitimate", "smart")
+    )
+    ratio, error = other.mean() / user.mean(), ratio_error(other, user)
+    sentence = recorded.summary["secrecy"]["smart"]["sentence"]
+    assert sentence.startswith(f"smart: {estimate(ratio, error)} × the legitimate error")
+    assert " ± " in sentence
+    for scenario, trials in (("eavesdroppers", 1), ("numerical", 5)):
+        alone = montecarlo(scenario, slots=50, trials=trials, out=tmp_path / scenario, plan=ALONE, expect=[])
+        assert " ± " not in alone.summary["secrecy"]["smart"]["sentence"]
+
+
 def test_rare_events_are_unknown_without_single_slots(recorded: Results) -> None:
     """For a link with a memory and for a genie; the numbers of the others are those of theory."""
     for name, scenario in (("legitimate", "bursts"), ("genie", "bayesian")):

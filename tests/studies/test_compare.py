@@ -380,6 +380,21 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     assert set(found["schemes"]["innovation"]["against"]["reference"]) == {"not_defined"}
 
 
+def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
+    """For schemes whose adversaries have more than a hundredth of their expected error from them, in these trials."""
+    names = ("--schemes", "innovation,plain", "--adversaries", "naive,smart", "--slots", "100", "--out", "found")
+    done = evedrop("compare", "eavesdroppers", *names, "--trials", "30")
+    (line,) = (
+        line for line in done.out.splitlines() if line.startswith("events of which 30 trials contain fewer than one")
+    )
+    found = json.loads((evedrop.folder / "found" / "compare.json").read_text())
+    for scheme, one in found["schemes"].items():
+        rare = [cell["eavesdropper"]["rare_events"] for cell in one["against"].values() if "eavesdropper" in cell]
+        share = max(each["share"] for each in rare)
+        assert share > 0.01
+        assert f"{scheme} up to {100 * share:.2g} %" in line
+
+
 def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:
     """In the order of schemes and adversaries."""
     found, _ = everything
