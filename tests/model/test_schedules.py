@@ -11,7 +11,7 @@ from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
 from evedrop.model.theory.design import Adversary
-from evedrop.model.theory.schedules import BestSchedule, ScheduleProblem, SlotRecursion, best_schedule
+from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, ScheduleProblem, SlotRecursion, best_schedule
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import STABLE
 
@@ -147,6 +147,8 @@ def test_the_user_is_kept_at_the_bound() -> None:
     assert max(found.constant.user) <= 0.005 * (1 + 1e-9)
     assert not found.exact
     assert list(found.as_dict()) == ["best", "constant", "grid", "exact"]
+    assert ScheduleDesign({"smart": found}, {}).as_dict() == {"eavesdroppers": {"smart": found.as_dict()}}
+    assert ScheduleDesign({}, {"wise": "bayesian"}).as_dict()["left_out"] == {"wise": "bayesian"}
 
 
 def test_blocks_share_their_probability() -> None:
