@@ -7,8 +7,8 @@ Source: docs/montecarlo.md, the most surprising trial.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import final
+from collections.abc import Iterable, Sequence
+from typing import Any, final
 
 import numpy as np
 
@@ -36,9 +36,11 @@ class ConditionalError:
         """prior: covariance before slot 0, (n, n)."""
         self._process = process
         self._P = np.repeat(prior[:, :, None], trials, axis=2)
-        self._done = np.zeros(trials)
+        self._sum = np.zeros(trials)
+        self._mark = np.zeros(trials)
+        """The sum up to the last used state."""
         self._squares = np.zeros(trials)
-        self._open = np.zeros(trials)
+        """Of the sums from one used state to the next."""
         self.slots = 0
         """The number of slots so far; 0 in a mode without errors."""
 
@@ -48,16 +50,29 @@ class ConditionalError:
         covariances = kernels.follow_covariance(process.A, process.Q, self._P, action, self.slots == 0)
         self._P = covariances[-1]
         self.slots += len(action)
-        for used, trace in zip(action == _STATE, kernels.traces(covariances), strict=True):
-            ended = np.where(used, self._open, 0.0)
-            self._done += ended
-            self._squares += ended * ended
-            self._open = (self._open - ended) + trace  # tr P is 0 where a state is used
+        used, traces = action == _STATE, kernels.traces(covariances)
+        rows: Iterable[tuple[Any, Any]] = zip(used, traces, strict=True)
+        known: Sequence[Any] = self._sum, self._mark, self._squares
+        if used.shape[1] == 1:  # Python's floats are many times as fast as arrays of one number, and have the same bits
+            rows, known = zip(used[:, 0].tolist(), traces[:, 0].tolist(), strict=True), [one.item() for one in known]
+        total, mark, squares = known
+        # Slot by slot, so that the bits do not depend on how many slots are added at a time.
+        for now, trace in rows:
+            between = (total - mark) * now  # tr P is 0 where a state is used
+            mark = mark + between
+            squares = squares + between * between
+            total = total + trace
+        self._sum, self._mark, self._squares = (np.atleast_1d(one) for one in (total, mark, squares))
 
     @property
     def expected(self) -> Floats:
         """The expected sum of the squared errors of each trial, (R,)."""
-        return self._done + self._open
+        return self._sum
+
+    @property
+    def variance(self) -> Floats:
+        """The upper bound of its variance, (R,)."""
+        return 2.0 * (self._squares + (self._sum - self._mark) ** 2)
 
     def probability(self, error: Floats) -> Floats:
         """The probability, for each trial, that the sum of squared errors is as far from its expectation as `error` (R,).
@@ -67,7 +82,7 @@ class ConditionalError:
         from scipy.special import gammainc, gammaincc  # noqa: PLC0415 - 0.2 s that only the summary needs
 
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            shape = self.expected**2 / (2.0 * (self._squares + self._open**2))
+            shape = self.expected**2 / self.variance
             at = shape * (error / self.expected)
             found: Floats = np.minimum(2.0 * np.minimum(gammainc(shape, at), gammaincc(shape, at)), 1.0)
         return found
@@ -76,7 +91,7 @@ class ConditionalError:
     def merged(cls, parts: Sequence[ConditionalError]) -> ConditionalError:
         """The sums of disjoint sets of trials, in their order."""
         whole = cls(parts[0]._process, np.zeros_like(parts[0]._process.Q), 0)
-        for name in ("_P", "_done", "_squares", "_open"):
+        for name in ("_P", "_sum", "_mark", "_squares"):
             setattr(whole, name, np.concatenate([getattr(part, name) for part in parts], axis=-1))
         whole.slots = min(part.slots for part in parts)
         return whole

@@ -55,17 +55,17 @@ def test_the_expectation_is_the_mean_of_many_trials_with_the_same_events() -> No
     own.add(action)
     found = errors(MARGINAL, action, 4)
     assert found.mean() == pytest.approx(own.expected[0], abs=4.5 * found.std() / np.sqrt(TRIALS))
-    assert 0.5 < found.var() / (2.0 * (own._squares + own._open**2))[0] < 1.3  # a bound; beyond 1 by chance only
+    assert 0.5 < found.var() / own.variance[0] < 1.3  # a bound; beyond 1 by chance only
 
 
 @pytest.mark.parametrize("length", [1, 7, SLOTS])
 def test_blocks_of_slots_and_sets_of_trials_do_not_matter(length: int) -> None:
-    """To the bit: slots in parts, and trials in two sets that are merged."""
+    """To the bit: slots in parts, and trials in sets, one of them of one trial, that are merged."""
     action = actions(5, 20)
     whole = ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, 20)
     whole.add(action)
-    parts = [ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, count) for count in (8, 12)]
-    for part, trials in zip(parts, (slice(0, 8), slice(8, 20)), strict=True):
+    parts = [ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, count) for count in (8, 11, 1)]
+    for part, trials in zip(parts, (slice(0, 8), slice(8, 19), slice(19, 20)), strict=True):
         for first in range(0, SLOTS, length):
             part.add(action[first : first + length, trials])
     merged = ConditionalError.merged(parts)
