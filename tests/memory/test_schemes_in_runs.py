@@ -185,7 +185,12 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
         detection.add(chunk.first, chunk.slots.alarms)
     assert np.array_equal(detection.first, np.full(5, 10))
     assert detection.summary(scenario) == DetectionSummary(
-        attack_from=10, alarms=5, false_alarms=0, mean_delay=1.0, first_alarm=10
+        attack_from=10,
+        alarms=5,
+        false_alarms=0,
+        mean_delay=1.0,
+        first_alarm=10,
+        standard_errors={"mean_delay": 0.0},
     )
 
 
