@@ -11,7 +11,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.acknowledgements import rates_of
+from evedrop.model.acknowledgements import FORGING, rates_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.reference_floor import reference_floor
@@ -100,7 +100,7 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
     kind = SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
     # Unless acknowledgements are forged the user never misses a reference, so it knows more about each slot.
-    told = receiver != LEGITIMATE or table.attack == "forge"
+    told = receiver != LEGITIMATE or table.attack in FORGING
     if kind in ("reference", "open-loop") and told:
         bound = kind == "reference" and split[1] > 0.0 and ReferenceCode(process).decorrelates
         return Closed(process, scenario.slots, quality[receiver], split, None, bound)
@@ -116,13 +116,13 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
 def _split(scenario: Scenario, receiver: str) -> Split:
     table, quality = scenario.acknowledgements, scenario.quality
     assert table is not None  # noqa: S101 - asked by the caller
-    mu, alpha = quality[LEGITIMATE], table.link.quality
+    mu, alpha, flip = quality[LEGITIMATE], table.link.quality, table.flip or 0.0
     if receiver == LEGITIMATE:
         mu_e = 1.0 if table.jammer is None else quality[table.jammer]
-        return rates_of(table.attack, mu, mu_e, alpha).user
+        return rates_of(table.attack, mu, mu_e, alpha, flip).user
     if table.jammer in (None, receiver):
-        return rates_of(table.attack, mu, quality[receiver], alpha).eavesdropper
-    arrives = rates_of(table.attack, mu, quality[table.jammer], alpha).arrives
+        return rates_of(table.attack, mu, quality[receiver], alpha, flip).eavesdropper
+    arrives = rates_of(table.attack, mu, quality[table.jammer], alpha, flip).arrives
     return arrives * quality[receiver], arrives * (1.0 - quality[receiver])
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from evedrop.expected.closed_forms import Closed, ClosedStream, closed_of
 from evedrop.model import modulated
+from evedrop.model.acknowledgements import FORGING
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Floats, Process
 from evedrop.model.schemes import SCHEMES, scheme_of
@@ -142,7 +143,7 @@ def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     if receiver == LEGITIMATE:
         table = scenario.acknowledgements
-        forged = table is not None and table.attack == "forge" and LEGITIMATE in scheme.closed_forms
+        forged = table is not None and table.attack in FORGING and LEGITIMATE in scheme.closed_forms
         return None if forged else legitimate_outcomes(scheme)
     eavesdropper = scenario.eavesdroppers[receiver]
     return eavesdropper_outcomes(scheme, eavesdropper.strategy, eavesdropper.parameters)

@@ -84,7 +84,7 @@ class ExactSimulation:
         self._way_back = (
             None
             if way_back is None
-            else AckChannel(way_back.attack, way_back.quality, keys.way_back, batch, way_back.spans)
+            else AckChannel(way_back.attack, way_back.quality, keys.way_back, batch, way_back.spans, way_back.flip)
         )
         self._steering = None
         if scenario.controller is not None and scenario.assignment is not None:

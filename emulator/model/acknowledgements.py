@@ -14,24 +14,28 @@ import numpy as np
 from evedrop.model.receiver import Flags
 from evedrop.streams import Ahead, Batch, BlockReader
 
-Attack = Callable[[Flags, Flags], Flags]
-"""(γ of the user, γᵉ of the jammer) → the acknowledgements on the air, all (R,)."""
+Attack = Callable[[Flags, Flags, Flags], Flags]
+"""(γ of the user, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
 
 
-def _none(gamma: Flags, gamma_e: Flags) -> Flags:  # noqa: ARG001 - what the jammer hears does not matter
+def _none(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - what the jammer hears does not matter
     return gamma
 
 
-def _block_all(gamma: Flags, gamma_e: Flags) -> Flags:  # noqa: ARG001 - the same
+def _block_all(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
     return np.zeros_like(gamma)
 
 
-def _block_critical(gamma: Flags, gamma_e: Flags) -> Flags:
+def _block_critical(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
     return gamma & gamma_e
 
 
-def _forge(gamma: Flags, gamma_e: Flags) -> Flags:  # noqa: ARG001 - the same
+def _forge(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
     return np.ones_like(gamma)
+
+
+def _flip(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
+    return gamma ^ flips
 
 
 ATTACKS: Mapping[str, Attack] = {
@@ -39,8 +43,11 @@ ATTACKS: Mapping[str, Attack] = {
     "all": _block_all,
     "critical": _block_critical,
     "forge": _forge,
+    "flip": _flip,
 }
-"""critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0."""
+"""critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0; flip does either."""
+FORGING = frozenset({"forge", "flip"})
+"""The attacks that make a reference of a packet that the user has not heard."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +59,15 @@ class WayBackSpec:
     jammer: str | None
     spans: Sequence[Sequence[int]] | None
     """Slots [from, to) in which the attack is on; None: in all slots."""
+    flip: float = 0.0
+    """The probability of a flip, for the attack `flip`."""
 
 
 @final
 class AckChannel:
     """Acknowledgements from user to sensor: each that is on the air arrives with probability `quality`.
 
-    spans: slots [from, to) in which the attack is on; None: in all slots.
+    spans: slots [from, to) in which the attack is on; None: in all slots. flip: the probability of a flip.
     """
 
     def __init__(
@@ -68,11 +77,14 @@ class AckChannel:
         key: bytes,
         batch: Batch,
         spans: Sequence[Sequence[int]] | None = None,
+        flip: float = 0.0,
     ) -> None:
         self._attack = ATTACKS[attack]
         self._spans = spans
-        reader = BlockReader(key, batch, 1)
-        self._through = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, 0, :] < quality)
+        # The first of two words is that of a reader of one.
+        reader = BlockReader(key, batch, 2)
+        limits = np.array([quality, flip])[:, None]
+        self._drawn = Ahead(reader.ahead, lambda slots: reader.uniforms(slots) < limits)
 
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
         """The acknowledgements of slot k that reach the sensor, (R,).
@@ -81,8 +93,9 @@ class AckChannel:
         gamma_e: what the jammer received.
         """
         attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
-        on_the_air = self._attack(gamma, gamma_e) if attacked else gamma
-        arrived: Flags = on_the_air & self._through.at(k)
+        through, flips = self._drawn.at(k)
+        on_the_air = self._attack(gamma, gamma_e, flips) if attacked else gamma
+        arrived: Flags = on_the_air & through
         return arrived if sent is None else arrived & sent
 
 
@@ -97,14 +110,16 @@ class AcknowledgementRates(NamedTuple):
     """The same jointly with the jammer having received the packet, and having missed it (critical or forged)."""
 
 
-def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0) -> AcknowledgementRates:
+def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: float = 0.0) -> AcknowledgementRates:
     """The rates under an attack, for independent links of qualities μ and μ_e and an independent way back.
+
+    flip: the probability of a flip.
 
     Source: docs/mathematics.md, attacks on acknowledgements.
     """
-    gamma, gamma_e = np.array([True, True, False, False]), np.array([True, False, True, False])
-    chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e)
-    arrives = quality * chances * ATTACKS[attack](gamma, gamma_e)
+    gamma, gamma_e, flips = (np.arange(8) >> bit & 1 == 0 for bit in range(3))
+    chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e) * np.where(flips, flip, 1.0 - flip)
+    arrives = quality * chances * ATTACKS[attack](gamma, gamma_e, flips)
 
     def split(heard: Flags) -> tuple[float, float]:
         return float(arrives[heard].sum()), float(arrives[~heard].sum())

@@ -105,12 +105,22 @@ class AcknowledgementsTable(Table):
     link: Annotated[WayBackTable, Field(examples=[{"quality": 0.9}])]
     attack: Annotated[str, Field(strict=True, examples=["critical"]), AfterValidator(one_of(ATTACKS))] = "none"
     jammer: Annotated[str | None, Field(strict=True, examples=["smart"])] = None
+    flip: Annotated[Probability | None, Field(examples=[0.1])] = None
     false_alarms: Annotated[float, Field(strict=True, ge=10.0, le=1e9, examples=[1e4])] = 1e4
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes in the jammer: the attack `critical` needs a jammer with a link of its own, and no other attack uses one."""
-        attack, jammer = table.get("attack", "none"), table.get("jammer")
+        """Mistakes in the entries of attacks: `critical` needs a jammer with a link of its own, `flip` a probability."""
+        attack, jammer, flip = table.get("attack", "none"), table.get("jammer"), table.get("flip")
+        if attack == "flip" and flip is None:
+            return [
+                (
+                    "flip",
+                    "is missing; the attack flip needs the probability of flipping an acknowledgement, such as flip = 0.1",
+                )
+            ]
+        if attack != "flip" and flip is not None:
+            return [("flip", f"is set, but the attack {as_toml(attack)} flips nothing; remove the line")]
         if attack == "critical" and jammer is None:
             return [
                 ("jammer", "is missing; the attack critical needs the eavesdropper that blocks the packets it missed")

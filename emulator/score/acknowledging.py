@@ -27,7 +27,7 @@ def way_back_of(scenario: Scenario) -> WayBackSpec | None:
     table = scenario.acknowledgements
     if table is None:
         return None
-    return WayBackSpec(table.link.quality, table.attack, table.jammer, scenario.timeline.jams)
+    return WayBackSpec(table.link.quality, table.attack, table.jammer, scenario.timeline.jams, table.flip or 0.0)
 
 
 def chart_of(scenario: Scenario) -> Chart | None:
@@ -41,7 +41,8 @@ def chart_of(scenario: Scenario) -> Chart | None:
     attack = _ATTACK_LOOKED_FOR if table.attack == "none" else table.attack
     quality = scenario.quality
     mu, mu_e = quality[LEGITIMATE], 1.0 if table.jammer is None else quality[table.jammer]
-    normal, attacked = (rates_of(name, mu, mu_e, table.link.quality).arrives for name in ("none", attack))
+    flip = table.flip or 0.0
+    normal, attacked = (rates_of(name, mu, mu_e, table.link.quality, flip).arrives for name in ("none", attack))
     if normal == 1.0 and attacked < 1.0:
         return Chart(acknowledged=0, missing=1, threshold=1)
     try:

@@ -189,7 +189,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
     tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
     way_back = tables.pop("acknowledgements", _WAY_BACK)
     if SCHEMES[scheme].needs_acknowledgements:
-        way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer")}
+        way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer", "flip")}
         jammer = {"jammer": matches[0].receiver} if attack == "critical" else {}
         tables["acknowledgements"] = {**way_back, "attack": attack, **jammer}
     return checked(tables, scenario.title)

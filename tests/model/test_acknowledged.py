@@ -427,3 +427,43 @@ def test_a_betrayed_state_is_a_reference_like_any_other() -> None:
     belief = spy.step(k, belief, Reception(nothing, x[k], truth=x[k]))
     belief = spy.step(k + 1, belief, Reception(~nothing, z, np.full((1, 2), learns_at)))
     assert np.allclose(belief.x_hat, x[k + 1], rtol=1e-12)
+
+
+def test_a_receiver_that_begins_later_knows_the_states_law() -> None:
+    """Before slot 5 the factor of its knowledge is that of its covariance in slot 4; it follows references since then."""
+    for process in (UNSTABLE, STABLE):
+        receiver = ReferenceReceiver(process, 2)
+        belief = receiver.prior(5)
+        X = belief.memory[2][:, :, 0]
+        assert np.allclose(X @ X.T, belief.P[:, :, 0], rtol=1e-12)
+        on, z = np.ones(2, bool), np.ones((2, 2))
+        for t, action in ((3, Action.DISCARDED), (4, Action.INNOVATION)):
+            assert (receiver.step(5, belief, Reception(on, z, np.full((1, 2), t))).action == action).all()
+
+
+def test_a_state_that_is_betrayed_in_slot_0_is_known() -> None:
+    """With no reference yet; the next packet with a reference to slot 0 is read, up to the rounding of x_0."""
+    receiver = ReferenceReceiver(STABLE, 2)
+    x = np.ones((2, 2))
+    belief = receiver.informed(0, x, receiver.prior())
+    after = receiver.step(1, belief, Reception(np.ones(2, bool), x, np.zeros((1, 2), np.int64)))
+    assert np.allclose(after.x_hat, x + carried(STABLE, 0, 1) @ x, rtol=1e-12)
+    assert np.abs(after.P).max() < 1e-28
+
+
+def test_each_trial_follows_its_own_headers_code() -> None:
+    """In one batch, one packet is coded, one with L = A, and one is the state; each is read as it would be alone."""
+    receiver, alone = ReferenceReceiver(STABLE, 3), ReferenceReceiver(STABLE, 1)
+    x = np.array([[1.0, 2.0, 3.0], [0.5, 0.1, -1.0]])
+    belief, single = receiver.prior(), alone.prior()
+    slot, on = np.zeros(3, np.int64), np.ones(3, bool)
+    belief = receiver.step(0, belief, Reception(on, x, np.array([slot - 1, slot])))
+    belief = receiver.step(1, belief, Reception(on, 0.1 * x, np.array([slot, [1, 2, 0]])))
+    expected = [carried(STABLE, 0, 1) @ x[:, 0] + 0.1 * x[:, 0], STABLE.A @ x[:, 1] + 0.1 * x[:, 1], 0.1 * x[:, 2]]
+    assert np.allclose(belief.x_hat, np.array(expected).T, rtol=1e-12)
+    for r in range(3):
+        single = alone.step(0, alone.prior(), Reception(on[:1], x[:, [r]], np.array([[-1], [0]])))
+        single = alone.step(1, single, Reception(on[:1], 0.1 * x[:, [r]], np.array([[0], [[1, 2, 0][r]]])))
+        assert single.x_hat.tobytes() == belief.x_hat[:, [r]].copy().tobytes()
+    # A reference that is named with another code than before is not followed.
+    assert (receiver.step(2, belief, Reception(on, x, np.array([slot, [2, 1, 2]]))).action == Action.DISCARDED).all()

@@ -25,15 +25,17 @@ KEY = stream_key(ROOT, "link/acknowledgements")
 
 
 def test_attacks_are_what_their_names_say() -> None:
-    """On each of the four outcomes of a slot."""
+    """On each of the four outcomes of a slot; a flip is drawn in every second slot."""
     gamma, gamma_e = np.array([True, True, False, False]), np.array([True, False, True, False])
+    flips = np.array([False, True, False, True])
     expected = {
         "none": [True, True, False, False],
         "all": [False] * 4,
         "critical": [True, False, False, False],
         "forge": [True] * 4,
+        "flip": [True, False, False, True],
     }
-    assert {name: attack(gamma, gamma_e).tolist() for name, attack in ATTACKS.items()} == expected
+    assert {name: attack(gamma, gamma_e, flips).tolist() for name, attack in ATTACKS.items()} == expected
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
@@ -41,10 +43,10 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     """Counted over a million packets, each rate lies within binomial bounds at 1e-6 confidence."""
     mu, mu_e, quality, slots, trials = 0.8, 0.6, 0.7, 100, 10_000
     batch = Batch(slots, trials)
-    way = AckChannel(attack, quality, KEY, batch)
+    way = AckChannel(attack, quality, KEY, batch, flip=0.2)
     gamma, gamma_e = coins(mu, slots, trials, 1), coins(mu_e, slots, trials, 2)
     arrived = np.array([way.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
-    rates = rates_of(attack, mu, mu_e, quality)
+    rates = rates_of(attack, mu, mu_e, quality, 0.2)
     for found, rate in (
         (arrived, rates.arrives),
         (arrived & gamma, rates.user[0]),

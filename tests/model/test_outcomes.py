@@ -39,7 +39,9 @@ LEGITIMATE = {
     "twin-track": STATES,
     "acknowledged": STATES,
     "open-loop": STATES,
+    "random-code": None,
     "scheduled": None,
+    "threshold-code": None,
 }
 
 

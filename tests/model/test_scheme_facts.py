@@ -79,7 +79,9 @@ def test_the_bits_of_packets_and_secrets_are_counted() -> None:
         "innovation": (128, 192, 0),
         "open-loop": (256, 0, 0),
         "plain": (128, 0, 0),
+        "random-code": (256, 0, 0),
         "scheduled": (128, 0, 0),
+        "threshold-code": (256, 0, 0),
         "twin-track": (128, 64, 256),
         "withholding": (128, 0, 0),
     }

@@ -189,7 +189,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
     assert {name: (one.payload_bits, one.header_bits) for name, one in needs.items()} == {
         **dict.fromkeys(SCHEMES, (128, 0)),
         "acknowledged": (128, 64),
-        "open-loop": (128, 128),
+        **dict.fromkeys(("open-loop", "random-code", "threshold-code"), (128, 128)),
         "encrypted-schedule": (128, 64),
     }
     secret = {name: (one.secret_bits_per_slot, one.initial_secret_bits) for name, one in needs.items()}
@@ -204,7 +204,9 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         "acknowledged",
         "encrypted-schedule",
         "open-loop",
+        "random-code",
         "scheduled",
+        "threshold-code",
     }
     assert needs["plain"].sent_fraction == 1.0
     assert needs["withholding"].sent_fraction == pytest.approx(0.3, abs=0.03)

@@ -51,7 +51,15 @@ _OUTAGES = listed(row(SLOT, SLOT, flag))
 _SCORE = whole(-NEVER)
 _CHART: Check = maybe(table(dict.fromkeys(("acknowledged", "missing", "threshold"), _SCORE)))
 _WAY_BACK: Check = maybe(
-    table({"quality": number, "attack": text, "jammer": maybe(text), "spans": maybe(listed(row(SLOT, SLOT)))})
+    table(
+        {
+            "quality": number,
+            "attack": text,
+            "jammer": maybe(text),
+            "spans": maybe(listed(row(SLOT, SLOT))),
+            "flip": number,
+        }
+    )
 )
 _CHANGES = listed(table({"at": SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)}))
 

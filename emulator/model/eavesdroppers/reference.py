@@ -12,13 +12,13 @@ from evedrop.streams import Batch
 class Reference(PacketReader):
     """Follows the headers as the legitimate estimator does; it needs no knowledge, because the code has no secret.
 
-    Intended only for the schemes `acknowledged` and `open-loop`, against which it is optimal.
+    Intended only for the schemes `acknowledged`, `open-loop`, `random-code` and `threshold-code`, against which it is optimal.
 
     Source: docs/mathematics.md, acknowledged references.
     """
 
     only_against = (
-        ("acknowledged", "open-loop"),
+        ("acknowledged", "open-loop", "random-code", "threshold-code"),
         "follows references, and there are none: it is the same as naive here",
     )
 

@@ -13,8 +13,10 @@ from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.schemes.plain import Plain
+from evedrop.model.schemes.random_code import RandomCode
 from evedrop.model.schemes.scheduled import Scheduled
 from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.schemes.threshold_code import ThresholdCode
 from evedrop.model.schemes.twin_track import TwinTrack
 from evedrop.model.schemes.withholding import Withholding
 
@@ -25,7 +27,9 @@ _BUILT_IN: Mapping[str, type[Scheme]] = {
     "innovation": Innovation,
     "open-loop": OpenLoop,
     "plain": Plain,
+    "random-code": RandomCode,
     "scheduled": Scheduled,
+    "threshold-code": ThresholdCode,
     "twin-track": TwinTrack,
     "withholding": Withholding,
 }
