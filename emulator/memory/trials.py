@@ -162,8 +162,8 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
             unsent=account.unsent,
         )
         keeper.totals.tallies[name].count(account)
-    errors = {name: one.error[:, rows] for name, one in chunk.receivers.items()}
-    for name, scored in keeper.add(replace(part, receivers=receivers), errors).items():
+    known = {name: (one.error[:, rows], one.trace[:, rows]) for name, one in chunk.receivers.items()}
+    for name, scored in keeper.add(replace(part, receivers=receivers), known).items():
         block.sums[name].add(chunk.first, scored.sums)
 
 

@@ -60,12 +60,18 @@ class Scorekeeper:
         self._theory = theory
         self.totals = Totals.of(scenario, trials)
 
-    def add(self, slots: Slots, known: Mapping[str, Floats] | None = None) -> dict[str, Scored]:
-        """Score the next slots: receiver → its errors, sums and theory; known: the errors, if they have been computed."""
+    def add(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
+        """Score the next slots: receiver → its errors, sums and theory.
+
+        known: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
+        """
         scored = {}
         self._add_plant(slots)
         for name, receiver in slots.receivers.items():
-            errors = squared_errors(slots.x, receiver.x_hat) if known is None else known[name]
+            if known is None:
+                errors, traces = squared_errors(slots.x, receiver.x_hat), receiver.traces_of_trials
+            else:
+                errors, traces = known[name]
             one = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
@@ -73,7 +79,7 @@ class Scorekeeper:
             tally.add(slots.first, *one)
             if tally.conditional is not None:
                 tally.conditional.add(receiver.action)
-            tally.add_traces(receiver.traces_of_trials)
+            tally.add_traces(traces)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
                 tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)

@@ -140,8 +140,7 @@ class Tally(ReceiverTotals):
         if traces is None:
             self.traces = None
         elif self.traces is not None:
-            for row in traces:  # slot by slot: the same bits however the slots are divided
-                self.traces += row
+            self.traces += traces.sum(axis=0)
 
     def account(
         self,
