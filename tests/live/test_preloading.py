@@ -28,16 +28,15 @@ class Bench:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self._folder, self._stack = folder, stack
-        self._brief = briefs_of(scenario_of(), loopback_places(None, None, False), ObserverTask(folder, False))[
-            "router"
-        ]
         self.log = folder / "log"
 
     def start(self, role: str = "router", brief: Path | None = None, **environment: str) -> StartedProcess:
-        """Start a process."""
-        path = self._brief.write(Path(mkdtemp(dir=self._folder))) if brief is None else brief  # which it removes
+        """Start a process; brief: None for that of a router with a port of its own."""
+        if brief is None:
+            briefs = briefs_of(scenario_of(), loopback_places(None, None, False), ObserverTask(self._folder, False))
+            brief = briefs["router"].write(Path(mkdtemp(dir=self._folder)))  # which it removes
         with process_starter() as starter, self.log.open("wb") as log:
-            process = starter(role, path, log, {**own_environment(), **environment})
+            process = starter(role, brief, log, {**own_environment(), **environment})
         if process.stdin is not None:
             self._stack.enter_context(closing(process.stdin))
         if process.stdout is not None:

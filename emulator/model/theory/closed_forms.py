@@ -95,7 +95,7 @@ class SensorChain:
         return found
 
     def limit(self, process: Process) -> Floats:
-        """Limit of E P_k, (n, n); all inf if it is unbounded."""
+        """Limit of E P_k, (n, n), or its mean over a period if slots repeat; all inf if it is unbounded."""
         states, n = len(self.start), process.n
         # The spectral radius of a Kronecker product is the product of its factors'.
         if np.max(np.abs(np.linalg.eigvals(self.carried))) * radius(process) ** 2 >= 1.0 - 1e-12:
