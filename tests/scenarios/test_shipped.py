@@ -69,10 +69,22 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
     assert all(digests_of(live).values())
     assert blocks(live) == blocks(memory)
     for receiver, figures in live.summary["peers"].items():
+        same = memory.summary["peers"][receiver]
+        assert figures.keys() == same.keys()
         for figure, found in figures.items():
-            if figure != "digest":
-                same = memory.summary["peers"][receiver][figure]
-                assert found == (same if same is None else pytest.approx(same, rel=1e-12))
+            # Differences of trials cancel more digits than their sums do.
+            apart = 1e-9 if figure in {"standard_errors", "z"} else 1e-12
+            if isinstance(found, dict):
+                alike = dict(same[figure])
+                if figure == "standard_errors" and found["mean_trace_covariance"] is None:
+                    alike["mean_trace_covariance"] = None  # only memory knows tr P of trials that are not recorded
+                assert found.keys() == alike.keys()
+                for part, value in found.items():
+                    assert value == (alike[part] if alike[part] is None else pytest.approx(alike[part], rel=apart)), (
+                        part
+                    )
+            elif figure != "digest":
+                assert found == (same[figure] if same[figure] is None else pytest.approx(same[figure], rel=apart))
     assert live.summary["secrecy"] == memory.summary["secrecy"]
 
 
