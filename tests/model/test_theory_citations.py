@@ -10,9 +10,7 @@ def test_every_cited_section_exists() -> None:
     headings = {heading.lower() for heading in re.findall(r"^## (.+)$", text, re.MULTILINE)}
     cited = 0
     for path in sorted((ROOT / "emulator").rglob("*.py")):
-        for section in re.findall(
-            r"docs/mathematics\.md, ([A-Za-z][A-Za-z ]*[A-Za-z])", path.read_text(encoding="utf-8")
-        ):
+        for section in re.findall(r"docs/mathematics\.md, ([A-Za-z][\w ]*\w)", path.read_text(encoding="utf-8")):
             name = section.lower()
             assert any(name == h or name.startswith(h) for h in headings), f"{path.name} cites “{section}”"
             cited += 1
