@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.kernels import reference
-from evedrop.model.receiver import Action, asymmetry
+from evedrop.model.receiver import Action, asymmetry, trace_of
 from tests.builders import mirrored
 
 
@@ -60,3 +60,9 @@ def test_made_up_numbers_are_judged() -> None:
     assert asymmetry(np.array([[[0.0], [1e308]], [[-1e308], [0.0]]])) == (0, 1, 0)
     assert asymmetry(np.array([[[-1.0], [2.0]], [[2.0], [-1.0]]])) is None
     assert asymmetry(np.array([[[-1.0], [2.0]], [[3.0], [-1.0]]])) == (0, 1, 0)
+
+
+def test_traces_of_trials() -> None:
+    """The sum of each trial's diagonal, in the order of its entries."""
+    P = np.random.default_rng(3).standard_normal((3, 3, 5))
+    assert np.array_equal(trace_of(P), [P[0, 0, r] + P[1, 1, r] + P[2, 2, r] for r in range(5)])

@@ -24,7 +24,6 @@ from evedrop.streams import Ahead
 
 _SLOTS_AT_ONCE, _NUMBERS_AT_ONCE = 64, 1 << 16  # read ahead of need
 _AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state, in those of the noise: its square is far from overflow
-_DOUBLINGS = 40  # more than the slowest stable direction takes: 2⁴⁰ slots
 
 
 @final
@@ -68,10 +67,8 @@ def _stationary_factor(F: Floats, G: Floats) -> Floats:
     """Lower triangular L with L Lᵀ = S, S = F S Fᵀ + G Gᵀ, by doubling: F (s, s) stable, G (s, m)."""
     L: Floats = kernels.triangular_factors(G[None])[0]
     power = F
-    for _ in range(_DOUBLINGS):
-        grown = kernels.triangular_factors(np.concatenate([L, power @ L], axis=1)[None])[0]
-        if np.array_equal(grown, L):
-            break
+    # The power is 0 in the end: F is stable.
+    while not np.array_equal(grown := kernels.triangular_factors(np.concatenate([L, power @ L], axis=1)[None])[0], L):
         L, power = grown, power @ power
     return L
 
