@@ -102,6 +102,7 @@ def follow(
     return x_hat, follow_covariance(A, Q, before[1], action, initial)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # as in C: an unstable receiver's covariance may exceed double precision
 def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: bool = False) -> Floats:
     """The believed covariances (c, n, n, R) of `follow`, from P (n, n, R) and actions (c, R)."""
     found = np.empty((len(action), *P.shape))

@@ -24,8 +24,8 @@ from tests.faults.variants import VARIANTS, Variant
 from tests.proxy import Cable
 
 ROOT = Path(__file__).parents[2]
-ENDURED, FAILED, INTERRUPTED = "82", "132", "55"
-"""Cases of one variant: a connection that is silent for a while, a killed estimator, and a hang-up."""
+ENDURED, FAILED, INTERRUPTED = "82", "487", "55"
+"""Three cases: a connection that is silent for a while, a killed estimator, and a hang-up."""
 
 
 def test_cases_of_the_campaign_keep_what_is_promised() -> None:

@@ -18,9 +18,12 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import loopback_places
 from evedrop.live.launch.preloading import fork_servers, process_starter
 from evedrop.live.launch.starter import StartedProcess, Starter, start_process
+from evedrop.names import KERNELS_VARIABLE
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import scenario_of
 from tests.processes import parent_of, words_of
+
+OTHER_KERNELS = "" if os.environ.get(KERNELS_VARIABLE) == "numpy" else "numpy"
 
 
 class Bench:
@@ -111,7 +114,7 @@ def test_a_process_ends_with_its_standard_input(bench: Bench) -> None:
     assert second.poll() is None
 
 
-@pytest.mark.parametrize(("variable", "value"), [("PYTHONWARNINGS", "ignore"), ("EVEDROP_KERNELS", "numpy")])
+@pytest.mark.parametrize(("variable", "value"), [("PYTHONWARNINGS", "ignore"), (KERNELS_VARIABLE, OTHER_KERNELS)])
 def test_in_a_block_all_runs_have_the_same_servers(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, variable: str, value: str
 ) -> None:

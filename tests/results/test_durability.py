@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,10 +42,10 @@ ResultsWriter.checkpoint = lambda *all: None
 def kill_all(live: Live) -> None:
     """Kill -9 of the command and of all its processes, at once."""
     found = [live.process.pid, *live.left()]
-    for pid in found:
-        os.kill(pid, signal.SIGSTOP)  # so that none can notice that another one is gone
-    for pid in found:
-        os.kill(pid, signal.SIGKILL)
+    for number in (signal.SIGSTOP, signal.SIGKILL):  # stopped, so that none can notice that another one is gone
+        for pid in found:
+            with suppress(ProcessLookupError):  # it may just have ended
+                os.kill(pid, number)
     live.process.communicate()
     wait_until(lambda: not live.left(), "no process left of the run")
     wait_until(lambda: all(map(ended, found)), "processes that have let go of their files")
