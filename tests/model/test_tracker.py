@@ -261,7 +261,7 @@ def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
 @pytest.mark.thorough
 def test_more_room_changes_little() -> None:
     """Where the tracks stay within a slot's noise, 16 times the room changes its mean error by less than 2 %."""
-    batch, gamma, means = Batch(60, 200), coins(0.9, 60, 200), []
+    batch, gamma, means = Batch(60, 50), coins(0.9, 60, 50), []
     for capacity in (CAPACITY, 128):
         one, total = Tracker(Knowledge(RESTLESS, 1.0, {}, {}), batch, capacity), 0.0
         belief = one.prior()
