@@ -69,6 +69,7 @@ class Results:
                 table = pq.read_table(path)
             else:
                 table = pa.Table.from_batches(batches_of(self.folder, name), schema)
+            columns = table.column_names  # which are read only here, and need not be text
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
@@ -76,7 +77,7 @@ class Results:
             raise UsageError(
                 f"{path} is not a table of this version ({_differences(table.schema, wanted)}); run the scenario again"
             )
-        empty = [name for name in table.column_names if name not in NULLABLE and table[name].null_count]
+        empty = [name for name in columns if name not in NULLABLE and table[name].null_count]
         if empty:
             raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
         return table

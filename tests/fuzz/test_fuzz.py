@@ -29,7 +29,7 @@ QUICK = {**dict.fromkeys(READERS, 100), **dict.fromkeys(CHEAP, 200), "scenario":
 QUICK |= {name: 15 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
 """How many changed examples `make test` has each reader read."""
 LONG_FILES = {"scenario": 10_000, "change": 20_000, "summary": 5_000}
-LONG_FILES |= {name: 2_000 for name in FILES if name.startswith("results-")}
+LONG_FILES |= {name: 2_000 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
 LONG_FILES |= dict.fromkeys(CHEAP - {"change"}, 25000)
 LONG_MESSAGES = (1_000_000 - sum(LONG_FILES.values())) // len(MESSAGES) + 1
 LONG = {**dict.fromkeys(MESSAGES, LONG_MESSAGES), **LONG_FILES}
