@@ -156,8 +156,8 @@ def _inverses(C: Floats) -> Floats:
 
 def initial_factor(process: Process, first: int) -> Floats:
     """A factor of the state's covariance in slot `first`, (n, n), lower triangular."""
-    factor = cholesky(process.initial_covariance)
-    for _ in range(first):
-        carried = np.concatenate([product(process.A, factor), process.noise_factor], axis=1)
-        factor = kernels.triangular_factors(carried[None])[0]
+    if not first:
+        return cholesky(process.initial_covariance)
+    carried = np.concatenate([StateFactors(process).carried(first), process.noise_factor], axis=1)
+    factor: Floats = kernels.triangular_factors(carried[None])[0]
     return factor

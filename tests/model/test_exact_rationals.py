@@ -118,7 +118,7 @@ def test_expectations(model: Model, outcomes: Outcomes) -> None:
 @settings(deadline=None, max_examples=20)
 @given(models())
 def test_covariances_of_packets(model: Model) -> None:
-    """Encoding noise, and the error of whoever takes an innovation for a state: every entry, measured by the largest."""
+    """The encoding noise, and the error of a receiver that takes an innovation for a state: each entry, relative to the trace."""
     sigmas = rationals.state_covariances(model.A, model.Q, model.initial)
     noise, misled = noise_covariances(model.process, 10), misled_covariances(model.process, 10)
     assert not noise[0].any()

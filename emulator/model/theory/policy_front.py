@@ -61,7 +61,7 @@ class PolicyFigures:
     """The fraction of slots in which the sensor sends."""
 
     def dominates(self, other: PolicyFigures) -> bool:
-        """Whether it is no worse in all three figures, and better in one: user and transmissions low, eavesdropper high."""
+        """Whether one of the three figures is better and none is worse: user and transmissions low, eavesdropper high."""
         ours, theirs = self.to_lower, other.to_lower
         return all(a <= b for a, b in zip(ours, theirs, strict=True)) and ours != theirs
 
