@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from evedrop.cli import main as cli
+from evedrop.model.schemes import SCHEMES
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = sorted(path.name for path in DOCS.glob("*.md"))
+PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 
 
 def commands(page: str) -> list[list[str]]:
@@ -70,6 +71,15 @@ def options(parser: argparse.ArgumentParser) -> set[str]:
     return found
 
 
+def test_every_scheme_has_a_page_or_shares_one() -> None:
+    """The index links each name to its page, and that page is about it."""
+    index = (DOCS / "schemes.md").read_text(encoding="utf-8")
+    pages = dict(re.findall(r"^\| \[`([a-z-]+)`\]\((schemes/[a-z-]+\.md)\)", index, re.MULTILINE))
+    assert set(pages) == set(SCHEMES)
+    for name, page in pages.items():
+        assert f"`{name}`" in (DOCS / page).read_text(encoding="utf-8").splitlines()[0], name
+
+
 def test_the_pages_that_show_commands_have_some() -> None:
     """So that the test above tests something."""
     assert {page: len(commands(page)) >= least for page, least in {"montecarlo.md": 5, "errata.md": 9}.items()} == {
@@ -84,7 +94,7 @@ def test_links_between_documents_lead_somewhere(page: str) -> None:
     text = (DOCS / page).read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#:\s]*(?:#[^)\s]*)?)\)", text):
         name, _, anchor = target.partition("#")
-        other = DOCS / name if name else DOCS / page
+        other = (DOCS / page).parent / name if name else DOCS / page
         assert other.is_file(), target
         if anchor:
             titles = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)

@@ -19,8 +19,8 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.threshold_code import forged_share
 from evedrop.streams import Batch
 from tests.builders import UNSTABLE, digests_of
+from tests.model.acknowledged_runs import MIXED, carried
 from tests.model.slot_loop import STABLE, Played, play
-from tests.model.test_acknowledged import MIXED, carried
 
 SLOTS, TRIALS, FLIP = 200, 500, 0.2
 KEY = bytes(range(32))

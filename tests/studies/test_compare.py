@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -11,15 +10,12 @@ from typing import Any
 import pytest
 
 from evedrop import compare, montecarlo
-from evedrop.errors import ScenarioError, UsageError
-from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.results.comparison import Comparison
 from evedrop.score.verdict import SecrecyKept
-from evedrop.studies.matchups import ATTACKERS, adversaries_of, matchups_of
-from tests.conftest import Evedrop
+from evedrop.studies.matchups import ATTACKERS
 
 MARGINAL: dict[str, Any] = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
@@ -265,136 +261,6 @@ def test_the_numerical_example_at_slot_sixty(
     )
     assert last(found, "innovation", "smart") == pytest.approx((smart, user), rel=5e-4)
     assert last(found, "innovation", "genie") == pytest.approx((genie, user), rel=5e-4)
-
-
-def test_the_scenario_says_what_it_says_and_the_rest_is_documented() -> None:
-    """A strategy's first eavesdropper is taken as it is; others listen behind the link of the scenario's first."""
-    groups = {group.name: group.scenario for group in matchups_of(load("numerical")).groups}
-    innovation = groups["innovation"]
-    assert innovation.encoding.parameters == groups["withholding"].encoding.parameters == {"state_probability": 0.56}
-    assert {name: innovation.quality[name] for name in ("legitimate", "smart", "naive", "genie")} == {
-        "legitimate": 0.9,
-        "smart": 0.85,
-        "naive": 0.85,
-        "genie": 0.85,
-    }
-    suspicious = innovation.eavesdroppers["suspicious"]
-    assert (suspicious.use_state, suspicious.use_innovation) == (0.8, 0.2)
-    assert innovation.eavesdroppers["colluding"].reads_as == "bayesian"
-    assert innovation.quality["colluding"] == pytest.approx(1.0 - 0.15**2)
-    assert innovation.eavesdroppers["replay-informed"].learns_at == 40
-    assert groups["acknowledged"].acknowledgements is not None
-    assert groups["acknowledged"].acknowledgements.link.quality == 1.0
-    attacked = groups["acknowledged-blocks-critical"].acknowledgements
-    assert attacked is not None
-    assert (attacked.attack, attacked.jammer) == ("critical", "reference")
-
-
-@pytest.mark.parametrize("name", ["numerical", "vehicle", "fading", "colluding", "restart", "late", "driving-away"])
-def test_shipped_scenarios_can_be_compared(name: str) -> None:
-    """Whatever their links, events and eavesdroppers are."""
-    assert len(matchups_of(load(name)).groups) >= len(SCHEMES)
-
-
-def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
-    """Exit 2, every name that is none, and what there is."""
-    options = ("--schemes", "cypher,plain", "--adversaries", "smrt", "--with", "innovation.mu_d=0.7")
-    done = evedrop("compare", "numerical", *options)
-    assert (done.status, done.out) == (2, "")
-    for said in ("cypher is not a scheme", "did you mean cipher?", "smrt is not an adversary", "did you mean smart?"):
-        assert said in done.err
-    assert "innovation.mu_d is not a parameter of a scheme" in done.err
-    assert all(name in done.err for name in (*SCHEMES, *adversaries_of(), "innovation.state_probability"))
-    assert not list(evedrop.folder.glob("runs/*"))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ("--schemes", ""),
-        ("--with", "innovation.state_probability"),
-        ("--with", "innovation.state_probability=2.0"),
-        ("--trials", "0"),
-        ("--workers", "0"),
-        ("--slots", "5000"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(evedrop: Evedrop, options: tuple[str, ...]) -> None:
-    """Exit 2 and a reason, before anything is run."""
-    done = evedrop("compare", "numerical", *options)
-    assert (done.status, done.out) == (2, "")
-    assert done.err.startswith("evedrop: ")
-
-
-def test_mistakes_of_a_scheme_name_it() -> None:
-    """A scenario's links may be none for a scheme that stays silent."""
-    scenario = load("bayesian", {"expect": [], "legitimate.link": {"quality": 0.9, "rate": 0.9}})
-    with pytest.raises(ScenarioError, match=r"with the scheme withholding: legitimate\.link\.rate"):
-        matchups_of(scenario)
-    with pytest.raises(UsageError, match="no scheme is named"):
-        matchups_of(scenario, schemes=[])
-
-
-def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> None:
-    """Every scheme and pair in the table; compare.json, two pictures and the scenarios in the folder."""
-    names = ("--schemes", "innovation,acknowledged", "--adversaries", "smart,reference,blocks-critical")
-    done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--out", "found")
-    assert (done.status, done.err) == (0, "")
-    for said in ("innovation", "acknowledged", "blocks-critical (reference)", "✕ broken", "not defined: smart"):
-        assert said in done.out
-    folder = evedrop.folder / "found"
-    assert sorted(path.name for path in folder.iterdir()) == ["compare.json", "compare.pdf", "compare.png", "scenarios"]
-    assert sorted(path.stem for path in (folder / "scenarios").iterdir()) == [
-        "acknowledged",
-        "acknowledged-blocks-critical",
-        "innovation",
-    ]
-    assert (folder / "compare.png").stat().st_size > 20_000
-
-
-def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
-    """One line on standard output, as compare.json says it, without numbers that JSON lacks."""
-    names = ("--schemes", "innovation,acknowledged", "--adversaries", "naive,reference,forges")
-    done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--json", "--out", "found")
-
-    def refused(constant: str) -> None:
-        raise AssertionError(constant)
-
-    found: dict[str, Any] = json.loads(done.out, parse_constant=refused)
-    assert done.out.count("\n") == 1
-    assert found == json.loads((evedrop.folder / "found" / "compare.json").read_text())
-    assert set(found) == {
-        *("scenario", "slots", "trials", "seed", "first_trial", "adversaries", "dominant", "schemes"),
-    }
-    scheme = found["schemes"]["acknowledged"]
-    assert set(scheme) == {"parameters", "needs", "legitimate", "closest", "against"}
-    assert set(scheme["needs"]) == {
-        *("acknowledgements", "payload_bits", "header_bits", "packet_bits", "sent_fraction"),
-        *("secret_bits_per_slot", "initial_secret_bits"),
-    }
-    cell = scheme["against"]["forges"]
-    ratio = {"ratio", "ratio_standard_error"}
-    assert set(cell) == {"reads_as", "attack", "eavesdropper", "legitimate", "verdict", "secrecy"} | ratio
-    measured = {"mean", "standard_error", "quantiles", "infinite_variance", "theory", "z", "rare_events"}
-    assert set(cell["eavesdropper"]) == set(cell["legitimate"]) == measured
-    assert set(cell["legitimate"]["theory"]) == {"mean", "last", "limit", "bound"}
-    assert cell["legitimate"]["theory"]["limit"] == "inf"
-    assert set(found["schemes"]["innovation"]["against"]["reference"]) == {"not_defined"}
-
-
-def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
-    """For schemes whose adversaries have more than a hundredth of their expected error from them, in these trials."""
-    names = ("--schemes", "innovation,plain", "--adversaries", "naive,smart", "--slots", "100", "--out", "found")
-    done = evedrop("compare", "eavesdroppers", *names, "--trials", "30")
-    (line,) = (
-        line for line in done.out.splitlines() if line.startswith("events of which 30 trials contain fewer than one")
-    )
-    found = json.loads((evedrop.folder / "found" / "compare.json").read_text())
-    for scheme, one in found["schemes"].items():
-        rare = [cell["eavesdropper"]["rare_events"] for cell in one["against"].values() if "eavesdropper" in cell]
-        share = max(each["share"] for each in rare)
-        assert share > 0.01
-        assert f"{scheme} up to {100 * share:.2g} %" in line
 
 
 def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:

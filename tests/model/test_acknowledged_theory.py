@@ -1,0 +1,84 @@
+"""Theory of state-secrecy codes: expectations, the floor, and the example of the paper."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from evedrop.model.process import Process
+from evedrop.model.reference_floor import reference_floor
+from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.schemes.open_loop import OpenLoop
+from evedrop.model.theory.closed_forms import reference_covariances
+from evedrop.model.theory.covariances import expected_covariances
+from tests.builders import DRIFTING, UNSTABLE
+from tests.model.acknowledged_runs import MIXED, all_events, exact_sigmas, played_over
+from tests.model.slot_loop import STABLE
+
+
+@pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
+@pytest.mark.parametrize("rule", ["honest", "blocked", "critical blocked", "forged"])
+def test_expectations_are_the_recursion(process: Process, rule: str) -> None:
+    """E P of user and eavesdropper over every course of four slots, each with its probability, is the recursion's, exactly."""
+    gamma, gamma_e, link = all_events(4)
+    acks = {
+        "honest": gamma & link,
+        "blocked": np.zeros_like(gamma),
+        "critical blocked": gamma & gamma_e & link,
+        "forged": link,
+    }[rule]
+    mu, mu_e, arrives = 0.7, 0.6, 0.8
+    played = played_over(process, gamma, gamma_e, acks, OpenLoop)
+    weights = np.where(gamma, mu, 1 - mu) * np.where(gamma_e, mu_e, 1 - mu_e) * np.where(link, arrives, 1 - arrives)
+    chances = weights.prod(0)
+    assert np.isclose(chances.sum(), 1.0)
+    for name, heard, quality in (("legitimate", gamma, mu), ("eve", gamma_e, mu_e)):
+        joint = [float(chances[acks[0] & (heard[0] == flag)].sum()) for flag in (True, False)]
+        expected = reference_covariances(process, quality, (joint[0], joint[1]), 4)
+        for k, belief in enumerate(played.beliefs[name]):
+            assert np.allclose(belief.P @ chances, expected[k], rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("process", [UNSTABLE, STABLE, MIXED])
+@pytest.mark.parametrize("back", [0.0, 0.8])
+def test_the_floor_is_below_the_exact_expectation(process: Process, back: float) -> None:
+    """Over every course of five slots: a bound in each slot, exact without critical slots, and close to what it bounds."""
+    slots = 5
+    gamma, gamma_e, link = all_events(slots)
+    mu, mu_e = 0.7, 0.9
+    played = played_over(process, gamma, gamma_e, gamma & link)
+    weights = np.where(gamma, mu, 1 - mu) * np.where(gamma_e, mu_e, 1 - mu_e) * np.where(link, back, 1 - back)
+    chances = weights.prod(0)
+    acknowledged = (mu * back * mu_e, mu * back * (1.0 - mu_e))
+    floor = reference_floor(process, mu_e, acknowledged, slots)
+    exact_traces = np.array([np.trace(belief.P @ chances) for belief in played.beliefs["eve"]])
+    assert (floor <= exact_traces * (1 + 1e-9)).all()
+    assert (floor >= (0.9 if back else 1 - 1e-9) * exact_traces).all()
+
+
+def test_the_floor_follows_many_slots() -> None:
+    """Of hundreds of critical slots some stand for others: the bound falls by little, and reaches the error of not listening."""
+    found = reference_floor(STABLE, 0.9, (0.81, 0.09), 400)
+    sigma = list(itertools.islice(exact_sigmas(STABLE), 400))[-1]
+    assert found[-1] == pytest.approx(np.trace(sigma), rel=1e-6)
+    assert found[-1] <= np.trace(sigma) * (1 + 1e-12)
+    seldom = reference_floor(STABLE, 0.9, (0.9, 1e-3), 400)
+    assert 0.2 * np.trace(sigma) < seldom[-1] < (1.0 - 0.999**400) * np.trace(sigma) + 0.1 * np.trace(sigma)
+    assert np.isinf(reference_floor(MIXED, 0.9, (0.81, 0.09), 3000)[-1])
+
+
+@pytest.mark.parametrize(
+    ("initial", "honest"), [(1e-3 * np.eye(2), 4.91e7), (np.eye(2), 2.36e10)], ids=["from Q", "from I"]
+)
+def test_the_papers_example(initial: np.ndarray, honest: float) -> None:
+    """Slot 40, μ = μ_e = 0.9: lost for good with honest acknowledgements; as good as the user where the critical ones fail."""
+    process = Process(UNSTABLE.A, UNSTABLE.Q, initial)
+    found = reference_covariances(process, 0.9, (0.81, 0.09), 41)
+    assert np.trace(found[40]) == pytest.approx(honest, rel=2e-3)
+    user = np.trace(expected_covariances(process, Acknowledged(process).outcomes(0.9), 41)[40])
+    assert user == pytest.approx(2.284e-4, rel=2e-4)
+    for acknowledged in ((0.0, 0.0), (0.81, 0.0)):
+        blocked = np.trace(reference_covariances(process, 0.9, acknowledged, 41)[40])
+        assert blocked == pytest.approx(user, rel=1e-12)
