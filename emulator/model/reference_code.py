@@ -5,6 +5,7 @@ Source: docs/mathematics.md, acknowledged references.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import final
 
 import numpy as np
@@ -19,6 +20,7 @@ NONE = -1
 _SLOTS_AT_ONCE = 64
 _NUMBERS_KEPT = 1 << 22  # of matrices L in memory, unless two blocks have more
 _LARGEST = 1e150  # a deviation of the state whose square is a double
+_OLDEST_KEPT = 1 << 12  # slots; an older one is computed again
 _WATCHED = 16  # references whose size is followed
 
 
@@ -39,8 +41,10 @@ class ReferenceCode:
         self._states = StateFactors(process)
         self._kept = max(2, _NUMBERS_KEPT // (_SLOTS_AT_ONCE * process.n * process.n))
         self._blocks: dict[int, tuple[Floats, Floats]] = {}
-        self._watch = _Watch(process)
-        self._oldest = [0]
+        self._watch: _Watch
+        self._watched: int
+        self._oldest: deque[int]
+        self._begin_to_watch()
 
     def at(self, k: int) -> Floats:
         """L_k, (n, n), for k ≥ 1."""
@@ -63,12 +67,20 @@ class ReferenceCode:
         """
         if not self.decorrelates:
             return 0
-        while len(self._oldest) <= k:
-            j = len(self._oldest)
+        if k <= self._watched - len(self._oldest):
+            self._begin_to_watch()
+        for j in range(self._watched + 1, k + 1):
             steps, starts = self._block_of(j)
             row = j % _SLOTS_AT_ONCE
             self._oldest.append(self._watch.advanced(j, steps[row], starts[row]))
-        return self._oldest[k]
+            self._watched = j
+        return self._oldest[k - self._watched - 1]
+
+    def _begin_to_watch(self) -> None:
+        """Follow the sizes of references from slot 0 on; only the results of the last slots are kept."""
+        self._watch = _Watch(self._process)
+        self._watched = 0
+        self._oldest = deque([0], _OLDEST_KEPT)
 
     def _block_of(self, k: int) -> tuple[Floats, Floats]:
         number = k // _SLOTS_AT_ONCE
