@@ -140,6 +140,11 @@ def design(
         raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
         raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
+    if made.encoding.state_probabilities is not None:
+        raise UsageError(
+            "the design of μ_d is for one μ_d in all slots, whose limits it compares, and encoding.state_probability is a list; "
+            "give --set encoding.state_probability=0.6 for the design, or --schedule N for another list"
+        )
     mu, adversaries, left_out = _adversaries(made)
     found = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace)
     return replace(found, left_out=left_out)

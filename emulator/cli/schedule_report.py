@@ -8,6 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
+from evedrop.model.checks import toml_of
 
 if TYPE_CHECKING:
     from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
@@ -29,8 +30,11 @@ def print_schedules(design: ScheduleDesign) -> None:
         )
         console.print(
             f"{on_grid} has {found.grid.value:.6g}; "
-            "none of the changes tried, of one μ_d or of two neighbouring ones, improves this schedule\n"
+            "none of the changes tried, of one μ_d or of two neighbouring ones, improves this schedule"
         )
+        numbers = list(found.best.mu_d)
+        console.print(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
+        console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True, highlight=False, markup=False)
     if design.left_out:
         who = ", ".join(f"{name} ({strategy})" for name, strategy in design.left_out.items())
         console.print(f"left out: {who}: no closed form of its error is known")

@@ -48,8 +48,11 @@ class Listening:
         """An eavesdropper for a problem."""
         with calling("streams()", self.kind):
             streams = self.kind.streams(self.parameters)
-        mu_d = made(self.scheme_of, problem, self.scheme).state_probability
-        knowledge = Knowledge(problem.process, mu_d, self.parameters, NamedKeys.of(streams))
+        scheme = made(self.scheme_of, problem, self.scheme)
+        of_slots = scheme.mu_d if isinstance(scheme.mu_d, tuple) else None
+        knowledge = Knowledge(
+            problem.process, scheme.state_probability, self.parameters, NamedKeys.of(streams), of_slots
+        )
         with calling(f"{self.kind.__name__}(knowledge, batch)", self.kind):
             return self.kind(knowledge, problem.batch)
 

@@ -36,7 +36,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
                 f"the legitimate estimator's expected error grows without bound: with spectral radius "
                 f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the losses of its link last too long"
             )
-    elif not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
+    elif expectation.has_limit and not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
         needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
         found.append(
             f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "

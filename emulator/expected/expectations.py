@@ -14,10 +14,12 @@ from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Floats, Process
+from evedrop.model.schedule import in_slot
 from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
-from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt
+from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
 from evedrop.model.theory.rare_events import Streaks, streaks
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
@@ -63,10 +65,14 @@ class Expectation:
     """Maps a link's quality to the frequencies of the receiver's actions; None if these are unknown."""
     bound_at: OutcomesAt | None = None
     """For a receiver without the secret and without a theory of its own: the genie, which no such receiver outperforms."""
+    bound_slots_at: SlotOutcomes | None = None
+    """The same as `slots_at` for `bound_at`."""
     closed: Closed | None = None
     """The closed form of a receiver whose slots differ."""
     closed_bound: Closed | None = None
     """A lower bound for such a receiver, in place of a closed form."""
+    slots_at: SlotOutcomes | None = None
+    """The outcomes of each slot, where μ_d differs from slot to slot; `outcomes_at` is then their mean, and there is no limit."""
     of_model: bool = False
     """Whether the process is only the model of a plant: then it is not the errors of a run that theory expects."""
 
@@ -82,7 +88,7 @@ class Expectation:
     @property
     def _outcomes(self) -> Outcomes | None:
         """The outcomes behind a link whose losses are independent, as in the paper."""
-        if self._known is None:
+        if self._known is None or self.slots_at is not None:
             return None
         law, outcomes_at = self._known
         alike = law.alike
@@ -95,7 +101,12 @@ class Expectation:
             return Expectation(self.process, self.law, None, closed=self.closed_bound)
         if self.known or self.law is None or self.bound_at is None:
             return None
-        return Expectation(self.process, self.law, self.bound_at)
+        return Expectation(self.process, self.law, self.bound_at, slots_at=self.bound_slots_at)
+
+    @property
+    def has_limit(self) -> bool:
+        """Whether there may be a limit: slots go on as they are, and do not follow a list that ends."""
+        return self.slots_at is None
 
     def stream(self) -> ExpectedTraceStream:
         """The expected traces from slot 0 on; NaN without a theory."""
@@ -103,7 +114,9 @@ class Expectation:
             return ClosedStream(self.closed)
         if self._outcomes is not None:
             return ExpectedCovariance(self.process, self._outcomes)
-        return _Unknown() if self._known is None else modulated.ModulatedCovariance(self.process, *self._known)
+        if self._known is None:
+            return _Unknown()
+        return modulated.ModulatedCovariance(self.process, *self._known, self.slots_at)
 
     def traces(self, slots: int) -> Floats:
         """The expected traces of slots 0 … slots−1, (slots,); NaN without a theory."""
@@ -111,7 +124,9 @@ class Expectation:
 
     @property
     def limit(self) -> float:
-        """Trace of the limit, for the link in its last state; inf if unbounded, NaN without a theory."""
+        """Trace of the limit, for the link in its last state; inf if unbounded, NaN without a theory or a limit."""
+        if not self.has_limit:
+            return math.nan
         if self.closed is not None:
             return self.closed.limit
         if self._outcomes is not None:
@@ -130,7 +145,7 @@ class Expectation:
             return self.bound.infinite_variance
         if self.closed is not None:
             return math.isinf(self.closed.limit)
-        if self._known is None:
+        if self._known is None or not self.has_limit:
             return False
         if self._outcomes is not None:
             return theory.has_infinite_variance(self.process, self._outcomes)
@@ -140,7 +155,10 @@ class Expectation:
 
 def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
     """Maps the quality of a receiver's link to the frequencies of its actions; None if these are unknown."""
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return _outcomes_of(scenario, receiver, scheme_of(scenario.process.process, scenario.encoding.spec))
+
+
+def _outcomes_of(scenario: Scenario, receiver: str, scheme: Scheme) -> OutcomesAt | None:
     if receiver == LEGITIMATE:
         table = scenario.acknowledgements
         forged = table is not None and table.attack in FORGING and LEGITIMATE in scheme.closed_forms
@@ -160,6 +178,7 @@ def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     """Receiver → theory's expectation of it."""
     found = {}
+    scheme, mu_d = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.encoding.state_probabilities
     for name in scenario.receivers:
         closed = closed_of(scenario, name)
         bound = closed is not None and closed.bound
@@ -168,10 +187,31 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
             law_of(scenario.schedule(name)),
             outcomes_of(scenario, name),
             bound_of(scenario, name),
-            None if bound else closed,
-            closed if bound else None,
-            scenario.plant is not None,
+            closed=None if bound else closed,
+            closed_bound=closed if bound else None,
+            slots_at=None if mu_d is None else _in_slots(mu_d, partial(_known_in_slot, scenario, name, scheme)),
+            bound_slots_at=None if mu_d is None else lambda k, mu_d=mu_d: partial(_genie, in_slot(mu_d, k)),  # type: ignore[misc]
+            of_model=scenario.plant is not None,
         )
+    return found
+
+
+def _in_slots(mu_d: tuple[float, ...], outcomes_in: SlotOutcomes) -> SlotOutcomes:
+    """The outcomes of each slot, asked for once for each value of μ_d."""
+    known: dict[float, OutcomesAt] = {}
+
+    def at(k: int) -> OutcomesAt:
+        value = in_slot(mu_d, k)
+        if value not in known:
+            known[value] = outcomes_in(k)
+        return known[value]
+
+    return at
+
+
+def _known_in_slot(scenario: Scenario, receiver: str, scheme: Scheme, k: int) -> OutcomesAt:
+    found = _outcomes_of(scenario, receiver, scheme.in_slot(k))
+    assert found is not None  # noqa: S101 - the mean over the slots has outcomes, so each slot has
     return found
 
 

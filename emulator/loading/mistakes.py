@@ -19,7 +19,13 @@ from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.across import acknowledgement_mistakes, application_mistakes, link_mistakes, strategy_mistakes
+from evedrop.scenario.across import (
+    acknowledgement_mistakes,
+    application_mistakes,
+    encoding_mistakes,
+    link_mistakes,
+    strategy_mistakes,
+)
 from evedrop.scenario.closed_loop import loop_mistakes
 from evedrop.scenario.event_mistakes import event_mistakes
 from evedrop.scenario.expect import Around
@@ -47,6 +53,7 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         found.append(f"shards: is {tables.shards}; {most}")
     for phase in (
         strategy_mistakes,
+        encoding_mistakes,
         acknowledgement_mistakes,
         loop_mistakes,
         application_mistakes,

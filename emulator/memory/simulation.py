@@ -90,7 +90,8 @@ class Simulation:
     def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
-        knowledge = Knowledge(self._process, self._scenario.encoding.mu_d, table.parameters, keys)
+        encoding = self._scenario.encoding
+        knowledge = Knowledge(self._process, encoding.mu_d, table.parameters, keys, encoding.state_probabilities)
         return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:

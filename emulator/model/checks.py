@@ -51,6 +51,17 @@ def probability_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[st
     return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, 1.0)]
 
 
+def probabilities_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
+    """A mistake if the entry is given and is neither a probability nor a list of them, one for each slot."""
+    value = given.get(name)
+    if not isinstance(value, list):
+        return probability_mistakes(given, name)
+    wrong = [k for k, one in enumerate(value) if not is_probability(one)]
+    if wrong:
+        return [(name, f"is {as_toml(value[wrong[0]])} for slot {wrong[0]}; expected numbers from 0 to 1")]
+    return [] if value else [(name, "is an empty list; expected a number from 0 to 1, or one for each slot")]
+
+
 def count_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[str, str]]:
     """A mistake if the entry is given and is not a number of slots from 1 on."""
     value = given.get(name, 1)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -30,6 +31,7 @@ from evedrop.model.theory.covariances import (
     ExpectedCovariance,
     Outcomes,
     OutcomesAt,
+    SlotOutcomes,
     lyapunov,
     radius,
 )
@@ -40,12 +42,14 @@ from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 class ModulatedCovariance:
     """E P_k of a receiver behind such a link, a number of slots at a time from k = 0, as `ExpectedCovariance`."""
 
-    def __init__(self, process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> None:
+    def __init__(
+        self, process: Process, law: LinkLaw, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None = None
+    ) -> None:
+        """slots_at: the outcomes of each slot, where they differ; `outcomes_at` is then their mean."""
         self._process, self._law = process, law
-        never, always = outcomes_at(0.0), outcomes_at(1.0)
-        self._base = {name: getattr(never, name) for name in PARTS}
-        self._slope = {name: getattr(always, name) - getattr(never, name) for name in PARTS}
-        self._remaining = RemainingCovariances(process) if self._slope["leaked"] or self._base["leaked"] else None
+        self._whole = _Odds.of(outcomes_at)
+        self._slots_at = slots_at
+        self._remaining = RemainingCovariances(process) if self._whole.leaks else None
         self._sigma = ExpectedCovariance(process, NOBODY)
         self._k = 0
         self._settled: Floats | None = None
@@ -78,13 +82,14 @@ class ModulatedCovariance:
 
     def _block_of(self, segment: Segment) -> LinearBlock | None:
         """The operator of the segment's blocks; None where its slots differ, or where the operator is too large to be useful."""
-        if self._law.window > BLOCK or self._remaining is not None or segment.quality_at is not None:
+        alike = self._slots_at is None and segment.quality_at is None
+        if self._law.window > BLOCK or self._remaining is not None or not alike:
             return None
         if self._process.n**2 * (len(segment.chain.law) + 1) > _LARGEST:
             return None
         if segment.start not in self._blocks:
             quality = segment.quality(range(segment.start, segment.start + 1))[0]
-            odds = [self._odds(quality * segment.arrived[lag]) for lag in range(self._law.window + 1)]
+            odds = [self._whole.at(quality * segment.arrived[lag]) for lag in range(self._law.window + 1)]
             with np.errstate(over="ignore", invalid="ignore"):
                 self._blocks[segment.start] = LinearBlock.of(self._process, segment.chain, odds)
         return self._blocks[segment.start]
@@ -147,15 +152,12 @@ class ModulatedCovariance:
         assert states is not None  # noqa: S101 - the window contains slot k
         return states
 
-    def _odds(self, quality: Floats) -> dict[str, Floats]:
-        """The probabilities of the outcomes in every state, (states,) each."""
-        return {name: self._base[name] + self._slope[name] * quality for name in PARTS}
-
     def _step(self, states: Floats | None, slot: _Slot, lag: int) -> Floats:
         """E(s) after a slot, from E(s) before it, when the slot is `lag` slots ago."""
         A, chain = self._process.A, slot.segment.chain
         quality = slot.quality * slot.segment.arrived[lag]
-        odds = {name: one[:, None, None] for name, one in self._odds(quality).items()}
+        whole = self._whole if self._slots_at is None else _Odds.of(self._slots_at(slot.k))
+        odds = {name: one[:, None, None] for name, one in whole.at(quality).items()}
         law = chain.law[:, None, None]
         if states is None or slot.before is None:
             first: Floats = odds["initial"] * law * self._process.initial_covariance
@@ -172,6 +174,28 @@ class ModulatedCovariance:
 
 
 _LARGEST = 160  # numbers that a block carries along: beyond it the operator costs more than it saves
+
+
+@dataclass(frozen=True)
+class _Odds:
+    """The probabilities of a slot's outcomes, which are affine in the link's quality."""
+
+    base: Mapping[str, float]
+    slope: Mapping[str, float]
+
+    @classmethod
+    def of(cls, outcomes_at: OutcomesAt) -> _Odds:
+        never, always = outcomes_at(0.0), outcomes_at(1.0)
+        base = {name: getattr(never, name) for name in PARTS}
+        return cls(base, {name: getattr(always, name) - base[name] for name in PARTS})
+
+    @property
+    def leaks(self) -> bool:
+        return bool(self.slope["leaked"] or self.base["leaked"])
+
+    def at(self, quality: Floats) -> dict[str, Floats]:
+        """The probabilities in every state, (states,) each, for the qualities of the states."""
+        return {name: self.base[name] + self.slope[name] * quality for name in PARTS}
 
 
 @dataclass(frozen=True)

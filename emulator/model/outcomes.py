@@ -17,7 +17,10 @@ from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 
 def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
-    """Maps its link's quality to the outcomes of the legitimate estimator; None if there is no such closed form."""
+    """Maps its link's quality to the outcomes of the legitimate estimator; None if there is no such closed form.
+
+    Of a scheme whose μ_d differs from slot to slot: their mean over the slots. `Scheme.in_slot` has those of a slot.
+    """
 
     def at(quality: float) -> Outcomes:
         found = scheme.outcomes(quality)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -75,6 +75,11 @@ class Beliefs(NamedTuple):
         """Room for the beliefs of the slots, states and trials of a shape (c, n, R)."""
         c, n, trials = shape
         return cls(np.empty(shape), np.empty((c, n, n, trials)), np.empty((c, trials), np.uint8))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Beliefs]) -> Beliefs:
+        """The beliefs of consecutive parts, at least one, as one."""
+        return parts[0] if len(parts) == 1 else cls(*map(np.concatenate, zip(*parts, strict=True)))
 
     def put(self, row: int, belief: Belief) -> None:
         """Set one slot's belief."""

@@ -40,6 +40,16 @@ def _correlation_mistakes(entry: str, name: str, link: LinkTable, other: str, ta
         yield f"{entry}: is {other}, but the loss models differ ({models}); expected the same model on both links"
 
 
+def encoding_mistakes(tables: ValidTables) -> Iterator[str]:
+    """A list of μ_d(k) that does not have one number for each slot."""
+    given = None if tables.encoding is None else tables.encoding.state_probabilities
+    if given is not None and tables.slots is not None and len(given) != tables.slots:
+        yield (
+            f"encoding.state_probability: has {len(given)} numbers; expected one number for each of the {tables.slots} "
+            "slots, or a single number for all"
+        )
+
+
 def acknowledgement_mistakes(tables: ValidTables) -> Iterator[str]:
     """Missing or needless acknowledgements, an unknown jammer, and link rates with a scheme that may be silent."""
     encoding, scheme, given = tables.encoding, tables.scheme, "acknowledgements" in tables.given

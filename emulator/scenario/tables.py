@@ -29,6 +29,7 @@ from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
 from evedrop.model.plant import Plant
 from evedrop.model.registry import asked, is_own
+from evedrop.model.schedule import StateProbability, mean_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.names import CONTROLLER, LEGITIMATE
@@ -89,8 +90,18 @@ class EncodingTable(Table):
 
     @property
     def mu_d(self) -> float:
-        """μ_d; 1 for a scheme without `state_probability`."""
-        return float(self.parameters.get("state_probability", 1.0))
+        """μ_d, or its mean over slots k ≥ 1; 1 for a scheme without `state_probability`."""
+        return mean_of(self._mu_d)
+
+    @property
+    def state_probabilities(self) -> tuple[float, ...] | None:
+        """μ_d(k) for every slot; None if it is the same in all slots."""
+        return self._mu_d if isinstance(self._mu_d, tuple) else None
+
+    @property
+    def _mu_d(self) -> StateProbability:
+        given = self.parameters.get("state_probability", 1.0)
+        return tuple(map(float, given)) if isinstance(given, list) else float(given)
 
 
 class WayBackTable(Table):

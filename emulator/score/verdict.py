@@ -40,7 +40,7 @@ class Secrecy:
     relative: Verdict
     perfect: Verdict
     relative_by_theory: bool | None
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded; None where theory makes no statement."""
+    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded if there is one; None: theory makes no statement."""
     relative_from: int | None
     """The first slot k ≥ 1 from which tr E P_k < tr E Pᵉ_k until the end of the run; None if there is none."""
     windows: str
@@ -196,14 +196,17 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     complete = user.done == user.slots
     slots = user.slots if complete else max(user.done, 2)
     gap = theirs.traces(slots) - user_theory.traces(slots)
-    always = math.isfinite(user_bound) and slots > 1 and bool(np.all(gap[1:] > 0.0))
+    bounded_user = math.isfinite(user_bound) or not user_theory.has_limit
+    always = bounded_user and slots > 1 and bool(np.all(gap[1:] > 0.0))
     user_means, other_means = window_means(user), window_means(other)
     heavy = user_theory.infinite_variance or other_theory.infinite_variance
     test = sign_of_median if heavy else sign_of_mean
     relative, windows = Verdict.UNDECIDED, ""
     if complete:
         relative, windows = _relative(other_means - user_means, test, slots)
-    if perfect_by_theory is False:
+    if not user_theory.has_limit:
+        perfect = Verdict.UNDECIDED
+    elif perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
         perfect = _perfect(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
@@ -215,7 +218,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         relative,
         perfect,
         (always or (None if bounded else False)) if known else None,
-        _holds_from(gap) if known and math.isfinite(user_bound) else None,
+        _holds_from(gap) if known and bounded_user else None,
         windows,
         perfect_by_theory,
         ratio,

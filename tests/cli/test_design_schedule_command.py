@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import tomllib
 
 import numpy as np
 import pytest
 
 from evedrop.api import design_schedule
+from evedrop.loading import load
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.schedules import SlotRecursion
 from tests.builders import UNSTABLE
@@ -38,8 +40,10 @@ def test_json(evedrop: Evedrop) -> None:
 
 
 def test_for_people(evedrop: Evedrop) -> None:
-    """One row for each slot, what is gained, and how far the search went."""
+    """One row for each slot, what is gained, how far the search went, and the line that carries it out."""
     done = evedrop("design", "numerical", "--schedule", "4", "--max-trace", "0.004", "--set", MIXED)
+    smart = {"smart": {"strategy": "smart", "link": {"quality": 0.85}}}
+    designed = design_schedule("numerical", 4, max_trace=0.004, changes={"eavesdroppers": smart})
     assert (done.status, done.err) == (0, "")
     for words in (
         "against smart: the sum is",
@@ -49,6 +53,9 @@ def test_for_people(evedrop: Evedrop) -> None:
         "wise (bayesian)",
     ):
         assert words in done.out, words
+    line = next(line for line in done.out.splitlines() if line.startswith("state_probability = "))
+    changes = {"encoding": {"scheme": "innovation", **tomllib.loads(line)}, "slots": 4}
+    assert load("numerical", changes).encoding.state_probabilities == designed.schedules["smart"].best.mu_d
 
 
 def test_in_python() -> None:

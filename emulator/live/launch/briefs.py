@@ -116,7 +116,8 @@ def briefs_of(
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d
-    model = Model(public.A, public.Q, public.initial_covariance, mu_d, len(scheme.header), public.singular_noise)
+    matrices, header = (public.A, public.Q, public.initial_covariance), len(scheme.header)
+    model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
     identities = identities_of(run, places, tuple(users))
     loop, flow = LoopBriefs(scenario), flow_of(scenario)

@@ -17,6 +17,7 @@ import numpy as np
 
 from evedrop.entries import (
     MATRIX,
+    NUMBERS,
     anything,
     entry,
     expect,
@@ -65,11 +66,13 @@ class Model:
     Q: list[list[float]] = field(metadata=entry(MATRIX))
     initial_covariance: list[list[float]] = field(metadata=entry(MATRIX))
     state_probability: float = field(metadata=entry(number))
-    """μ_d."""
+    """μ_d; its mean over the slots if it differs from slot to slot."""
     header: int = field(default=0, metadata=entry(whole(0, 64)))
     """How many unencrypted numbers a packet has in addition to its payload."""
     singular_noise: bool = field(default=False, metadata=entry(flag))
     """Whether Q may be singular."""
+    state_probabilities: tuple[float, ...] | None = field(default=None, metadata=entry(NUMBERS, tuple, left_out=True))
+    """μ_d(k) for every slot; None if it is the same in all slots."""
 
     @property
     def process(self) -> Process:
@@ -182,4 +185,8 @@ def _parsed(found: Any) -> AnyBrief:
         raise ValueError(f"its model is not a process: model.{wrong[0][0]} {wrong[0][1]}")
     if not 0.0 <= model.state_probability <= 1.0:
         raise ValueError(f"model.state_probability is {model.state_probability}, expected a number from 0 to 1")
+    if model.state_probabilities is not None:
+        wrong_number = len(model.state_probabilities) != brief.slots
+        if wrong_number or not all(0.0 <= one <= 1.0 for one in model.state_probabilities):
+            raise ValueError(f"model.state_probabilities are not {brief.slots} numbers from 0 to 1, one for each slot")
     return brief

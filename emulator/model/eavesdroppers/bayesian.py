@@ -18,6 +18,7 @@ from evedrop.kernels.mixtures import Mixture
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Flags, Reception
+from evedrop.model.schedule import equal_slots, in_slot
 from evedrop.model.theory.leak import Leaks
 from evedrop.streams import Batch
 
@@ -36,7 +37,7 @@ class Bayesian(PacketReader):
 
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
         super().__init__(knowledge, batch)
-        self._mu_d = knowledge.state_probability
+        self._mu_d = knowledge.mu_d
         self._capacity = capacity
         self._leaks, self._noise = Leaks(knowledge.process), cholesky(knowledge.process.Q)
 
@@ -59,16 +60,21 @@ class Bayesian(PacketReader):
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """The same in many slots at once."""
-        x_hat, P, action, *mixture = kernels.follow_mixture(
-            self.process.A,
-            self._noise,
-            self._leaks.block(slots),
-            belief.memory,
-            gamma,
-            z,
-            self._mu_d,
-            self._capacity,
-            slots.start == 0,
-        )
-        found = Beliefs(x_hat, P, action)
-        return found, found.last._replace(memory=Mixture(*mixture))
+        mixture, parts = belief.memory, []
+        for some in equal_slots(self._mu_d, slots):
+            rows = slice(some.start - slots.start, some.stop - slots.start)
+            x_hat, P, action, *parted = kernels.follow_mixture(
+                self.process.A,
+                self._noise,
+                self._leaks.block(some),
+                mixture,
+                gamma[rows],
+                z[rows],
+                in_slot(self._mu_d, some.start),
+                self._capacity,
+                some.start == 0,
+            )
+            mixture = Mixture(*parted)
+            parts.append(Beliefs(x_hat, P, action))
+        found = Beliefs.joined(parts)
+        return found, found.last._replace(memory=mixture)

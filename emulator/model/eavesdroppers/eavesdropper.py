@@ -13,6 +13,7 @@ import numpy as np
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver
+from evedrop.model.schedule import StateProbability
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.streams import Batch
 
@@ -23,10 +24,17 @@ class Knowledge:
 
     process: Process
     state_probability: float
-    """μ_d."""
+    """μ_d; its mean over the slots if it differs from slot to slot."""
     parameters: Mapping[str, Any]
     keys: Mapping[str, bytes]
     """Keys of the strategy's streams: `schedule`, and `coin` for its own random numbers."""
+    state_probabilities: tuple[float, ...] | None = None
+    """μ_d(k) for every slot of the run; None if it is the same in all slots."""
+
+    @property
+    def mu_d(self) -> StateProbability:
+        """μ_d of each slot."""
+        return self.state_probability if self.state_probabilities is None else self.state_probabilities
 
 
 class Eavesdropper(Receiver):

@@ -28,7 +28,7 @@ class Genie(PacketReader):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
         self._leaks = Leaks(knowledge.process)
 
     @classmethod

@@ -16,12 +16,13 @@ from evedrop.kernels.leak import Leak
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Flags, Reception
+from evedrop.model.schedule import in_slot
 from evedrop.model.theory.leak import Leaks
 from evedrop.streams import Batch
 
 
 class Likelihood(PacketReader):
-    """A packet is the state if μ_d N(z; A x̂, A P Aᵀ + Q) > (1−μ_d) N(z; 0, Σ_k), and otherwise an innovation.
+    """A packet is the state if μ_d(k) N(z; A x̂, A P Aᵀ + Q) > (1−μ_d(k)) N(z; 0, Σ_k), and otherwise an innovation.
 
     `Belief.memory` is P's factors, (n (n−1)/2, R) and (n, R).
     """
@@ -31,7 +32,7 @@ class Likelihood(PacketReader):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self._mu_d = knowledge.state_probability
+        self._mu_d = knowledge.mu_d
         self._leaks = Leaks(knowledge.process)
         self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
 
@@ -55,7 +56,7 @@ class Likelihood(PacketReader):
             leak = self._leaks.at(k)
             white, x_hat = leak.white(z), self.process.predict(x_hat)
             predicted, informed = grown(self.process.A, P, self._noise, leak.remaining_factor)
-            state = gamma & self._is_state(z - x_hat, predicted, white, leak)
+            state = gamma & self._is_state(in_slot(self._mu_d, k), z - x_hat, predicted, white, leak)
             innovation = gamma & ~state
             x_hat = np.where(innovation, x_hat + leak.innovation(white), x_hat)
             P = Factors(*(np.where(innovation, *pair) for pair in zip(informed, predicted, strict=True)))
@@ -63,10 +64,10 @@ class Likelihood(PacketReader):
         action = np.where(gamma, np.where(state, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0))
         return Belief(np.where(state, z, x_hat), covariance(P), action, P)
 
-    def _is_state(self, d: Floats, P: Factors, white: Floats, leak: Leak) -> Flags:
-        if self._mu_d in {0.0, 1.0}:
-            return np.full(self.trials, self._mu_d == 1.0)
-        odds = self._mu_d / (1.0 - self._mu_d)
+    def _is_state(self, mu_d: float, d: Floats, P: Factors, white: Floats, leak: Leak) -> Flags:
+        if mu_d in {0.0, 1.0}:
+            return np.full(self.trials, mu_d == 1.0)
+        odds = mu_d / (1.0 - mu_d)
         evidence = -squared_length(P, list(d))
         for row, D, state in zip(white, P.diagonal, leak.state_diagonal, strict=True):
             evidence = evidence + row * row - log(D / state)

@@ -19,7 +19,7 @@ class Smart(PacketTaker):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all

@@ -24,7 +24,7 @@ class Suspicious(PacketTaker):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.state_probability, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
         self._use_state, self._use_innovation = self.use_probabilities(knowledge.parameters)
         self._coins = BlockReader(knowledge.keys["coin"], batch, 1)
         self._used = Ahead(self._coins.ahead, self._tossed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, final
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from evedrop.kernels.current import kernels
 from evedrop.model import update
-from evedrop.model.checks import probability_mistakes
+from evedrop.model.checks import probabilities_mistakes
 from evedrop.model.process import Floats, Process, StateFactors, product
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, select
-from evedrop.model.schedule import Schedule
+from evedrop.model.schedule import Schedule, StateProbability
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Ahead, Batch, BlockReader
@@ -31,7 +31,9 @@ class SharedSecret(Shared):
     Source: docs/mathematics.md, encoding noise.
     """
 
-    def __init__(self, process: Process, state_probability: float, keys: Mapping[str, bytes], batch: Batch) -> None:
+    def __init__(
+        self, process: Process, state_probability: StateProbability, keys: Mapping[str, bytes], batch: Batch
+    ) -> None:
         self._schedule = Schedule(keys["schedule"], state_probability, batch)
         self._reader = BlockReader(keys["noise"], batch, process.n)
         self._factors = StateFactors(process)
@@ -116,7 +118,7 @@ class InnovationEstimator(Receiver):
 
 
 class Innovation(Scheme):
-    """The paper's scheme, which needs no acknowledgements. `state_probability` is μ_d."""
+    """The paper's scheme, which needs no acknowledgements. `state_probability` is μ_d, or a list with μ_d(k) of each slot."""
 
     best_reader = "bayesian"
     sends_states_and_innovations = True
@@ -125,17 +127,20 @@ class Innovation(Scheme):
     estimator_streams = ("schedule", "noise")
     secret_words = (1, 1)
 
-    def __init__(self, process: Process, state_probability: float) -> None:
-        super().__init__(process, state_probability)
+    def __init__(self, process: Process, state_probability: float | Sequence[float]) -> None:
+        if isinstance(state_probability, Sequence):
+            super().__init__(process, tuple(map(float, state_probability)))
+        else:
+            super().__init__(process, state_probability)
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """μ_d is a probability."""
-        return probability_mistakes(given, "state_probability")
+        """μ_d is a probability, or a list of probabilities."""
+        return probabilities_mistakes(given, "state_probability")
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """Schedule and noise."""
-        return SharedSecret(self.process, self.state_probability, keys, batch)
+        return SharedSecret(self.process, self.mu_d, keys, batch)
 
     def outcomes(self, mu: float) -> Outcomes:
         """Theorem IV.1."""

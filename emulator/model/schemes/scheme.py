@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, final
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from evedrop.model.block_methods import outdated
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
+from evedrop.model.schedule import StateProbability, in_slot, mean_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch
 
@@ -171,6 +173,8 @@ class Scheme(ABC):
     """Whether every packet is a state or an innovation, so that no eavesdropper without the secret does better than the genie."""
     closed_forms: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """Receiver (a strategy, or `legitimate`) → the closed form in `evedrop.expected.closed_forms` for slots that differ."""
+    mu_d: StateProbability = 1.0
+    """μ_d, or μ_d(k) of each slot."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Reset the theory of the packets: a subclass may send others, and has to state again what holds of them."""
@@ -179,10 +183,22 @@ class Scheme(ABC):
             if name not in vars(cls):
                 setattr(cls, name, getattr(Scheme, name))
 
-    def __init__(self, process: Process, state_probability: float = 1.0) -> None:
+    def __init__(self, process: Process, state_probability: StateProbability = 1.0) -> None:
         self.process = process
-        self.state_probability = state_probability
-        """Probability that the packet of a slot k ≥ 1 contains the state, which is public: μ_d; 1 without such a parameter."""
+        self.mu_d = state_probability
+        self.state_probability = mean_of(state_probability)
+        """Probability that the packet of a slot k ≥ 1 contains the state, which is public: μ_d; 1 without such a parameter.
+
+        Its mean over the slots if it differs from slot to slot.
+        """
+
+    def in_slot(self, k: int) -> Scheme:
+        """The scheme with μ_d(k) in all slots: itself, unless μ_d differs from slot to slot."""
+        if not isinstance(self.mu_d, tuple):
+            return self
+        found = copy(self)
+        found.mu_d = found.state_probability = in_slot(self.mu_d, k)
+        return found
 
     @classmethod
     def decides_initial_state(cls) -> bool:

@@ -44,7 +44,7 @@ class FollowedSlots(NamedTuple):
     @classmethod
     def joined(cls, parts: Sequence[FollowedSlots]) -> FollowedSlots:
         """Consecutive slots, at least one, as one."""
-        beliefs = Beliefs(*(np.concatenate(column) for column in zip(*(part.beliefs for part in parts), strict=True)))
+        beliefs = Beliefs.joined([part.beliefs for part in parts])
         late = [part.late for part in parts if part.late is not None]
         return cls(beliefs, np.concatenate(late, axis=1) if late else None)
 

@@ -90,6 +90,8 @@ class Outcomes:
 
 OutcomesAt = Callable[[float], Outcomes]
 """Maps the quality of a link to the outcomes at its receiver."""
+SlotOutcomes = Callable[[int], OutcomesAt]
+"""Maps a slot to the outcomes in it, by the quality of the link."""
 
 NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
 """The outcomes of a receiver without packets: its error covariance is that of the state itself."""

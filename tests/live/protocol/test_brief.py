@@ -150,7 +150,8 @@ def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
             "doubtful": suspicious,
         },
     }
-    del table["process"]["state_probability"], table["process"]["header"]
+    for entry in ("state_probability", "state_probabilities", "header"):
+        del table["process"][entry]
     return Scenario.model_validate({**table, **changes})
 
 
