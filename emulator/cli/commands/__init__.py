@@ -28,6 +28,7 @@ MODULES: Mapping[str, str] = {
     "design": "design",
     "cost": "cost",
     "figures": "figures",
+    "paper": "paper",
     "view": "view",
     "diff": "diff",
     "test": "testing",
