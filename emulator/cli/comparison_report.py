@@ -39,7 +39,7 @@ def print_comparison(found: Comparison, folder: str) -> None:
 
 
 def _schemes(found: Comparison) -> Table:
-    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits", "secret", "once"))
+    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits/slot", "energy", "secret", "once"))
     for head in ("closest adversary", "verdict"):
         table.add_column(head, no_wrap=True)
     for name, one in found.schemes.items():
@@ -48,9 +48,10 @@ def _schemes(found: Comparison) -> Table:
             name,
             simulated(one.legitimate),
             theory(one.legitimate),
-            "needed" if needs.acknowledgements else "–",
+            "yes" if needs.acknowledgements else "–",
             f"{needs.sent_fraction:.3g}",
-            f"{needs.payload_bits} + {needs.header_bits}" if needs.header_bits else f"{needs.payload_bits}",
+            estimate(needs.bits_per_slot, needs.standard_errors["bits_per_slot"] or None, ".4g"),
+            estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
             f"{needs.secret_bits_per_slot}" if needs.secret_bits_per_slot else "–",
             f"{needs.initial_secret_bits}" if needs.initial_secret_bits else "–",
             *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
@@ -124,8 +125,8 @@ def _undefined(found: Comparison) -> Iterator[str]:
 
 def _remarks(found: Comparison) -> Iterator[str]:
     yield (
-        "sent: the share of slots with a packet; bits: of its payload + header; secret: the most bits that a slot uses; once: "
-        "bits that a trial uses once"
+        "sent: the share of slots with a packet; bits/slot, energy: what the sensor sends, headers included, and spends in a "
+        "slot on average; secret: the most bits that a slot uses; once: bits that a trial uses once"
     )
     measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
     if any(one is not None and one.infinite_variance for one in measured):

@@ -17,13 +17,14 @@ from evedrop.kernels.current import kernels
 from evedrop.memory.chunk import Chunk, ReceiverChunk
 from evedrop.memory.guarded_classes import Guard
 from evedrop.memory.linked_receiver import LinkedReceiver
+from evedrop.memory.packet_counts import PacketCounts
 from evedrop.model.acknowledgements import AckChannel
 from evedrop.model.digest import BlockDigests, Digests, InputLog
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, Receiver
-from evedrop.model.schemes.scheme import Shared
+from evedrop.model.schemes.scheme import Scheme, Shared
 from evedrop.model.slot.controller import ControllerCore
 from evedrop.model.slot.link_core import LinkCore
 from evedrop.model.slot.plant import PlantCore
@@ -50,6 +51,7 @@ class Roles:
     keys: StreamKeys
     guard: Guard
     """Checks the results of classes that are not built in."""
+    scheme: Scheme
     shared: Shared
     """The scheme's shared part of both sides."""
     initial: Floats | None
@@ -64,12 +66,14 @@ class ExactSimulation:
     """Simulates all slots of a batch of trials.
 
     digests: filled with the digests of receivers and controller, block by its first slot → (R, bytes); times: filled with the
-    times of decisions.
+    times of decisions; packets: filled with the counts of packets.
     """
 
-    def __init__(self, roles: Roles, digests: Mapping[str, dict[int, Digests]], times: SolveTimes) -> None:
+    def __init__(
+        self, roles: Roles, digests: Mapping[str, dict[int, Digests]], times: SolveTimes, packets: PacketCounts
+    ) -> None:
         scenario, batch, keys = roles.scenario, roles.batch, roles.keys
-        self._roles, self._digests = roles, digests
+        self._roles, self._digests, self._packets = roles, digests, packets
         self._guard = roles.guard
         disturbances = disturbances_of(scenario)
         process, chart = scenario.process.process, chart_of(scenario)
@@ -121,6 +125,8 @@ class ExactSimulation:
                 x_hat = users[-1].beliefs.x_hat[0] if users else None
                 self._steering.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
         whole = Sent.joined(sent)
+        with self._guard.asking(LEGITIMATE, chunk):
+            self._packets.add(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
         followed = {
             name: FollowedSlots.joined(users)
             if users and name == LEGITIMATE

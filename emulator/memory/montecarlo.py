@@ -18,6 +18,7 @@ import numpy as np
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import expected_traces_of
+from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BatchResult, Task, tasks_of
 from evedrop.memory.workers import REACH_SECONDS, connected, in_processes, in_this_process, on_cluster
@@ -217,6 +218,7 @@ class Merger:
         names = scenario.receivers
         self._sums = {name: SlotSums.zero(scenario.slots) for name in names}
         self._totals: list[Totals] = []
+        self._packets: list[PacketCounts] = []
         self._digests = {name: RunDigest() for name in scenario.digested}
         self._errors: dict[str, SlotHistograms] = {}
         self._traces: dict[str, SlotHistograms] = {}
@@ -240,6 +242,7 @@ class Merger:
         for block in result.blocks:
             self.trials += block.trials
             self._totals.append(block.totals)
+            self._packets.append(block.packets)
             for name in self._scenario.receivers:
                 self._sums[name].add(0, block.sums[name])
             if self._mode is Mode.EXACT:
@@ -280,6 +283,11 @@ class Merger:
     def totals(self) -> Totals:
         """The totals of all added batches."""
         return Totals.merged(self._totals)
+
+    @property
+    def packets(self) -> PacketCounts:
+        """The counts of packets in all added batches, at least one; in exact mode only."""
+        return PacketCounts.merged(self._packets)
 
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: Ending) -> Summary:

@@ -19,6 +19,7 @@ import numpy as np
 from evedrop.memory.chunk import Chunk, ReceiverChunk
 from evedrop.memory.exact import ExactSimulation, Roles
 from evedrop.memory.guarded_classes import Guard
+from evedrop.memory.packet_counts import PacketCounts
 from evedrop.model import update
 from evedrop.model.digest import Digests, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -79,6 +80,8 @@ class Simulation:
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.digested}
         """Receiver, or controller → block number → digests, (R, 16); filled in exact mode only."""
         self.solve_times = SolveTimes()
+        self.packets = PacketCounts.zero(len(trials))
+        """Counted in exact mode only."""
 
     def _informed(self, estimator: Receiver) -> Receiver:
         """The legitimate estimator, input-aware if the scenario says so."""
@@ -125,12 +128,13 @@ class Simulation:
             self._batch,
             self._keys,
             self._guard,
+            self._scheme,
             self._shared,
             self._initial,
             self._receivers,
             self._betrayed,
         )
-        return ExactSimulation(roles, self.digests, self.solve_times).play
+        return ExactSimulation(roles, self.digests, self.solve_times, self.packets).play
 
     def _error_coordinates(self) -> Callable[[range, Mapping[str, LinkCore]], Chunk]:
         n, trials = self._process.n, self._batch.trials

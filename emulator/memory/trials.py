@@ -16,6 +16,7 @@ import numpy as np
 from evedrop.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.figures.figure import ScoredSlots
 from evedrop.memory.chunk import Chunk
+from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.model.digest import Digests
 from evedrop.model.process import Floats
@@ -52,6 +53,7 @@ class TrialBlock:
     totals: Totals
     accountants: dict[str, Accountant]
     digests: dict[str, dict[int, Digests]]
+    packets: PacketCounts
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
     result.blocks[0].totals.solve_times.merge(simulation.solve_times)
     for block in result.blocks:
         rows = slice(block.start - task.start, block.start - task.start + block.trials)
+        block.packets.add_counts(simulation.packets.part(rows))
         for name, digests in simulation.digests.items():
             block.digests[name] = {number: values[rows] for number, values in digests.items()}
     return result
@@ -137,6 +140,7 @@ def _empty_block(
         keeper.totals if task.mode is Mode.EXACT else Totals.nothing(scenario, trials),
         {name: Accountant(scenario.window(name), trials) for name in names},
         {},
+        PacketCounts.zero(trials),
     )
     return block, keeper
 

@@ -155,6 +155,14 @@ class Needs:
     """Bits of a packet's header on the wire: int64 numbers."""
     sent_fraction: float
     """Fraction of slots with a packet, measured without an attack."""
+    encrypted_fraction: float
+    """Fraction of slots with an encrypted packet, measured in the same way."""
+    bits_per_slot: float
+    """Bits of payload and header that the sensor sends in a slot on average."""
+    energy_per_slot: float
+    """Energy that the sensor spends in a slot on average, in the unit of the scenario's `[energy]`."""
+    standard_errors: Mapping[str, float | None]
+    """Standard errors of these four; None for one trial."""
     secret_bits_per_slot: int
     """The most bits in a slot from the streams that both sides draw."""
     initial_secret_bits: int
@@ -292,6 +300,10 @@ def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
             "ratio_standard_error": cell.ratio_error,
             "verdict": None if cell.verdict is None else cell.verdict.value,
             "packet_bits": one.needs.packet_bits,
+            "sent_fraction": one.needs.sent_fraction,
+            "encrypted_fraction": one.needs.encrypted_fraction,
+            "bits_per_slot": one.needs.bits_per_slot,
+            "energy_per_slot": one.needs.energy_per_slot,
             "secret_bits_per_slot": one.needs.secret_bits_per_slot,
             "acknowledgements": one.needs.acknowledgements,
         }

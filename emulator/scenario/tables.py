@@ -27,6 +27,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.energy import EnergyModel
 from evedrop.model.plant import Plant
 from evedrop.model.registry import asked, is_own
 from evedrop.model.schedule import StateProbability, mean_of
@@ -146,6 +147,17 @@ class AcknowledgementsTable(Table):
         return []
 
 
+_Energy = Annotated[float, Field(strict=True, ge=0.0, le=1e12)]
+
+
+class EnergyTable(Table):
+    """`[energy]`: what packets cost the sensor, in any unit; it does not change the trials."""
+
+    packet: Annotated[_Energy, Field(examples=[1.0])] = EnergyModel.packet
+    bit: Annotated[_Energy, Field(examples=[0.01])] = EnergyModel.bit
+    encryption: Annotated[_Energy, Field(examples=[0.5])] = EnergyModel.encryption
+
+
 class NetworkTable(Table):
     """`[network]`: how the processes of a live run are connected; it does not change the trials."""
 
@@ -177,6 +189,7 @@ class Scenario(Table):
     plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
+    energy: Annotated[EnergyTable | None, Field(examples=[{"packet": 1.0, "encryption": 0.5}])] = None
     network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
     event: Annotated[list[AnyEvent], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
@@ -298,6 +311,11 @@ class Scenario(Table):
     def digested(self) -> tuple[str, ...]:
         """The processes that have a digest: all receivers, and the controller if there is one."""
         return self.receivers if self.controller is None else (*self.receivers, CONTROLLER)
+
+    @property
+    def energy_model(self) -> EnergyModel:
+        """What packets cost the sensor."""
+        return EnergyModel() if self.energy is None else EnergyModel(**self.energy.model_dump())
 
     @property
     def quality(self) -> dict[str, float]:

@@ -19,11 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from evedrop.errors import Interrupted, RunError
+from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
 from evedrop.figures.standard_error import standard_error, z_of
 from evedrop.memory.montecarlo import Merger, Plan, disk_errors, results_of, teller
+from evedrop.memory.packet_counts import PacketCounts
+from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.model.schemes import scheme_of
@@ -51,6 +53,8 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Com
     Raises UsageError for an unusable folder or plan; Interrupted on Ctrl-C and RunError if a worker fails, with the completed
     schemes in the folder.
     """
+    if plan.mode is not Mode.EXACT:
+        raise UsageError(f"a comparison follows packets, which the mode {plan.mode.value} has not; leave the mode out")
     groups = matchups.groups
     workers = max(plan.workers_for(group.scenario) for group in groups)
     tasks = [tasks_of(group.scenario, plan.mode, 1) for group in groups]
@@ -106,16 +110,17 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
     title = some.title.rpartition(" (")[0]
     schemes = {}
     for scheme in whole:
-        groups = [(group, merger.totals.tallies) for group, merger in played if group.scheme == scheme]
+        groups = [(group, merger) for group, merger in played if group.scheme == scheme]
         cells = {one.adversary: Cell(one) for one in matchups.undefined if one.scheme == scheme}
-        for group, totals in groups:
-            cells |= _cells(group, totals)
-        scenario, totals = groups[0][0].scenario, groups[0][1]
+        for group, merger in groups:
+            cells |= _cells(group, merger.totals.tallies)
+        scenario, merger = groups[0][0].scenario, groups[0][1]
+        user = merger.totals.tallies[LEGITIMATE]
         schemes[scheme] = SchemeResult(
             scheme,
             scenario.encoding.parameters,
-            _needs(scenario, totals[LEGITIMATE]),
-            _measured(scenario, LEGITIMATE, totals[LEGITIMATE], expectations_of(scenario)[LEGITIMATE]),
+            _needs(scenario, merger.packets),
+            _measured(scenario, LEGITIMATE, user, expectations_of(scenario)[LEGITIMATE]),
             {adversary: cells[adversary] for adversary in matchups.adversaries},
         )
     return Comparison(title, some.slots, some.trials, some.seed, some.first_trial, matchups.adversaries, schemes)
@@ -131,16 +136,23 @@ def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     }
 
 
-def _needs(scenario: Scenario, user: Tally) -> Needs:
+def _needs(scenario: Scenario, packets: PacketCounts) -> Needs:
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
-    header = scheme.packet_bits * len(scheme.header) // (scheme.process.n + len(scheme.header))
+    sent, encrypted = packets.sent / scenario.slots, packets.encrypted / scenario.slots
+    of_trials = {
+        "sent_fraction": sent,
+        "encrypted_fraction": encrypted,
+        "bits_per_slot": scheme.packet_bits * sent,
+        "energy_per_slot": scenario.energy_model.spent(scheme, sent, encrypted),
+    }
     return Needs(
         scheme.needs_acknowledgements,
-        scheme.packet_bits - header,
-        header,
-        1.0 - user.unsent / user.offered,
-        scheme.secret_bits,
-        scheme.initial_secret_bits,
+        scheme.payload_bits,
+        scheme.header_bits,
+        **{name: float(np.mean(one)) for name, one in of_trials.items()},
+        standard_errors={name: standard_error(one) for name, one in of_trials.items()},
+        secret_bits_per_slot=scheme.secret_bits,
+        initial_secret_bits=scheme.initial_secret_bits,
     )
 
 

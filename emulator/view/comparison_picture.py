@@ -35,7 +35,7 @@ _SAID = {
     SecrecyKept.BROKEN: "broken",
 }
 _NOTABLE = 1.1  # the factor by which an attack must raise the user's error to be noted
-_FACTS = ("legitimate\nerror", "ACKs", "bits a\npacket", "secret bits\na slot (+ once)")
+_FACTS = ("legitimate\nerror", "ACKs", "bits\na slot", "energy\na slot", "secret bits\na slot (+ once)")
 _FACT_WIDTH = 1.25
 _LEAST_WIDTH = 9.0
 
@@ -69,7 +69,8 @@ def _facts(one: SchemeResult) -> Iterator[str]:
     error = one.legitimate.standard_error
     yield _number(one.legitimate.typical) + (f"\n± {_number(error)}" if error else "")
     yield "needed" if needs.acknowledgements else "–"
-    yield f"{needs.packet_bits}" + (f" × {needs.sent_fraction:.2f}" if needs.sent_fraction < 0.995 else "")
+    yield _number(needs.bits_per_slot)
+    yield f"{needs.energy_per_slot:.3g}"
     once = f" (+ {needs.initial_secret_bits})" if needs.initial_secret_bits else ""
     yield f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–"
 

@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 
 from evedrop import compare, montecarlo
+from evedrop.errors import UsageError
+from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.results.comparison import Comparison
@@ -206,6 +209,46 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
     }
     assert needs["plain"].sent_fraction == 1.0
     assert needs["withholding"].sent_fraction == pytest.approx(0.3, abs=0.03)
+
+
+def test_bits_and_energy_are_those_of_the_packets(everything: Everything) -> None:
+    """By default a packet costs 1 and its encryption 1 more; fractions agree with theory within five standard errors."""
+    needs = {name: one.needs for name, one in everything[0].schemes.items()}
+    for one in needs.values():
+        assert one.energy_per_slot == pytest.approx(one.sent_fraction + one.encrypted_fraction)
+        assert one.bits_per_slot == pytest.approx(one.packet_bits * one.sent_fraction)
+        assert (one.standard_errors["bits_per_slot"] == 0.0) is (one.sent_fraction == 1.0)
+    encrypted = {name: one.encrypted_fraction for name, one in needs.items()}
+    assert {name for name, fraction in encrypted.items() if fraction} == {"cipher", "encrypted-schedule"}
+    assert encrypted["cipher"] == 1.0
+    mu = load("bayesian").quality["legitimate"]
+    # θ = 2 encrypts slot 0, and then with probability 1 − μ; θ = 4 sends in 1/μ of every 3 + 1/μ slots.
+    slots, scheme = MARGINAL["slots"], needs["encrypted-schedule"]
+    expected = (1.0 + (slots - 1) * (1.0 - mu)) / slots
+    assert abs(scheme.encrypted_fraction - expected) < 5.0 * (scheme.standard_errors["encrypted_fraction"] or 0.0)
+    assert needs["scheduled"].sent_fraction == pytest.approx((1.0 / mu) / (3.0 + 1.0 / mu), rel=0.03)
+
+
+def test_the_energy_is_that_of_the_scenario(tmp_path: Path) -> None:
+    """Per packet, per bit and per encrypted packet; one trial has no standard error."""
+    found = compare(
+        "bayesian",
+        schemes=["cipher", "plain"],
+        adversaries=["naive"],
+        trials=1,
+        slots=5,
+        out=tmp_path,
+        energy={"packet": 3.0, "bit": 0.5, "encryption": 7.0},
+    )
+    assert found.schemes["plain"].needs.energy_per_slot == 3.0 + 0.5 * 128
+    assert found.schemes["cipher"].needs.energy_per_slot == 3.0 + 0.5 * 128 + 7.0
+    assert set(found.schemes["plain"].needs.standard_errors.values()) == {None}
+
+
+def test_a_comparison_follows_packets(tmp_path: Path) -> None:
+    """A mode that does not is refused."""
+    with pytest.raises(UsageError, match="follows packets"):
+        compare("bayesian", trials=1, slots=5, out=tmp_path, plan=Plan(Mode.COVARIANCE_ONLY))
 
 
 def test_blocking_critical_acknowledgements_undoes_the_state_secrecy_code(literature: Comparison) -> None:

@@ -117,7 +117,11 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     assert set(scheme) == {"parameters", "needs", "legitimate", "closest", "against"}
     assert set(scheme["needs"]) == {
         *("acknowledgements", "payload_bits", "header_bits", "packet_bits", "sent_fraction"),
+        *("encrypted_fraction", "bits_per_slot", "energy_per_slot", "standard_errors"),
         *("secret_bits_per_slot", "initial_secret_bits"),
+    }
+    assert set(scheme["needs"]["standard_errors"]) == {
+        *("sent_fraction", "encrypted_fraction", "bits_per_slot", "energy_per_slot"),
     }
     cell = scheme["against"]["forges"]
     ratio = {"ratio", "ratio_standard_error"}

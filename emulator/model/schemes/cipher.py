@@ -10,7 +10,7 @@ from evedrop.model import update
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
-from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes, state_covariances
 from evedrop.streams import Batch
 
@@ -64,6 +64,10 @@ class Cipher(Scheme):
             lambda: CipherEncoder(mask),
             lambda: CipherEstimator(self.process, batch.trials, mask),
         )
+
+    def encrypted(self, packets: PacketBlock) -> Flags:
+        """All, (c, R)."""
+        return np.ones(packets.nu.shape, np.bool_)
 
     def error_floor(self, slots: int) -> tuple[Floats, bool]:
         """Tr Σ_k, (slots,): nothing can be learnt from packets. It grows unless A forgets.

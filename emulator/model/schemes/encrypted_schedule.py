@@ -14,9 +14,16 @@ from evedrop.model.holding_time import HoldingTime
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
-from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch
+
+
+def encrypted_by_header(packets: PacketBlock) -> Flags:
+    """Whether the first number of each packet's header is 1, (c, R)."""
+    assert packets.header is not None  # noqa: S101 - every packet of such a scheme has one
+    flags: Flags = packets.header[:, 0] == 1
+    return flags
 
 
 class EncryptedScheduleEncoder(Encoder):
@@ -94,6 +101,10 @@ class EncryptedSchedule(Scheme):
             lambda: EncryptedScheduleEncoder(self.threshold, batch.trials, mask),
             lambda: EncryptedScheduleEstimator(self.process, batch.trials, mask),
         )
+
+    def encrypted(self, packets: PacketBlock) -> Flags:
+        """Those whose header says so, (c, R)."""
+        return encrypted_by_header(packets)
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet."""

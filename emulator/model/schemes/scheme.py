@@ -229,9 +229,24 @@ class Scheme(ABC):
         return None
 
     @property
+    def payload_bits(self) -> int:
+        """Size of a packet's payload."""
+        return _WORD_BITS * self.process.n
+
+    @property
+    def header_bits(self) -> int:
+        """Size of a packet's header."""
+        return _WORD_BITS * len(self.header)
+
+    @final
+    @property
     def packet_bits(self) -> int:
         """Size of a packet's payload and header."""
-        return _WORD_BITS * (self.process.n + len(self.header))
+        return self.payload_bits + self.header_bits
+
+    def encrypted(self, packets: PacketBlock) -> Flags:
+        """Whether the sensor has encrypted each packet, (c, R); by default none. Encryption costs it energy."""
+        return np.zeros(packets.nu.shape, np.bool_)
 
     @property
     def secret_bits(self) -> int:

@@ -1,0 +1,51 @@
+"""Counts of the packets that the sensor sent in each trial, for the energy and the bits of a scheme."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.receiver import Flags
+
+
+@final
+@dataclass
+class PacketCounts:
+    """Counts over the slots of R trials."""
+
+    sent: NDArray[np.int64]
+    """Packets, (R,)."""
+    encrypted: NDArray[np.int64]
+    """Those among them that were encrypted, (R,)."""
+
+    @classmethod
+    def zero(cls, trials: int) -> PacketCounts:
+        """No packets yet."""
+        return cls(np.zeros(trials, np.int64), np.zeros(trials, np.int64))
+
+    @classmethod
+    def merged(cls, parts: Sequence[PacketCounts]) -> PacketCounts:
+        """The counts of several sets of trials, at least one, in order."""
+        return cls(np.concatenate([one.sent for one in parts]), np.concatenate([one.encrypted for one in parts]))
+
+    def add(self, encrypted: Flags, sent: Flags | None) -> None:
+        """Add some slots: whether each packet is encrypted, and whether it is sent, (c, R) each; None: all are sent."""
+        if sent is None:
+            self.sent += len(encrypted)
+        else:
+            self.sent += np.count_nonzero(sent, axis=0)
+            encrypted = encrypted & sent
+        self.encrypted += np.count_nonzero(encrypted, axis=0)
+
+    def add_counts(self, other: PacketCounts) -> None:
+        """Add the counts of further slots of the same trials."""
+        self.sent += other.sent
+        self.encrypted += other.encrypted
+
+    def part(self, trials: slice) -> PacketCounts:
+        """The counts of some of the trials."""
+        return PacketCounts(self.sent[trials], self.encrypted[trials])
