@@ -39,7 +39,9 @@ def print_comparison(found: Comparison, folder: str) -> None:
 
 
 def _schemes(found: Comparison) -> Table:
-    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits/slot", "energy", "secret", "once"))
+    table = _table(
+        "scheme", ("legitimate", "theory", "ACKs", "sent", "bits/slot", "energy", "secret", "once", "clear", "leak")
+    )
     for head in ("closest adversary", "verdict"):
         table.add_column(head, no_wrap=True)
     for name, one in found.schemes.items():
@@ -54,6 +56,11 @@ def _schemes(found: Comparison) -> Table:
             estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
             f"{needs.secret_bits_per_slot}" if needs.secret_bits_per_slot else "–",
             f"{needs.initial_secret_bits}" if needs.initial_secret_bits else "–",
+            *(
+                ("–", "–")
+                if one.leak is None
+                else (f"{one.leak.clear_fraction:.3g}", figure_text(one.leak.bits, ".3g"))
+            ),
             *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
         )
     return table
@@ -126,7 +133,9 @@ def _undefined(found: Comparison) -> Iterator[str]:
 def _remarks(found: Comparison) -> Iterator[str]:
     yield (
         "sent: the share of slots with a packet; bits/slot, energy: what the sensor sends, headers included, and spends in a "
-        "slot on average; secret: the most bits that a slot uses; once: bits that a trial uses once"
+        "slot on average; secret: the most bits that a slot uses; once: bits that a trial uses once; "
+        "clear: the share of slots whose packet is the state itself; leak: the bits about the path of states that another packet "
+        "reveals without the secret"
     )
     measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
     if any(one is not None and one.infinite_variance for one in measured):

@@ -194,8 +194,10 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
         console.print(line)
     if summary.controller is not None:
         console.print(_loop_line(summary.controller))
-    for verdict in summary.secrecy.values():
+    for name, verdict in summary.secrecy.items():
         console.print(verdict.sentence)
+        if verdict.leak is not None and verdict.leak.bits > 0.0:
+            console.print(f"{name}: packets that hide the state revealed {verdict.leak.text} of its path")
     for name, peer in summary.peers.items():
         if peer.infinite_variance and peer.error_quantiles and summary.trials > 1:
             low, middle, high = (f"{value:.3g}" for value in peer.error_quantiles.values())

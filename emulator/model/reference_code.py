@@ -36,7 +36,7 @@ class ReferenceCode:
 
     def __init__(self, process: Process, open_loop: bool = False) -> None:
         self._process = process
-        self.decorrelates = not open_loop and _is_regular(process.A)
+        self.decorrelates = not open_loop and is_regular(process.A)
         """Whether packets are independent of the state that they are sent for: L is not A."""
         self._states = StateFactors(process)
         self._kept = max(2, _NUMBERS_KEPT // (_SLOTS_AT_ONCE * process.n * process.n))
@@ -144,7 +144,7 @@ class _Watch:
         self._factors = factors[places]
 
 
-def _is_regular(A: Floats) -> bool:
+def is_regular(A: Floats) -> bool:
     """Whether A⁻¹ has correct digits in double precision."""
     try:
         size = float(np.abs(A).max()) * float(np.abs(inverse(A)).max())

@@ -175,6 +175,19 @@ class Needs:
 
 
 @dataclass(frozen=True)
+class PacketLeak:
+    """What a packet of a scheme reveals without the secret, to a receiver that knows its type: the mean over the run's slots.
+
+    Source: docs/mathematics.md, leak in bits.
+    """
+
+    clear_fraction: float
+    """The probability that it is the state itself."""
+    bits: float | None
+    """The bits about the path of states that a packet reveals if it is not the state itself; None if all are."""
+
+
+@dataclass(frozen=True)
 class SchemeResult:
     """One scheme against all adversaries."""
 
@@ -185,6 +198,8 @@ class SchemeResult:
     """The legitimate estimator without an attack."""
     cells: Mapping[str, Cell]
     """Adversary → its cell, for all adversaries."""
+    leak: PacketLeak | None = None
+    """None: unknown."""
 
     @property
     def closest(self) -> Cell | None:
@@ -262,6 +277,7 @@ class Comparison:
                     "parameters": dict(one.parameters),
                     "needs": {**asdict(one.needs), "packet_bits": one.needs.packet_bits},
                     "legitimate": asdict(one.legitimate),
+                    "leak": None if one.leak is None else asdict(one.leak),
                     "closest": None if one.closest is None else one.closest.match.adversary,
                     "against": {adversary: cell.as_dict() for adversary, cell in one.cells.items()},
                 }
@@ -282,6 +298,7 @@ class Comparison:
 def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
     for adversary, cell in one.cells.items():
         user, other = cell.legitimate, cell.eavesdropper
+        leak = None if cell.secrecy is None else cell.secrecy.leak
         yield {
             "scheme": one.name,
             "adversary": adversary,
@@ -299,6 +316,11 @@ def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
             "ratio": cell.ratio,
             "ratio_standard_error": cell.ratio_error,
             "verdict": None if cell.verdict is None else cell.verdict.value,
+            "clear_fraction": None if leak is None else leak.clear_fraction,
+            "leaked_bits": None if leak is None else leak.bits,
+            "leaked_bits_standard_error": None if leak is None else leak.standard_error,
+            "leaked_bits_theory": None if leak is None else leak.expected_bits,
+            "leaked_bits_z": None if leak is None else leak.z,
             "packet_bits": one.needs.packet_bits,
             "sent_fraction": one.needs.sent_fraction,
             "encrypted_fraction": one.needs.encrypted_fraction,

@@ -26,6 +26,7 @@ from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
+from evedrop.score.leak import revealed_to
 from evedrop.score.slots import Slots
 from evedrop.score.summary import RARE_SHARE, PeerSummary, RareEvents, Summary, Surprising, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
@@ -58,6 +59,7 @@ class Scorekeeper:
         if theory is None:
             theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self._theory = theory
+        self._revealed = revealed_to(scenario)
         self.totals = Totals.of(scenario, trials)
 
     def add(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
@@ -79,6 +81,8 @@ class Scorekeeper:
             tally.add(slots.first, *one)
             if tally.conditional is not None:
                 tally.conditional.add(receiver.action)
+            if tally.leak is not None:
+                tally.leak.add(receiver.action, slots.nu, self._revealed[name])
             tally.add_traces(traces)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from evedrop.entries import plain
 from evedrop.figures.links import LinkAccount
+from evedrop.figures.text import estimate
 from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.scenario import application
 
@@ -109,6 +110,28 @@ class Verification:
 
 
 @dataclass(frozen=True)
+class LeakSummary:
+    """What the packets that an eavesdropper received reveal without the secret, to a receiver that knows their types."""
+
+    clear_fraction: float
+    """The fraction of slots in which it received the state itself: unlimited bits."""
+    bits: float
+    """The bits per slot that its other packets reveal about the path of states."""
+    standard_error: float | None
+    """Of `bits`."""
+    expected_bits: float | None
+    """Theory: `bits` over the same slots; None if theory does not cover the link."""
+    z: float | None
+    """How many standard errors `bits` is above `expected_bits`."""
+
+    @property
+    def text(self) -> str:
+        """In words: the bits per slot, and their theory."""
+        theory = "" if self.expected_bits is None else f" (theory {self.expected_bits:.3g})"
+        return f"{estimate(self.bits, self.standard_error, '.3g')} bits a slot{theory}"
+
+
+@dataclass(frozen=True)
 class SecrecySummary:
     """The verdict on an eavesdropper."""
 
@@ -119,6 +142,8 @@ class SecrecySummary:
     perfect_by_theory: bool | None
     judged_by: str
     sentence: str
+    leak: LeakSummary | None = None
+    """None: unknown, or not measured in this mode."""
 
 
 @dataclass(frozen=True)

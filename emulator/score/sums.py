@@ -18,6 +18,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.score.conditional import ConditionalError
+from evedrop.score.leak import LeakTally
 from evedrop.score.watched import Watched, WatchedSlots
 
 WINDOWS = 8
@@ -101,6 +102,8 @@ class Tally(ReceiverTotals):
     """Slots that all trials have reached."""
     conditional: ConditionalError | None = None
     """The expected errors given what happened to the packets; None where that does not determine them."""
+    leak: LeakTally | None = None
+    """What its packets reveal without the secret; None where that is unknown."""
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
     bursts: NDArray[np.int64] = field(init=False)
@@ -258,6 +261,8 @@ def merged(parts: Sequence[Tally]) -> Tally:
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
     conditional = [part.conditional for part in parts if part.conditional is not None]
     total.conditional = ConditionalError.merged(conditional) if conditional else None
+    leaks = [part.leak for part in parts if part.leak is not None]
+    total.leak = LeakTally.merged(leaks) if leaks else None
     total.packets = np.concatenate([part.packets for part in parts], axis=1)
     traces = [part.traces for part in parts if part.traces is not None]
     total.traces = np.concatenate(traces) if len(traces) == len(parts) else None

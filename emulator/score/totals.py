@@ -10,6 +10,7 @@ from evedrop.score.acknowledging import Detection
 from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
 from evedrop.score.conditional import conditional_error_of
 from evedrop.score.filtering import FilterTally
+from evedrop.score.leak import LeakTally, leak_is_known
 from evedrop.score.sums import Tally, merged
 from evedrop.score.watched import Watched, watches_of
 
@@ -32,6 +33,7 @@ class Totals:
         tallies = {name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()}
         for name, tally in tallies.items():
             tally.conditional = conditional_error_of(scenario, name, trials)
+            tally.leak = LeakTally(trials) if leak_is_known(scenario, name) else None
         return cls(tallies)
 
     @classmethod

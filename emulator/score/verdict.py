@@ -16,7 +16,7 @@ from evedrop.expected.expectations import Expectation
 from evedrop.figures.standard_error import ratio_error
 from evedrop.figures.text import estimate
 from evedrop.model.process import Floats
-from evedrop.score.summary import SecrecySummary
+from evedrop.score.summary import LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, trial_means, window_means, window_of
 
 ERROR_RATE = 0.01
@@ -56,6 +56,8 @@ class Secrecy:
     """The end of the sentence where theory makes no claim."""
     ratio_error: float | None = None
     """Standard error of the ratio; None for one trial, and where an error has infinite variance."""
+    leak: LeakSummary | None = None
+    """What its packets revealed; None where that is unknown."""
 
     @property
     def summary(self) -> SecrecySummary:
@@ -68,6 +70,7 @@ class Secrecy:
             perfect_by_theory=self.perfect_by_theory,
             judged_by=self.judged_by,
             sentence=self.sentence,
+            leak=self.leak,
         )
 
     @property
@@ -226,6 +229,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         "median" if heavy else "mean",
         unknown="no closed form of its error is known" if other_theory.outcomes_at is None else Secrecy.unknown,
         ratio_error=scatter,
+        leak=None if other.leak is None else other.leak.summary,
     )
 
 

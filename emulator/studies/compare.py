@@ -31,11 +31,12 @@ from evedrop.memory.workers import connected
 from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE
 from evedrop.news import Tell
-from evedrop.results.comparison import Cell, Comparison, Needs, SchemeResult, SimulatedError, Theory
+from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory
 from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
+from evedrop.score.leak import revealed_by_packets
 from evedrop.score.scorekeeper import rare_events_of, verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.signals import stop_on_signals
@@ -122,6 +123,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
             _needs(scenario, merger.packets),
             _measured(scenario, LEGITIMATE, user, expectations_of(scenario)[LEGITIMATE]),
             {adversary: cells[adversary] for adversary in matchups.adversaries},
+            _leak(scenario),
         )
     return Comparison(title, some.slots, some.trials, some.seed, some.first_trial, matchups.adversaries, schemes)
 
@@ -154,6 +156,17 @@ def _needs(scenario: Scenario, packets: PacketCounts) -> Needs:
         secret_bits_per_slot=scheme.secret_bits,
         initial_secret_bits=scheme.initial_secret_bits,
     )
+
+
+def _leak(scenario: Scenario) -> PacketLeak | None:
+    if scenario.plant is not None:
+        return None
+    revealed = revealed_by_packets(scenario)
+    if revealed is None:
+        return None
+    hidden = 1.0 - revealed.clear
+    bits = float(revealed.hidden_bits.sum()) / float(hidden.sum()) if hidden.any() else None
+    return PacketLeak(float(np.mean(revealed.clear)), bits)
 
 
 def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expectation) -> SimulatedError:

@@ -64,6 +64,17 @@ def inverted(M: Matrix) -> Matrix:
     return [row[n:] for row in rows]
 
 
+def determinant(M: Matrix) -> Fraction:
+    """Det M of a matrix whose leading minors are not 0, as those of a covariance."""
+    rows, found = [list(row) for row in M], Fraction(1)
+    for c, row in enumerate(rows):
+        found *= row[c]
+        for other in rows[c + 1 :]:
+            factor = other[c] / row[c]
+            other[c:] = [a - factor * b for a, b in zip(other[c:], row[c:], strict=True)]
+    return found
+
+
 def trace(M: Matrix) -> Fraction:
     """The sum of the diagonal."""
     return sum((row[i] for i, row in enumerate(M)), Fraction(0))

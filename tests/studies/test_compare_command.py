@@ -114,7 +114,7 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
         *("scenario", "slots", "trials", "seed", "first_trial", "adversaries", "dominant", "schemes"),
     }
     scheme = found["schemes"]["acknowledged"]
-    assert set(scheme) == {"parameters", "needs", "legitimate", "closest", "against"}
+    assert set(scheme) == {"parameters", "needs", "legitimate", "leak", "closest", "against"}
     assert set(scheme["needs"]) == {
         *("acknowledgements", "payload_bits", "header_bits", "packet_bits", "sent_fraction"),
         *("encrypted_fraction", "bits_per_slot", "energy_per_slot", "standard_errors"),

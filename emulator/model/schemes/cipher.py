@@ -77,6 +77,10 @@ class Cipher(Scheme):
         traces: Floats = np.trace(state_covariances(self.process, slots), axis1=1, axis2=2)
         return traces, self.process.spectral_radius >= 1.0 - MARGINAL
 
+    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+        """Nothing."""
+        return np.zeros(slots), np.zeros(slots)
+
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet."""
         return Outcomes.plain(mu)

@@ -13,9 +13,11 @@ from evedrop.model import update
 from evedrop.model.checks import probabilities_mistakes
 from evedrop.model.process import Floats, Process, StateFactors, product
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, select
+from evedrop.model.reference_code import is_regular
 from evedrop.model.schedule import Schedule, StateProbability
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.leaked_bits import leaked_bits
 from evedrop.streams import Ahead, Batch, BlockReader
 
 _INNOVATION = int(Action.INNOVATION)  # numpy compares with an int ten times as fast
@@ -141,6 +143,12 @@ class Innovation(Scheme):
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """Schedule and noise."""
         return SharedSecret(self.process, self.mu_d, keys, batch)
+
+    def revealed_bits(self, slots: int) -> tuple[Floats, Floats] | None:
+        """The state, or what an innovation leaks; None if A is singular, for an innovation then shows a part of w itself."""
+        if not is_regular(self.process.A):
+            return None
+        return np.full(slots, np.inf), leaked_bits(self.process, slots)
 
     def outcomes(self, mu: float) -> Outcomes:
         """Theorem IV.1."""

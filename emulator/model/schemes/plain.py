@@ -44,6 +44,10 @@ class Plain(Scheme):
         """A state with every packet."""
         return Outcomes.plain(mu)
 
+    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+        """The state."""
+        return np.full(slots, np.inf), np.zeros(slots)
+
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
         """As in the paper, with μ_d = 1."""
         return Outcomes.eavesdropper(mu_e, 1.0, use_state, use_innovation)

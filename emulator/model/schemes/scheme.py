@@ -179,7 +179,7 @@ class Scheme(ABC):
     def __init_subclass__(cls, **options: Any) -> None:
         """Reset the theory of the packets: a subclass may send others, and has to state again what holds of them."""
         super().__init_subclass__(**options)
-        for name in ("sends_states_and_innovations", "closed_forms", "error_floor"):
+        for name in ("sends_states_and_innovations", "closed_forms", "error_floor", "revealed_bits"):
             if name not in vars(cls):
                 setattr(cls, name, getattr(Scheme, name))
 
@@ -273,6 +273,17 @@ class Scheme(ABC):
         """A lower bound on tr E[e_k e_kᵀ] of every receiver without the secret, (slots,), and whether it grows without bound.
 
         None: no bound is known, or the genie's is (`sends_states_and_innovations`).
+        """
+        del slots
+        return None
+
+    def revealed_bits(self, slots: int) -> tuple[Floats, Floats] | None:
+        """The bits about the path of states that a packet with ν = 0, and one with ν = 1, reveals in each slot, (slots,) each.
+
+        To a receiver without the secret that knows ν, beyond what all earlier packets revealed; inf: the packet is the state
+        itself. The probability of ν = 0 must be `mu_d`. None: unknown.
+
+        Source: docs/mathematics.md, leak in bits.
         """
         del slots
         return None

@@ -65,6 +65,10 @@ class Withholding(Scheme):
         """A state with probability μp: E P → (1−μp) S(μp)."""
         return self.eavesdropper_outcomes(mu, 1.0, 1.0)
 
+    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+        """The state; silence, by a coin that does not depend on the state, reveals nothing."""
+        return np.full(slots, np.inf), np.zeros(slots)
+
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
         """Silent slots mislead no receiver."""
         del use_innovation

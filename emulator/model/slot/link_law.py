@@ -59,6 +59,17 @@ class LinkLaw:
         """Slots by which a packet may be late."""
         return len(self.segments[0].arrived) - 1
 
+    def rates(self, slots: int) -> Floats:
+        """Probability that the packet of each slot arrives in that slot, (slots,)."""
+        found = np.zeros(slots)
+        starts = [segment.start for segment in self.segments]
+        for segment, stop in zip(self.segments, [*starts[1:], slots], strict=True):
+            some = range(min(segment.start, slots), min(stop, slots))
+            found[some.start : some.stop] = segment.arrived[0] * (segment.quality(some) @ segment.chain.law)
+        for start, stop, _ in self.outages:
+            found[start:stop] = 0.0
+        return found
+
     @property
     def last(self) -> Chain:
         """The link in its last state: the last segment's chain, counting every packet that eventually arrives."""

@@ -1,0 +1,129 @@
+"""What the packets that an eavesdropper received reveal without the secret: states in clear, and bits of other packets.
+
+Source: docs/mathematics.md, leak in bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, final
+
+import numpy as np
+
+from evedrop.figures.standard_error import standard_error, z_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.schedule import in_slots
+from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.link_law import law_of
+from evedrop.names import LEGITIMATE
+from evedrop.scenario import Scenario
+from evedrop.score.summary import LeakSummary
+
+
+class PacketBits(NamedTuple):
+    """What the packet of each slot reveals without the secret."""
+
+    by_type: Floats
+    """Bits of a packet with ν = 0, and of one with ν = 1, (slots, 2); inf for the state itself."""
+    clear: Floats
+    """The probability that it is the state itself, (slots,)."""
+    hidden_bits: Floats
+    """The expected bits of a packet that is not, times the probability of such a packet, (slots,)."""
+
+
+class RevealedBits(NamedTuple):
+    """What a packet reveals in each slot of a scenario to the receiver behind one link."""
+
+    by_type: Floats
+    """Bits of a packet with ν = 0, and of one with ν = 1, (slots, 2); inf for the state itself."""
+    expected: Floats | None
+    """Theory: bits that packets other than states reveal, (slots,); None if theory does not cover the link."""
+
+
+@final
+class LeakTally:
+    """The bits, and the states in clear, that R trials received, summed over slots from slot 0 on."""
+
+    def __init__(self, trials: int) -> None:
+        self._bits, self._clear = np.zeros(trials), np.zeros(trials)
+        self._expected = 0.0  # NaN without theory
+        self.slots = 0
+        """The number of slots so far; 0 in a mode without packets."""
+
+    def add(self, action: Codes, nu: Flags, revealed: RevealedBits) -> None:
+        """Add the next slots: the receiver's actions, and the packets' types, (c, R) each."""
+        some = slice(self.slots, self.slots + len(action))
+        self.slots += len(action)
+        of_state, of_other = revealed.by_type[some].T[:, :, None]
+        bits = np.where(action == Action.LOST, 0.0, np.where(nu, of_other, of_state))
+        clear = np.isinf(bits)
+        # Slot by slot, so that a trial's bits do not depend on how many slots are added at a time.
+        for hidden in np.where(clear, 0.0, bits):
+            self._bits += hidden
+        self._clear += clear.sum(axis=0)
+        if revealed.expected is None:
+            self._expected = math.nan
+        else:
+            for expected in revealed.expected[some].tolist():
+                self._expected += expected
+
+    @classmethod
+    def merged(cls, parts: Sequence[LeakTally]) -> LeakTally:
+        """The sums of disjoint sets of trials, in their order; of no slots if the trials were cut short at different slots."""
+        whole = cls(0)
+        whole._bits = np.concatenate([part._bits for part in parts])
+        whole._clear = np.concatenate([part._clear for part in parts])
+        whole._expected = parts[0]._expected
+        whole.slots = parts[0].slots if len({part.slots for part in parts}) == 1 else 0
+        return whole
+
+    @property
+    def summary(self) -> LeakSummary | None:
+        """The entry of the summary; None without slots."""
+        if not self.slots:
+            return None
+        means = self._bits / self.slots
+        bits, error = float(np.mean(means)), standard_error(means)
+        expected = None if math.isnan(self._expected) else self._expected / self.slots
+        clear = float(np.mean(self._clear)) / self.slots
+        return LeakSummary(clear, bits, error, expected, z_of(bits, expected, error))
+
+
+def leak_is_known(scenario: Scenario, receiver: str) -> bool:
+    """Whether it is known what the packets that a receiver hears reveal.
+
+    Not for the legitimate estimator, which has the secret, for schemes that do not say what their packets reveal, for packets
+    that may come late, and for a plant, whose noise is not the one that theory describes.
+    """
+    if receiver == LEGITIMATE or scenario.plant is not None or scenario.window(receiver):
+        return False
+    return scheme_of(scenario.process.process, scenario.encoding.spec).revealed_bits(1) is not None
+
+
+def revealed_by_packets(scenario: Scenario) -> PacketBits | None:
+    """What the scenario's packets reveal; None if its scheme does not say."""
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    known = scheme.revealed_bits(scenario.slots)
+    if known is None:
+        return None
+    state = np.where(np.arange(scenario.slots) == 0, 1.0, in_slots(scheme.mu_d, range(scenario.slots)))
+    clear, hidden = np.zeros(scenario.slots), np.zeros(scenario.slots)
+    for odds, bits in zip((state, 1.0 - state), known, strict=True):
+        clear += np.where(np.isinf(bits), odds, 0.0)
+        hidden += np.where(np.isinf(bits), 0.0, bits) * odds
+    return PacketBits(np.stack(known, axis=1), clear, hidden)
+
+
+def revealed_to(scenario: Scenario) -> dict[str, RevealedBits]:
+    """Receiver → what packets reveal to it, for all of which it is known."""
+    names = [name for name in scenario.receivers if leak_is_known(scenario, name)]
+    packets = revealed_by_packets(scenario) if names else None
+    if packets is None:
+        return {}
+    laws = {name: law_of(scenario.schedule(name)) for name in names}
+    return {
+        name: RevealedBits(packets.by_type, None if law is None else law.rates(scenario.slots) * packets.hidden_bits)
+        for name, law in laws.items()
+    }
