@@ -63,6 +63,7 @@ def test_a_schedule_of_probabilities_leaks_slot_by_slot() -> None:
     scenario = load("eavesdroppers", {"slots": 4, "encoding": encoding, "expect": []})
     bits = leaked_bits(scenario.process.process, 4)
     expected = revealed_to(scenario)["smart"].expected
+    assert expected is not None
     np.testing.assert_allclose(expected, scenario.quality["smart"] * (1.0 - np.array(chances)) * bits, rtol=1e-12)
 
 
