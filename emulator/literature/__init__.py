@@ -9,12 +9,14 @@ from collections.abc import Mapping
 
 from evedrop.errors import UsageError
 from evedrop.literature.kennedy2022 import Kennedy2022
+from evedrop.literature.luecke2022 import Luecke2022
 from evedrop.literature.paper import Paper, Progress
 from evedrop.literature.reproduction import Reproduction
 from evedrop.model.registry import near
 
 PAPERS: Mapping[str, type[Paper]] = {
     "kennedy2022": Kennedy2022,
+    "luecke2022": Luecke2022,
 }
 """Name on the command line → paper, in the order of the list."""
 

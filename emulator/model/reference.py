@@ -81,9 +81,10 @@ class ReferenceReceiver(Receiver):
     Source: docs/mathematics.md, acknowledged references.
     """
 
-    def __init__(self, process: Process, trials: int) -> None:
+    def __init__(self, process: Process, trials: int, open_loop: bool = False) -> None:
+        """open_loop: L = A in coded packets, too."""
         super().__init__(process, trials)
-        self._code = ReferenceCode(process)
+        self._code = ReferenceCode(process, open_loop)
         self._noise: list[Floats] = [np.zeros_like(process.Q), process.noise_factor]
         self._negligible = _NEGLIGIBLE * float(np.abs(process.noise_factor).max())
 

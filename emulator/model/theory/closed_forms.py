@@ -5,6 +5,7 @@ Source: docs/mathematics.md, twin track, acknowledged references, schedules by h
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,14 @@ def twin_track_bound(process: Process, slots: int) -> Floats:
     return bound
 
 
-def reference_covariances(process: Process, received: float, acknowledged: tuple[float, float], slots: int) -> Floats:
+def reference_covariances(
+    process: Process,
+    received: float,
+    acknowledged: tuple[float, float],
+    slots: int,
+    plain: float = 0.0,
+    L: Callable[[int], Floats] | None = None,
+) -> Floats:
     """E P_k of a reader of state-secrecy codes with L = A, for k = 0 … slots−1, (slots, n, n); inf from where it overflows.
 
     received: the probability that it hears a packet. acknowledged: the probabilities that the packet is acknowledged to
@@ -41,18 +49,22 @@ def reference_covariances(process: Process, received: float, acknowledged: tuple
 
     which is linear in (P, R), so the expectations follow it.
 
-    Source: docs/mathematics.md, acknowledged references.
+    plain: the probability that a packet contains the state: P_k = 0 where that is heard. L: k → L_k; R⁻ = L R Lᵀ then. With
+    either these are errors of a reader that takes z plus its own reference for the state: upper bounds on those of the best one.
+
+    Source: docs/mathematics.md, acknowledged references, flipped acknowledgements.
     """
-    _, unheard = acknowledged
+    heard, unheard = acknowledged
     found = np.empty((slots, process.n, process.n))
     P = R = np.zeros_like(process.Q)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(slots):
             A = process.A
             predicted = A @ P @ A.T + process.Q if k else process.initial_covariance
-            carried = A @ R @ A.T
-            P = received * carried + (1.0 - received) * predicted
-            R = (1.0 - unheard) * carried + unheard * predicted
+            step = A if L is None or not k else L(k)
+            carried = step @ R @ step.T
+            P = received * (1.0 - plain) * carried + (1.0 - received) * predicted
+            R = (1.0 - unheard - plain * heard) * carried + unheard * predicted
             if not np.isfinite(P).all():
                 found[k:] = np.inf
                 break
