@@ -50,9 +50,8 @@ class Listening:
             streams = self.kind.streams(self.parameters)
         scheme = made(self.scheme_of, problem, self.scheme)
         of_slots = scheme.mu_d if isinstance(scheme.mu_d, tuple) else None
-        knowledge = Knowledge(
-            problem.process, scheme.state_probability, self.parameters, NamedKeys.of(streams), of_slots
-        )
+        mu_d, keys = scheme.state_probability, NamedKeys.of(streams)
+        knowledge = Knowledge(problem.process, mu_d, self.parameters, keys, of_slots, scheme.noise_law)
         with calling(f"{self.kind.__name__}(knowledge, batch)", self.kind):
             return self.kind(knowledge, problem.batch)
 

@@ -1,10 +1,12 @@
-"""Closed forms for receivers whose slots differ, because the packets depend on acknowledgements.
+"""Closed forms for receivers whose slots differ, because the packets depend on acknowledgements, or that take noise for states.
 
-Source: docs/mathematics.md, acknowledged references and schedules by holding time.
+Source: docs/mathematics.md, acknowledged references, schedules by holding time and noise packets.
 """
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -12,24 +14,73 @@ from typing import final
 import numpy as np
 
 from evedrop.model.acknowledgements import FORGING, rates_of
+from evedrop.model.outcomes import noise_taken
 from evedrop.model.process import Floats, Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.reference_floor import reference_floor
-from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_forms import SensorChain, encrypted_schedule, reference_covariances, scheduled
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.noise_taken import NoiseTaken
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
 Split = tuple[float, float]
 
 
+class ClosedForm(ABC):
+    """One receiver's expected error covariance over the slots of a run."""
+
+    bound: bool = False
+    """Whether this is only a lower bound, in every slot; its limit is exact."""
+
+    @property
+    @abstractmethod
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,)."""
+
+    @property
+    @abstractmethod
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
+
+    @property
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+        return math.isinf(self.limit)
+
+
 @final
 @dataclass(frozen=True)
-class Closed:
-    """One receiver's expected error covariance over the slots of a run."""
+class TakesNoise(ClosedForm):
+    """That of a receiver that takes noise packets for states, behind a link of independent losses."""
+
+    taken: NoiseTaken
+    slots: int
+
+    @cached_property
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,)."""
+        traces: Floats = np.trace(self.taken.covariances(self.slots), axis1=1, axis2=2)
+        return traces
+
+    @cached_property
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded."""
+        return float(np.trace(self.taken.limit))
+
+    @property
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound: not where noise is used, which leaves an error like x itself."""
+        return theory.has_infinite_variance(self.taken.process, self.taken.outcomes)
+
+
+@final
+@dataclass(frozen=True)
+class Closed(ClosedForm):
+    """That of a receiver of packets that depend on acknowledgements."""
 
     process: Process
     slots: int
@@ -40,7 +91,6 @@ class Closed:
     chain: SensorChain | None
     """The sensor's behaviour; None if it sends in every slot."""
     bound: bool = False
-    """Whether this is only a lower bound, in every slot; its limit is exact."""
 
     @cached_property
     def traces(self) -> Floats:
@@ -73,7 +123,7 @@ class Closed:
 class ClosedStream:
     """The traces of a closed form, a number of slots at a time."""
 
-    def __init__(self, closed: Closed) -> None:
+    def __init__(self, closed: ClosedForm) -> None:
         self._closed, self._next = closed, 0
 
     def next_traces(self, slots: int) -> Floats:
@@ -82,8 +132,28 @@ class ClosedStream:
         return self._closed.traces[self._next - slots : self._next]
 
 
-def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
-    """A receiver's closed form; None if scheme and strategy have none, or the links violate its assumptions.
+def closed_of(scenario: Scenario, receiver: str) -> ClosedForm | None:
+    """A receiver's closed form; None if scheme and strategy have none, or the links violate its assumptions."""
+    if _kind_of(scenario, receiver) == "noise":
+        return _takes_noise(scenario, receiver)
+    return acknowledged_form(scenario, receiver)
+
+
+def _kind_of(scenario: Scenario, receiver: str) -> str | None:
+    reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
+    return SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
+
+
+def _takes_noise(scenario: Scenario, receiver: str) -> TakesNoise | None:
+    if not _independent(scenario, receiver):
+        return None
+    scheme, table = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.eavesdroppers[receiver]
+    found = noise_taken(scheme, table.strategy, table.parameters)
+    return None if found is None else TakesNoise(found(scenario.quality[receiver]), scenario.slots)
+
+
+def acknowledged_form(scenario: Scenario, receiver: str) -> Closed | None:
+    """The closed form of a receiver of a scheme that acts on acknowledgements; None as for `closed_of`.
 
     It assumes links of independent losses without delay, and an attack that is always on or always off.
     """
@@ -97,8 +167,7 @@ def closed_of(scenario: Scenario, receiver: str) -> Closed | None:
         return None
     process, quality = scenario.process.process, scenario.quality
     split = _split(scenario, receiver)
-    reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
-    kind = SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
+    kind = _kind_of(scenario, receiver)
     # Unless acknowledgements are forged the user never misses a reference, so it knows more about each slot.
     told = receiver != LEGITIMATE or table.attack in FORGING
     if kind in ("reference", "open-loop") and told:

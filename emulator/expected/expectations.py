@@ -9,13 +9,13 @@ from typing import Protocol, final
 
 import numpy as np
 
-from evedrop.expected.closed_forms import Closed, ClosedStream, closed_of
+from evedrop.expected.closed_forms import ClosedForm, ClosedStream, closed_of
 from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Floats, Process
 from evedrop.model.schedule import in_slot
-from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
@@ -64,12 +64,12 @@ class Expectation:
     outcomes_at: OutcomesAt | None
     """Maps a link's quality to the frequencies of the receiver's actions; None if these are unknown."""
     bound_at: OutcomesAt | None = None
-    """For a receiver without the secret and without a theory of its own: the genie, which no such receiver outperforms."""
+    """For a receiver without the secret and without a theory of its own: one that it cannot outperform, such as the genie."""
     bound_slots_at: SlotOutcomes | None = None
     """The same as `slots_at` for `bound_at`."""
-    closed: Closed | None = None
+    closed: ClosedForm | None = None
     """The closed form of a receiver whose slots differ."""
-    closed_bound: Closed | None = None
+    closed_bound: ClosedForm | None = None
     """A lower bound for such a receiver, in place of a closed form."""
     slots_at: SlotOutcomes | None = None
     """The outcomes of each slot, where μ_d differs from slot to slot; `outcomes_at` is then their mean, and there is no limit."""
@@ -144,7 +144,7 @@ class Expectation:
         if self.bound is not None:
             return self.bound.infinite_variance
         if self.closed is not None:
-            return math.isinf(self.closed.limit)
+            return self.closed.infinite_variance
         if self._known is None or not self.has_limit:
             return False
         if self._outcomes is not None:
@@ -168,11 +168,11 @@ def _outcomes_of(scenario: Scenario, receiver: str, scheme: Scheme) -> OutcomesA
 
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
-    """The same for the genie behind a receiver's link, where it bounds the receiver: for schemes it bounds, without leaks."""
-    scheme = SCHEMES[scenario.encoding.scheme]
-    if receiver == LEGITIMATE or receiver in scenario.leaks or not scheme.sends_states_and_innovations:
+    """The same for a receiver that knows the types of packets, behind the same link, where it bounds this one: without leaks."""
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    if receiver == LEGITIMATE or receiver in scenario.leaks or scheme.bound_outcomes(0.5) is None:
         return None
-    return partial(_genie, scenario.encoding.mu_d)
+    return partial(_bound, scheme)
 
 
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
@@ -190,7 +190,7 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
             closed=None if bound else closed,
             closed_bound=closed if bound else None,
             slots_at=None if mu_d is None else _in_slots(mu_d, partial(_known_in_slot, scenario, name, scheme)),
-            bound_slots_at=None if mu_d is None else lambda k, mu_d=mu_d: partial(_genie, in_slot(mu_d, k)),  # type: ignore[misc]
+            bound_slots_at=None if mu_d is None else lambda k: partial(_bound, scheme.in_slot(k)),
             of_model=scenario.plant is not None,
         )
     return found
@@ -215,8 +215,10 @@ def _known_in_slot(scenario: Scenario, receiver: str, scheme: Scheme, k: int) ->
     return found
 
 
-def _genie(mu_d: float, quality: float) -> Outcomes:
-    return Outcomes.genie(quality, mu_d)
+def _bound(scheme: Scheme, quality: float) -> Outcomes:
+    found = scheme.bound_outcomes(quality)
+    assert found is not None  # noqa: S101 - checked before
+    return found
 
 
 def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:

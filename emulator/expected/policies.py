@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from evedrop.errors import UsageError
-from evedrop.expected.closed_forms import closed_of
+from evedrop.expected.closed_forms import acknowledged_form
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
 from evedrop.model.theory.policy import least_weight
@@ -63,7 +63,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
         for name, table in scenario.eavesdroppers.items()
         if forms.get(table.strategy) != _CLOSED_FORM
     }
-    closed = {name: closed_of(scenario, name) for name in scenario.receivers if name not in left_out}
+    closed = {name: acknowledged_form(scenario, name) for name in scenario.receivers if name not in left_out}
     if len(closed) == 1:
         raise UsageError(
             "the design of a policy needs an eavesdropper whose error has a closed form under this scheme; expected a "

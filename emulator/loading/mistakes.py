@@ -24,6 +24,7 @@ from evedrop.scenario.across import (
     application_mistakes,
     encoding_mistakes,
     link_mistakes,
+    scheme_mistakes,
     strategy_mistakes,
 )
 from evedrop.scenario.closed_loop import loop_mistakes
@@ -52,6 +53,7 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         most = f"expected at most trials, which is {trials}: a shard has one trial or more"
         found.append(f"shards: is {tables.shards}; {most}")
     for phase in (
+        scheme_mistakes,
         strategy_mistakes,
         encoding_mistakes,
         acknowledgement_mistakes,

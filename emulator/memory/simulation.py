@@ -93,8 +93,8 @@ class Simulation:
     def _eavesdropper(self, name: str) -> Receiver:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
-        encoding = self._scenario.encoding
-        knowledge = Knowledge(self._process, encoding.mu_d, table.parameters, keys, encoding.state_probabilities)
+        encoding, law = self._scenario.encoding, self._scheme.noise_law
+        knowledge = Knowledge(self._process, encoding.mu_d, table.parameters, keys, encoding.state_probabilities, law)
         return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:

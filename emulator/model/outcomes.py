@@ -5,7 +5,7 @@ Source: docs/mathematics.md, eavesdroppers; docs/schemes.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
@@ -14,6 +14,7 @@ from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.model.theory.noise_taken import NoiseTaken
 
 
 def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
@@ -48,3 +49,12 @@ def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str
         return found
 
     return None if scheme.eavesdropper_outcomes(0.5, *uses) is None else at
+
+
+def noise_taken(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> Callable[[float], NoiseTaken] | None:
+    """Maps the quality of a link to the error of a user of packets some of which are noise; None if there is no such error."""
+    kind, law = STRATEGIES[strategy], scheme.noise_law
+    if law is None or not issubclass(kind, PacketTaker):
+        return None
+    uses = kind.use_probabilities(parameters)
+    return lambda mu_e: NoiseTaken(scheme.process, law, scheme.mu_d, mu_e, uses)

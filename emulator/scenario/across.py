@@ -76,6 +76,13 @@ def acknowledgement_mistakes(tables: ValidTables) -> Iterator[str]:
                 )
 
 
+def scheme_mistakes(tables: ValidTables) -> Iterator[str]:
+    """Parameters of the scheme that do not fit the process."""
+    if tables.process is not None and tables.encoding is not None and tables.scheme is not None:
+        for entry, what in tables.scheme.mistakes_with(tables.process.process, tables.encoding.parameters):
+            yield f"encoding.{entry}: {what}"
+
+
 def strategy_mistakes(tables: ValidTables) -> Iterator[str]:
     """Strategies that need a stream the scheme lacks, and leaks in a slot beyond the run or while the eavesdropper is away."""
     for name, table in tables.eavesdroppers.items():

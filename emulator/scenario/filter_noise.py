@@ -22,19 +22,31 @@ FILTER = "filter"
 
 
 def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
-    """Replace `Q = "filter"` with the covariance of the filter's innovations, in place. Returns mistakes, with their paths."""
-    process = tables.get("process")
-    if not isinstance(process, dict) or process.get("Q") != FILTER:
+    """Replace "filter" by the covariance of the filter's innovations, as Q, and of its error, as that of a scheme's noise.
+
+    This is done in place. Returns mistakes, with their paths.
+    """
+    process, encoding = tables.get("process"), tables.get("encoding")
+    if not isinstance(process, dict):
         return []
+    of_process = process.get("Q") == FILTER
+    noise = encoding if isinstance(encoding, dict) and encoding.get("noise_covariance") == FILTER else None
     rows = process.get("A")
     n = len(rows) if isinstance(rows, list) and 0 < len(rows) <= MOST_STATES else 1
-    process["Q"] = np.eye(n).tolist()  # a placeholder until Q is known
+    if of_process:
+        process["Q"] = np.eye(n).tolist()  # a placeholder until Q is known
     plant = tables.get("plant")
+    if not of_process and noise is None:
+        return []
     if not isinstance(plant, Mapping) or plant.get("output_matrix") is None:
+        if not of_process:  # the scheme says what it expects instead
+            return []
         return [
             f'process.Q: is "{FILTER}", but the sensor has none; expected a matrix, or output_matrix and measurement_noise '
             "in [plant]"
         ]
+    if noise is not None:
+        noise["noise_covariance"] = np.eye(n).tolist()  # a placeholder, too
     try:
         # Disturbances may be numbers for a whole day, and do not matter here.
         bare = {name: value for name, value in plant.items() if not name.startswith("disturbance")}
@@ -42,8 +54,11 @@ def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
         step = settled_of(made, PlantTable.model_validate(bare))
     except ValueError:  # a mistake in process or plant, reported elsewhere
         return []
-    process["Q"] = step.innovation.tolist()
-    process["singular_noise"] = is_singular(step.innovation)
+    if noise is not None:
+        noise["noise_covariance"] = step.covariance.tolist()
+    if of_process:
+        process["Q"] = step.innovation.tolist()
+        process["singular_noise"] = is_singular(step.innovation)
     return []
 
 

@@ -33,6 +33,13 @@ RUNS: dict[str, dict[str, Any]] = {
     "acknowledged": {"A": UNSTABLE, "attack": {"attack": "critical", "jammer": "ref"}, "event": [JAM]},
     "cipher": {"A": STABLE},
     "encrypted-schedule": {"A": STABLE, "threshold": 2, "attack": {"attack": "forge"}, "event": [PAUSE]},
+    "noise": {
+        "A": STABLE,
+        "state_probability": 0.6,
+        "noise_covariance": [[1e-3, 2e-4], [2e-4, 1e-3]],
+        "reads_as": "bayesian",
+        "event": [PAUSE],
+    },
     "open-loop": {"A": MIXED, "attack": {"attack": "forge"}, "event": [JAM, PAUSE]},
     "scheduled": {"A": STABLE, "threshold": 3, "attack": {"attack": "all"}, "event": [JAM]},
     "twin-track": {"A": UNSTABLE, "reads_as": "tracker"},

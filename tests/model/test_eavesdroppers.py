@@ -187,7 +187,7 @@ def test_who_looks_at_packets_says_so(name: str) -> None:
     one, gamma = receiver(name, Batch(2, 3)), np.ones(3, bool)
     follows = STRATEGIES[name].follows_gamma(PARAMETERS[name])
     assert follows == (name in {*TAKERS, "colluding"})
-    if name in {"bayesian", "likelihood", "reference", "selective", "tracker", "replay-informed"}:
+    if name in {"bayesian", "likelihood", "power-test", "reference", "selective", "tracker", "replay-informed"}:
         with pytest.raises(NotImplementedError, match="γ alone does not tell its action"):
             one.act(0, gamma)
     else:

@@ -113,6 +113,7 @@ def test_schemes_say_what_their_packets_reveal() -> None:
     assert found == {
         "cipher": [0.0, 0.0],
         "innovation": [math.inf, leak],
+        "noise": [math.inf, 0.0],
         "plain": [math.inf, 0.0],
         "withholding": [math.inf, 0.0],
     }

@@ -37,6 +37,7 @@ def test_the_built_in_classes_say_what_theory_knows() -> None:
     assert {name for name in SCHEMES if SCHEMES[name].closed_forms} == {
         "acknowledged",
         "encrypted-schedule",
+        "noise",
         "open-loop",
         "scheduled",
     }
@@ -78,6 +79,7 @@ def test_the_bits_of_packets_and_secrets_are_counted() -> None:
         "cipher": (128, 128, 0),
         "encrypted-schedule": (192, 128, 0),
         "innovation": (128, 192, 0),
+        "noise": (128, 64, 0),
         "open-loop": (256, 0, 0),
         "plain": (128, 0, 0),
         "random-code": (256, 0, 0),
@@ -95,4 +97,4 @@ def test_a_scheme_that_says_nothing_of_eavesdroppers_has_no_closed_form() -> Non
         for name in SCHEMES
         if scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters}).eavesdropper_outcomes(0.5, 1.0, 0.0)
     }
-    assert known == {"innovation", "plain", "withholding"}
+    assert known == {"innovation", "noise", "plain", "withholding"}

@@ -68,7 +68,7 @@ def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entr
     (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
         f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by its knowledge of the schedule, and the scheme '
-        "plain has none; expected bayesian, constant, likelihood, naive, reference, selective or tracker"
+        "plain has none; expected bayesian, constant, likelihood, naive, power-test, reference, selective or tracker"
     )
 
 

@@ -197,6 +197,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         "cipher": (128, 0),
         "encrypted-schedule": (128, 0),
         "innovation": (192, 0),
+        "noise": (64, 0),
         "twin-track": (64, 256),
     }
     assert {name for name, one in needs.items() if one.acknowledgements} == {

@@ -210,6 +210,7 @@ def briefs_of(
             parameters=table.parameters,
             window=scenario.window(name),
             outages=_outages(scenario, name),
+            noise_covariance=None if scheme.noise_law is None else scheme.noise_law.given,
             modules=modules(strategy=table.strategy, parameters=table.parameters),
         )
         made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))

@@ -5,11 +5,12 @@ Source: docs/protocol.md, the brief.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from evedrop.entries import (
+    MATRIX,
     SLOT,
     Check,
     anything,
@@ -39,6 +40,7 @@ from evedrop.live.protocol.brief_closed_loop import (
 from evedrop.live.protocol.keys import KINDS
 from evedrop.model.acknowledgements import WayBackSpec
 from evedrop.model.links.link import Fate
+from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.numeric.detection import Chart
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.streams import MOST_SLOTS
@@ -62,6 +64,11 @@ _WAY_BACK: Check = maybe(
     )
 )
 _CHANGES = listed(table({"at": SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)}))
+
+
+def _noise(path: str, found: Any) -> Iterator[str]:
+    """Check that a value is a matrix or a word."""
+    yield from (text if isinstance(found, str) else MATRIX)(path, found)
 
 
 @dataclass(frozen=True)
@@ -203,10 +210,17 @@ class EavesdropperPart:
     """As the legitimate estimator's."""
     outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
     """As the legitimate estimator's."""
+    noise_covariance: Any = field(default=None, metadata=entry(_noise, left_out=True))
+    """The covariance of packets that hold noise in place of a state, as in the scenario; None if the scheme sends none."""
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
     """As the router's."""
     state_file: str | None = field(default=None, metadata=entry(text, left_out=True))
     """As the legitimate estimator's."""
+
+    @property
+    def noise_law(self) -> NoiseLaw | None:
+        """The law of these packets; None if there are none."""
+        return None if self.noise_covariance is None else NoiseLaw(self.noise_covariance)
 
 
 @dataclass(frozen=True)

@@ -55,14 +55,17 @@ def expect_usable(brief: AnyBrief) -> None:
             _expect_keys(brief, _scheme(brief, part).estimator_streams)
             if loop is not None and loop.plant is not None:
                 _expect_plant(brief, loop.plant)
-        case EavesdropperPart(strategy=strategy, parameters=parameters):
-            kind = STRATEGIES[strategy]
+        case EavesdropperPart(strategy=strategy, parameters=parameters, noise_law=law):
+            kind, n = STRATEGIES[strategy], brief.model.process.n
             lacking = sorted(set(kind.parameters) - set(parameters))
             if lacking:
                 raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {WRITE_AGAIN}")
             with _using("part.parameters"):
                 streams = kind.streams(parameters)
             _expect_keys(brief, streams)
+            with _using("part.noise_covariance"):
+                if law is not None and law.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
+                    raise ValueError(f"it does not have {n} states, as the model does")
         case ControllerPart() as part:
             _expect_controller(brief, part)
         case _:

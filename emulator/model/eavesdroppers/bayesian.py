@@ -32,14 +32,17 @@ class Bayesian(PacketReader):
     `Belief.memory` is its `Mixture`.
     """
 
-    only_against = ("innovation", "weighs states against innovations, and there are none: it is the same as naive here")
+    only_against = (
+        ("innovation", "noise"),
+        "weighs states against innovations, and there are none: it is the same as naive here",
+    )
     inverts_noise = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
         self._capacity = capacity
-        self._leaks, self._noise = Leaks(knowledge.process), cholesky(knowledge.process.Q)
+        self._leaks, self._noise = Leaks(knowledge.process, knowledge.noise_law), cholesky(knowledge.process.Q)
 
     def prior(self, first: int = 0) -> Belief:
         """One component, without any reception."""

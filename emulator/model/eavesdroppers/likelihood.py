@@ -27,13 +27,16 @@ class Likelihood(PacketReader):
     `Belief.memory` is P's factors, (n (n−1)/2, R) and (n, R).
     """
 
-    only_against = ("innovation", "tests states against innovations, and there are none: it is the same as naive here")
+    only_against = (
+        ("innovation", "noise"),
+        "tests states against innovations, and there are none: it is the same as naive here",
+    )
     inverts_noise = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
-        self._leaks = Leaks(knowledge.process)
+        self._leaks = Leaks(knowledge.process, knowledge.noise_law)
         self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
 
     def prior(self, first: int = 0) -> Belief:

@@ -11,6 +11,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.likelihood import Likelihood
 from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.power_test import PowerTest
 from evedrop.model.eavesdroppers.reference import Reference
 from evedrop.model.eavesdroppers.selective import Selective
 from evedrop.model.eavesdroppers.smart import Smart
@@ -31,6 +32,7 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "likelihood": Likelihood,
     "bayesian": Bayesian,
     "genie": Genie,
+    "power-test": PowerTest,
     "reference": Reference,
     "selective": Selective,
     "tracker": Tracker,

@@ -11,6 +11,7 @@ from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.cipher import Cipher
 from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.random_code import RandomCode
@@ -25,6 +26,7 @@ _BUILT_IN: Mapping[str, type[Scheme]] = {
     "cipher": Cipher,
     "encrypted-schedule": EncryptedSchedule,
     "innovation": Innovation,
+    "noise": Noise,
     "open-loop": OpenLoop,
     "plain": Plain,
     "random-code": RandomCode,

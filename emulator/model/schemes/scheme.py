@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.block_methods import outdated
+from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
@@ -27,7 +28,7 @@ class Packet(NamedTuple):
     z: Floats
     """Payload, (n, R)."""
     nu: Flags
-    """ν_k, (R,): true for an innovation. Never sent; the sensor's own record."""
+    """ν_k, (R,): true for an innovation, or for noise in its place. Never sent; the sensor's own record."""
     header: NDArray[np.int64] | None = None
     """Sent in clear with z, (h, R); None for a scheme without a header."""
     sent: Flags | None = None
@@ -179,7 +180,7 @@ class Scheme(ABC):
     def __init_subclass__(cls, **options: Any) -> None:
         """Reset the theory of the packets: a subclass may send others, and has to state again what holds of them."""
         super().__init_subclass__(**options)
-        for name in ("sends_states_and_innovations", "closed_forms", "error_floor", "revealed_bits"):
+        for name in ("sends_states_and_innovations", "closed_forms", "error_floor", "revealed_bits", "bound_outcomes"):
             if name not in vars(cls):
                 setattr(cls, name, getattr(Scheme, name))
 
@@ -211,6 +212,12 @@ class Scheme(ABC):
         del given
         return []
 
+    @classmethod
+    def mistakes_with(cls, process: Process, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Mistakes in parameters, otherwise valid, that show only with the process: as `mistakes`."""
+        del process, given
+        return []
+
     @abstractmethod
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The shared part of both sides; keys: those of `secret_streams`."""
@@ -226,6 +233,11 @@ class Scheme(ABC):
     def initial_state(self, keys: Mapping[str, bytes], batch: Batch) -> Floats | None:
         """x_0 (n, R), if the secret decides it; None if the process alone does."""
         del keys, batch
+        return None
+
+    @property
+    def noise_law(self) -> NoiseLaw | None:
+        """The public law of packets that hold noise in place of a state; None if there are none."""
         return None
 
     @property
@@ -287,6 +299,10 @@ class Scheme(ABC):
         """
         del slots
         return None
+
+    def bound_outcomes(self, mu_e: float) -> Outcomes | None:
+        """The outcomes at the best receiver without the secret but with the types of packets; None if no bound is known."""
+        return Outcomes.genie(mu_e, self.state_probability) if self.sends_states_and_innovations else None
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes | None:
         """The outcomes at a receiver that uses packets with P(b=1 | ν); None if there is no closed form."""

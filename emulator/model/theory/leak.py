@@ -19,6 +19,7 @@ import numpy as np
 from evedrop.kernels.current import kernels
 from evedrop.kernels.elementary import cholesky
 from evedrop.kernels.leak import Leak
+from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
 from evedrop.streams import Ahead
 
@@ -92,10 +93,14 @@ def _squared(L: Floats) -> Floats:
 
 @final
 class Leaks:
-    """The leak of every slot k ≥ 1; reading slots in order computes each once, and many at a time."""
+    """The leak of every slot k ≥ 1; reading slots in order computes each once, and many at a time.
 
-    def __init__(self, process: Process) -> None:
+    law: of noise that is sent in place of innovations, and leaks nothing: L_k is then the factor of its covariance, and M_k is Q.
+    """
+
+    def __init__(self, process: Process, law: NoiseLaw | None = None) -> None:
         self._states = StateFactors(process)
+        self._alone = None if law is None else law.factors(process)
         self._noise = cholesky(process.Q)
         count = max(1, min(_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE // (4 * process.n * process.n)))
         self._factors = Ahead(lambda slots: range(slots.start, max(slots.stop, slots.start + count)), self._computed)
@@ -113,4 +118,9 @@ class Leaks:
         return self._factors.of(slots)
 
     def _computed(self, slots: range) -> Floats:
-        return _triangularised(self._states.block(slots), self._noise, self._noise)
+        if self._alone is None:
+            return _triangularised(self._states.block(slots), self._noise, self._noise)
+        n = len(self._noise)
+        joint = np.zeros((len(slots), 2 * n, 2 * n))
+        joint[:, :n, :n], joint[:, n:, n:] = self._alone.block(slots), self._noise
+        return joint

@@ -288,11 +288,22 @@ OPTIONAL = {
     "longest_outage",
     "largest_message",
     "measurement",
+    "noise_covariance",
+    "output_matrix",
+    "measurement_noise",
 }
 """Entries that a brief may leave out, or whose meaning another one gives."""
-WITHIN = ("part.scenario", "part.assignment.parameters", "part.parameters", "part.scheme", "model.A", "model.Q")
+WITHIN = (
+    "part.scenario",
+    "part.assignment.parameters",
+    "part.parameters",
+    "part.scheme",
+    "part.noise_covariance",
+    "model.A",
+    "model.Q",
+)
 """Tables with entries of the scenario, which their readers check, and matrices."""
-KINDS = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart")
+KINDS = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart", "noise-before")
 
 
 def every_brief() -> dict[str, dict[str, Any]]:

@@ -141,7 +141,21 @@ def many_disturbances(found: dict[str, Any]) -> None:
     plant["disturbance_matrix"] = [[*row, 1.0] for row in plant["disturbance_matrix"]]
 
 
+def one_state(found: dict[str, Any]) -> None:
+    """The noise and the model are not of the same system."""
+    found["part"]["noise_covariance"] = [[1.0]]
+
+
+def no_covariance(found: dict[str, Any]) -> None:
+    """The noise has a direction with a negative variance."""
+    found["part"]["noise_covariance"] = [[1.0, 2.0], [2.0, 1.0]]
+
+
 UNUSABLE = {
+    "noise-before/bayesian": [
+        (one_state, "part.noise_covariance cannot be used (ValueError: it does not have 2 states"),
+        (no_covariance, "part.noise_covariance cannot be used (ValueError: not positive definite)"),
+    ],
     "eavesdroppers/sensor": [(without_parameter, "part.scheme.state_probability is missing")],
     "acknowledged/sensor": [(other_scheme, "part.scheme.colour is not a parameter of the scheme")],
     "microgrid/controller": [
