@@ -21,6 +21,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:
+    from evedrop.expected.energy_budget import BudgetDesign
     from evedrop.expected.policies import PolicyDesign
     from evedrop.memory.montecarlo import Plan
     from evedrop.model.theory.design import Adversary, Design
@@ -30,7 +31,16 @@ if TYPE_CHECKING:
 _LONGEST_SCHEDULE = 100  # designed in a minute
 _TWENTIETHS = tuple(float(i) / 20 for i in range(21))
 
-__all__ = ["compare", "design", "design_policy", "design_schedule", "load_results", "montecarlo", "run"]
+__all__ = [
+    "compare",
+    "design",
+    "design_budget",
+    "design_policy",
+    "design_schedule",
+    "load_results",
+    "montecarlo",
+    "run",
+]
 
 
 def run(
@@ -239,6 +249,21 @@ def design_policy(
     from evedrop.expected.policies import policies_of  # noqa: PLC0415 - a run does not need it
 
     return policies_of(_prepared(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
+
+
+def design_budget(
+    scenario: str | Path | Scenario, budget: float, *, changes: Mapping[str, Any] | None = None
+) -> BudgetDesign:
+    """The threshold from which on a sensor should encrypt, for a budget of energy.
+
+    budget: mean energy in a slot, in the unit of the scenario's `[energy]`; changes: entries by dotted key.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError if no threshold keeps the budget, see
+    `evedrop.expected.energy_budget.budget_of`.
+    """
+    from evedrop.expected.energy_budget import budget_of  # noqa: PLC0415 - a run does not need it
+
+    return budget_of(_prepared(scenario, changes or {}, beyond_horizon=True), budget)
 
 
 def _not_for(scheme: str) -> str:

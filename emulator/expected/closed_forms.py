@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
 from evedrop.model.acknowledgements import FORGING, rates_of
+from evedrop.model.checks import is_number
 from evedrop.model.outcomes import noise_taken
 from evedrop.model.process import Floats, Process
 from evedrop.model.reference_code import ReferenceCode
@@ -21,9 +22,16 @@ from evedrop.model.reference_floor import reference_floor
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
-from evedrop.model.theory.closed_forms import SensorChain, encrypted_schedule, reference_covariances, scheduled
+from evedrop.model.theory.closed_forms import (
+    SensorChain,
+    always_sent,
+    encrypted_schedule,
+    reference_covariances,
+    scheduled,
+)
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.noise_taken import NoiseTaken
+from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
@@ -91,6 +99,8 @@ class Closed(ClosedForm):
     chain: SensorChain | None
     """The sensor's behaviour; None if it sends in every slot."""
     bound: bool = False
+    quantisation: QuantisationError | None = None
+    """The error of a state that is read from a packet; None if there is none."""
 
     @cached_property
     def traces(self) -> Floats:
@@ -98,7 +108,7 @@ class Closed(ClosedForm):
         if self.bound:
             return reference_floor(self.process, self.received, self.acknowledged, self.slots)
         if self.chain is not None:
-            found = self.chain.covariances(self.process, self.slots)
+            found = self.chain.covariances(self.process, self.slots, self.quantisation)
         else:
             found = reference_covariances(self.process, self.received, self.acknowledged, self.slots)
         traces: Floats = np.trace(found, axis1=1, axis2=2)
@@ -110,13 +120,18 @@ class Closed(ClosedForm):
         if self.chain is not None:
             if len(self.chain.start) * self.process.n**2 > theory.LARGEST_OPERATOR:
                 return float("nan")
-            return float(np.trace(self.chain.limit(self.process)))
+            return float(np.trace(self.chain.limit(self.process, self.quantisation)))
         if self.bound:
             # After the first critical slot it knows less and less, in the end no more than a receiver that hears nothing.
             return theory.limit_trace(self.process, theory.NOBODY)
         if self.acknowledged[1] > 0.0:
             return float("inf")
         return theory.limit_trace(self.process, Outcomes.plain(self.received))
+
+    @cached_property
+    def infinite_variance(self) -> bool:
+        """Whether the variance over trials has no bound: not if only the steps of a quantiser grow."""
+        return math.isinf(self.limit if self.quantisation is None else replace(self, quantisation=None).limit)
 
 
 @final
@@ -162,7 +177,7 @@ def acknowledged_form(scenario: Scenario, receiver: str) -> Closed | None:
         return None
     needed = {LEGITIMATE, receiver} | ({table.jammer} if table.jammer is not None else set())
     threshold = scenario.encoding.parameters.get("threshold", 1)
-    long = type(threshold) is int and threshold > theory.LARGEST_OPERATOR  # the chain has one state for each slot of it
+    long = is_number(threshold) and threshold > theory.LARGEST_OPERATOR  # the chain has one state for each slot of it
     if long or not all(_independent(scenario, name) for name in needed):
         return None
     process, quality = scenario.process.process, scenario.quality
@@ -176,9 +191,11 @@ def acknowledged_form(scenario: Scenario, receiver: str) -> Closed | None:
     if kind == "scheduled":
         chain = scheduled(threshold, quality[receiver], split)
         return Closed(process, scenario.slots, quality[receiver], split, chain)
-    if kind == "selective":
-        chain = encrypted_schedule(threshold, quality[receiver], split)
-        return Closed(process, scenario.slots, quality[receiver], split, chain)
+    if kind in ("selective", "always sent"):
+        heard = quality[receiver]
+        chain = encrypted_schedule(threshold, heard, split) if kind == "selective" else always_sent(heard)
+        quantisation = scheme_of(process, scenario.encoding.spec).quantisation
+        return Closed(process, scenario.slots, heard, split, chain, quantisation=quantisation)
     return None
 
 

@@ -41,11 +41,12 @@ RUNS: dict[str, dict[str, Any]] = {
         "event": [PAUSE],
     },
     "open-loop": {"A": MIXED, "attack": {"attack": "forge"}, "event": [JAM, PAUSE]},
+    "quantised-schedule": {"A": STABLE, "threshold": 1.5, "bits": 4, "deviations": 6.0, "event": [PAUSE]},
     "scheduled": {"A": STABLE, "threshold": 3, "attack": {"attack": "all"}, "event": [JAM]},
     "twin-track": {"A": UNSTABLE, "reads_as": "tracker"},
     "withholding": {"A": STABLE, "state_probability": 0.5},
 }
-NEEDS = ("acknowledged", "encrypted-schedule", "open-loop", "scheduled")
+NEEDS = ("acknowledged", "encrypted-schedule", "open-loop", "quantised-schedule", "scheduled")
 SILENT = ("scheduled", "withholding")
 
 
@@ -211,6 +212,8 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
         ("encrypted-schedule", "sel", "critical"),
         ("encrypted-schedule", "legitimate", "none"),
         ("withholding", "naive", "none"),
+        ("quantised-schedule", "sel", "critical"),
+        ("quantised-schedule", "legitimate", "forge"),
     ],
 )
 def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, attack: str) -> None:

@@ -39,6 +39,7 @@ LEGITIMATE = {
     "twin-track": STATES,
     "acknowledged": STATES,
     "open-loop": STATES,
+    "quantised-schedule": None,
     "random-code": None,
     "scheduled": None,
     "threshold-code": None,

@@ -39,6 +39,7 @@ def test_the_built_in_classes_say_what_theory_knows() -> None:
         "encrypted-schedule",
         "noise",
         "open-loop",
+        "quantised-schedule",
         "scheduled",
     }
     assert {name for name in SCHEMES if SCHEMES[name].error_floor is not Scheme.error_floor} == {"cipher", "twin-track"}
@@ -82,6 +83,7 @@ def test_the_bits_of_packets_and_secrets_are_counted() -> None:
         "noise": (128, 64, 0),
         "open-loop": (256, 0, 0),
         "plain": (128, 0, 0),
+        "quantised-schedule": (17, 128, 0),  # levels of 8 bits, and one bit that says whether they are encrypted
         "random-code": (256, 0, 0),
         "scheduled": (128, 0, 0),
         "threshold-code": (256, 0, 0),

@@ -75,15 +75,20 @@ def test_a_step_is_pure(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_without_losses_the_user_follows_exactly(name: str) -> None:
-    """Behind a perfect link with honest acknowledgements every packet sent is read, up to rounding, unless it is noise."""
+    """Behind a perfect link every packet sent is read, up to rounding or half a quantiser's step, unless it is noise."""
     scheme = made(name, UNSTABLE)
     played = play(scheme, Batch(30, 50), {"legitimate": np.ones((30, 50), bool)})
+    error = scheme.quantisation
+    steps = (
+        np.zeros((30, 2)) if error is None else np.sqrt(12.0 * np.einsum("kii->ki", error.covariances(UNSTABLE, 30)))
+    )
     for k, belief in enumerate(played.beliefs["legitimate"]):
         received = played.received["legitimate"][k]
         if scheme.noise_law is not None:
             received = received & ~played.packets[k].nu
         scale = float(np.abs(played.x[k]).max()) + 30.0
-        assert np.allclose(belief.x_hat[:, received], played.x[k][:, received], rtol=0, atol=1e-12 * scale)
+        apart = np.abs(belief.x_hat - played.x[k])[:, received]
+        assert (apart <= 0.5 * steps[k][:, None] + 1e-12 * scale).all()
 
 
 @pytest.mark.parametrize("name", SCHEMES)
@@ -109,7 +114,7 @@ def test_declarations_are_what_the_packets_show(name: str) -> None:
     rows = 0 if packet.header is None else len(packet.header)
     assert rows == len(scheme.header)
     assert packet.header is None or packet.header.dtype == np.int64
-    assert scheme.packet_bits == 64 * (2 + rows)
+    assert scheme.packet_bits == (64 * (2 + rows) if scheme.quantisation is None else 2 * 8 + 1)
     assert (scheme.secret_bits == 0) == (not scheme.estimator_streams)
     assert np.isfinite(packet.z).all()
     assert scheme.mistakes(scheme.parameters) == []

@@ -16,6 +16,7 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
+from evedrop.model.theory.closed_forms import encrypted_fraction
 from evedrop.results.comparison import Comparison
 from evedrop.score.verdict import SecrecyKept
 from evedrop.studies.matchups import ATTACKERS
@@ -190,12 +191,13 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         "acknowledged": (128, 64),
         **dict.fromkeys(("open-loop", "random-code", "threshold-code"), (128, 128)),
         "encrypted-schedule": (128, 64),
+        "quantised-schedule": (16, 1),
     }
     secret = {name: (one.secret_bits_per_slot, one.initial_secret_bits) for name, one in needs.items()}
     assert secret == {
         **dict.fromkeys(SCHEMES, (0, 0)),
         "cipher": (128, 0),
-        "encrypted-schedule": (128, 0),
+        **dict.fromkeys(("encrypted-schedule", "quantised-schedule"), (128, 0)),
         "innovation": (192, 0),
         "noise": (64, 0),
         "twin-track": (64, 256),
@@ -204,6 +206,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         "acknowledged",
         "encrypted-schedule",
         "open-loop",
+        "quantised-schedule",
         "random-code",
         "scheduled",
         "threshold-code",
@@ -220,13 +223,18 @@ def test_bits_and_energy_are_those_of_the_packets(everything: Everything) -> Non
         assert one.bits_per_slot == pytest.approx(one.packet_bits * one.sent_fraction)
         assert (one.standard_errors["bits_per_slot"] == 0.0) is (one.sent_fraction == 1.0)
     encrypted = {name: one.encrypted_fraction for name, one in needs.items()}
-    assert {name for name, fraction in encrypted.items() if fraction} == {"cipher", "encrypted-schedule"}
+    assert {name for name, fraction in encrypted.items() if fraction} == {
+        *("cipher", "encrypted-schedule", "quantised-schedule"),
+    }
     assert encrypted["cipher"] == 1.0
     mu = load("bayesian").quality["legitimate"]
-    # θ = 2 encrypts slot 0, and then with probability 1 − μ; θ = 4 sends in 1/μ of every 3 + 1/μ slots.
-    slots, scheme = MARGINAL["slots"], needs["encrypted-schedule"]
-    expected = (1.0 + (slots - 1) * (1.0 - mu)) / slots
-    assert abs(scheme.encrypted_fraction - expected) < 5.0 * (scheme.standard_errors["encrypted_fraction"] or 0.0)
+    # Slot 0 is encrypted; from then on, with θ ≤ 2, the chain is stationary. θ = 4 sends in 1/μ of every 3 + 1/μ slots.
+    slots = MARGINAL["slots"]
+    for name, threshold in (("encrypted-schedule", 2.0), ("quantised-schedule", 1.5)):
+        expected = (1.0 + (slots - 1) * encrypted_fraction(threshold, mu)) / slots
+        error = needs[name].standard_errors["encrypted_fraction"]
+        assert error is not None
+        assert abs(needs[name].encrypted_fraction - expected) < 5.0 * error
     assert needs["scheduled"].sent_fraction == pytest.approx((1.0 / mu) / (3.0 + 1.0 / mu), rel=0.03)
 
 

@@ -1,4 +1,4 @@
-"""`evedrop design`: the choice of μ_d, for all slots or for each, and of when to send."""
+"""`evedrop design`: the choice of μ_d, for all slots or for each, of when to send, and of when to encrypt."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from evedrop.errors import UsageError
 
 
 def design(options: argparse.Namespace) -> int:
-    """Print the admissible μ_d, and the cost and secrecy of each choice; or when to send, or a μ_d for each slot."""
+    """Print the admissible μ_d, the cost and secrecy of each choice; or when to send or to encrypt, or a μ_d for each slot."""
     from evedrop import api
+    from evedrop.cli.budget_report import print_budget
     from evedrop.cli.policy_report import print_policies
     from evedrop.cli.report import print_design
     from evedrop.cli.schedule_report import print_schedules
 
-    kind = "--policy" if options.policy else "--schedule" if options.schedule is not None else None
+    chosen = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}
+    kind = next((name for name, value in chosen.items() if value is not None and value is not False), None)
     given, changed = _given(options, kind), changes_of(options)
     if kind == "--policy":
         policies = api.design_policy(options.scenario, changes=changed, **given)
@@ -27,6 +29,9 @@ def design(options: argparse.Namespace) -> int:
     if kind == "--schedule":
         schedules = api.design_schedule(options.scenario, options.schedule, changes=changed, **given)
         return _show(options, schedules, lambda: print_schedules(schedules))
+    if kind == "--budget":
+        budget = api.design_budget(options.scenario, options.budget, changes=changed)
+        return _show(options, budget, lambda: print_budget(budget))
     found = api.design(options.scenario, changes=changed, **given)
     return _show(options, found, lambda: print_design(found))
 
@@ -35,6 +40,7 @@ _OPTIONS: Mapping[str | None, Mapping[str, str]] = {
     None: {"max_trace": "max_trace"},
     "--policy": {"weight": "weights", "price": "prices", "states": "states"},
     "--schedule": {"max_trace": "max_trace", "weight": "weight", "block": "block"},
+    "--budget": {},
 }
 """The design asked for → the options that it takes, with their names in Python."""
 
@@ -82,6 +88,12 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="when to send, for a scheme that goes by acknowledgements: the Pareto front",
     )
+    kind.add_argument(
+        "--budget",
+        type=float,
+        metavar="E",
+        help="the threshold from which on to encrypt, for a mean energy of at most E in a slot",
+    )
     parser.add_argument(
         "--weight", type=float, nargs="+", metavar="β", help="weights of the user's error, 0 to 1 (default 0, 0.05 … 1)"
     )
@@ -94,7 +106,7 @@ COMMANDS = (
     Command(
         "design",
         design,
-        "admissible μ_d, secrecy, optimum, per eavesdropper; per slot; when to send",
+        "admissible μ_d, secrecy, optimum, per eavesdropper; per slot; when to send or encrypt",
         (scenario, changes, _designs, as_json),
     ),
 )

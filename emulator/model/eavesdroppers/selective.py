@@ -12,13 +12,14 @@ from evedrop.model.receiver import Action, Belief, Reception
 class Selective(PacketReader):
     """b_k = 1 where the header is 0, or missing; it needs no knowledge.
 
-    Intended only for the scheme `encrypted-schedule`, against which it is optimal.
+    Intended only for the schemes `encrypted-schedule`, against which it is optimal, and `quantised-schedule`, whose quantiser
+    it takes for exact.
 
-    Source: docs/mathematics.md, schedules by holding time.
+    Source: docs/mathematics.md, schedules by holding time and quantised packets.
     """
 
     only_against = (
-        "encrypted-schedule",
+        ("encrypted-schedule", "quantised-schedule"),
         "reads a header that says which packets are encrypted, and there is none: it is the same as naive here",
     )
 

@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.numeric.state_variances import StateVariances
 from evedrop.model.process import Floats, Process
 from evedrop.streams import Ahead, Batch, BlockReader
 
@@ -29,11 +30,9 @@ class Mask:
     """
 
     def __init__(self, process: Process, key: bytes, batch: Batch) -> None:
-        self._process = process
         reader = BlockReader(key, batch, process.n)
         self._pads = Ahead(reader.ahead, lambda slots: (reader.uniforms(slots) * 2.0**_RANGE_BITS).astype(np.int64))
-        self._k = 0
-        self._sigma: Floats = process.initial_covariance[:, :, None]
+        self._variances = StateVariances(process)
         self._exponents: dict[int, NDArray[np.int32]] = {}
 
     def hide(self, k: int, x: Floats) -> Floats:
@@ -65,11 +64,5 @@ class Mask:
     def _exponent(self, k: int) -> NDArray[np.int32]:
         """The exponents of H in slot k, (n,); those of the last two slots are cached."""
         if k not in self._exponents:
-            if k < self._k:
-                self._k, self._sigma = 0, self._process.initial_covariance[:, :, None]
-            while self._k < k:
-                self._sigma = self._process.diffuse(self._process.carry(self._sigma))
-                self._k += 1
-            variances = np.array([self._sigma[i, i, 0] for i in range(self._process.n)])
-            self._exponents = {k: np.frexp(DEVIATIONS * np.sqrt(variances))[1]}
+            self._exponents = {k: np.frexp(DEVIATIONS * np.sqrt(self._variances.at(k)))[1]}
         return self._exponents[k]

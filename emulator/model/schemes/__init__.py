@@ -14,6 +14,7 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.schemes.plain import Plain
+from evedrop.model.schemes.quantised_schedule import QuantisedSchedule
 from evedrop.model.schemes.random_code import RandomCode
 from evedrop.model.schemes.scheduled import Scheduled
 from evedrop.model.schemes.scheme import Scheme
@@ -29,6 +30,7 @@ _BUILT_IN: Mapping[str, type[Scheme]] = {
     "noise": Noise,
     "open-loop": OpenLoop,
     "plain": Plain,
+    "quantised-schedule": QuantisedSchedule,
     "random-code": RandomCode,
     "scheduled": Scheduled,
     "threshold-code": ThresholdCode,

@@ -17,6 +17,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Batch
 
 _WORD_BITS = 64
@@ -255,6 +256,11 @@ class Scheme(ABC):
     def packet_bits(self) -> int:
         """Size of a packet's payload and header."""
         return self.payload_bits + self.header_bits
+
+    @property
+    def quantisation(self) -> QuantisationError | None:
+        """The error of a state that is read from a packet; None if there is none."""
+        return None
 
     def encrypted(self, packets: PacketBlock) -> Flags:
         """Whether the sensor has encrypted each packet, (c, R); by default none. Encryption costs it energy."""

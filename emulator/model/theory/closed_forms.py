@@ -5,6 +5,7 @@ Source: docs/mathematics.md, twin track, acknowledged references, schedules by h
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.covariances import radius
+from evedrop.model.theory.quantisation import QuantisationError
 
 
 def twin_track_bound(process: Process, slots: int) -> Floats:
@@ -89,16 +91,22 @@ class SensorChain:
     carried: Floats
     """P ← A P Aᵀ + Q, (S, S); together with `reset`, rows sum to 1."""
 
-    def covariances(self, process: Process, slots: int) -> Floats:
-        """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows."""
+    def covariances(self, process: Process, slots: int, quantisation: QuantisationError | None = None) -> Floats:
+        """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows.
+
+        quantisation: the error that a reset leaves, if it is not 0.
+        """
         found = np.empty((slots, process.n, process.n))
         law = self.start
         E = np.zeros((len(law), process.n, process.n))
+        left = None if quantisation is None else quantisation.covariances(process, slots)
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(slots):
                 source = process.Q if k else process.initial_covariance
                 grown = process.A @ E @ process.A.T + law[:, None, None] * source
                 E = np.tensordot(self.carried.T, grown, axes=1)
+                if left is not None:
+                    E = E + (law @ self.reset)[:, None, None] * left[k]
                 law = law @ (self.reset + self.carried)
                 found[k] = E.sum(axis=0)
                 if not np.isfinite(found[k]).all():
@@ -106,15 +114,22 @@ class SensorChain:
                     break
         return found
 
-    def limit(self, process: Process) -> Floats:
-        """Limit of E P_k, (n, n), or its mean over a period if slots repeat; all inf if it is unbounded."""
+    def limit(self, process: Process, quantisation: QuantisationError | None = None) -> Floats:
+        """Limit of E P_k, (n, n), or its mean over a period if slots repeat; all inf if it is unbounded.
+
+        quantisation: the error that a reset leaves, if it is not 0.
+        """
         states, n = len(self.start), process.n
         # The spectral radius of a Kronecker product is the product of its factors'.
         if np.max(np.abs(np.linalg.eigvals(self.carried))) * radius(process) ** 2 >= 1.0 - 1e-12:
             return np.full((n, n), np.inf)
+        left = np.zeros((n, n)) if quantisation is None else quantisation.limit(process)
+        if not np.isfinite(left).all():
+            return np.full((n, n), np.inf)
         operator = np.kron(self.carried.T, np.kron(process.A, process.A))
-        noise = self.carried.T @ self.law
-        solution = np.linalg.solve(np.eye(len(operator)) - operator, np.kron(noise, process.Q.reshape(-1)))
+        law = self.law
+        noise = np.kron(self.carried.T @ law, process.Q.reshape(-1)) + np.kron(self.reset.T @ law, left.reshape(-1))
+        solution = np.linalg.solve(np.eye(len(operator)) - operator, noise)
         total: Floats = solution.reshape(states, n, n).sum(axis=0)
         return total
 
@@ -142,19 +157,51 @@ def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]
     return SensorChain(start, reset, carried)
 
 
-def encrypted_schedule(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:
-    """The chain for the selective eavesdropper of `encrypted-schedule`; states and arguments as for `scheduled`.
+def encrypted_schedule(threshold: float, received: float, acknowledged: tuple[float, float]) -> SensorChain:
+    """The chain for the selective eavesdropper of `encrypted-schedule`; arguments as for `scheduled`, states up to ⌈θ⌉.
 
-    The last state's entry of `law` is the fraction of packets that are encrypted.
+    The threshold θ need not be whole: at a holding time of ⌊θ⌋ a packet is then in clear with probability θ − ⌊θ⌋.
 
-    Source: docs/mathematics.md, schedules by holding time.
+    Source: docs/mathematics.md, schedules by holding time and quantised packets.
     """
-    start, reset, carried = _blank(threshold)
-    top = threshold - 1
-    for s in range(top):
-        _hear(reset, carried, s, s + 1, received, acknowledged)
-    _hear(reset, carried, top, top, 0.0, (0.0, sum(acknowledged)))
+    start, reset, carried = _blank(math.ceil(threshold))
+    arrives = sum(acknowledged)
+    for s in range(math.ceil(threshold)):
+        clear = min(max(threshold - (s + 1), 0.0), 1.0)
+        heard = clear * acknowledged[0]
+        after = min(s + 1, len(start) - 1)
+        _hear(reset, carried, s, after, clear * received, (heard, arrives - heard))
     return SensorChain(start, reset, carried)
+
+
+def encrypted_fraction(threshold: float, arrives: float) -> float:
+    """The fraction of packets that are encrypted in the long run, by the probability that a packet is acknowledged.
+
+    (1−p)^{⌊θ⌋−1} (1 − (θ − ⌊θ⌋) p). Source: docs/mathematics.md, quantised packets.
+    """
+    whole = math.floor(threshold)
+    return (1.0 - arrives) ** (whole - 1) * (1.0 - (threshold - whole) * arrives)
+
+
+def threshold_for(fraction: float, arrives: float) -> float:
+    """The threshold θ with which this fraction of packets is encrypted in the long run, 0 < fraction ≤ 1; inf if none has it.
+
+    Source: docs/mathematics.md, quantised packets.
+    """
+    if fraction >= 1.0:
+        return 1.0
+    if arrives <= 0.0:
+        return math.inf
+    if arrives >= 1.0:
+        return 2.0 - fraction
+    whole = math.floor(math.log(fraction) / math.log1p(-arrives)) + 1
+    left: float = fraction / (1.0 - arrives) ** (whole - 1)
+    return whole + min(max((1.0 - left) / arrives, 0.0), 1.0)
+
+
+def always_sent(received: float) -> SensorChain:
+    """The chain for a receiver that reads every packet it hears, one in each slot."""
+    return SensorChain(np.ones(1), np.array([[received]]), np.array([[1.0 - received]]))
 
 
 def _blank(threshold: int) -> tuple[Floats, Floats, Floats]:

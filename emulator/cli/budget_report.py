@@ -1,0 +1,46 @@
+"""The terminal output of `evedrop design --budget`: thresholds with their energy and errors."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from evedrop.cli.report import terminal
+
+if TYPE_CHECKING:
+    from evedrop.expected.energy_budget import BudgetDesign
+
+
+def print_budget(design: BudgetDesign) -> None:
+    """Print the thresholds as a table, the one for the budget among them."""
+    console = terminal()
+    console.print(
+        f"a packet in clear costs {design.in_clear:g}, an encrypted one {design.encrypted:g}; errors are traces in the limit; "
+        f"the user's is {_number(design.user)}"
+    )
+    shown = Table(box=SIMPLE_HEAD)
+    names = list(design.best.eavesdroppers)
+    for head in ("threshold θ", "encrypted", "energy", *(f"error of {name}" for name in names)):
+        shown.add_column(head, justify="right", no_wrap=True)
+    shown.add_column("")
+    for one in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
+        figures = one[1]
+        shown.add_row(
+            f"{figures.threshold:.6g}",
+            f"{figures.encrypted_fraction:.4f}",
+            f"{figures.energy:.6g}",
+            *(_number(figures.eavesdroppers[name]) for name in names),
+            "the budget's" if figures is design.best else "",
+        )
+    console.print(shown)
+    if design.left_out:
+        who = ", ".join(f"{name} ({strategy})" for name, strategy in design.left_out.items())
+        console.print(f"left out: {who}: no closed form of its error is known under this scheme")
+    console.print(f"threshold = {design.best.threshold!r}")
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "∞"

@@ -1,0 +1,101 @@
+"""`evedrop design --budget`: the threshold from which on to encrypt."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from evedrop.api import design_budget, montecarlo
+from evedrop.errors import UsageError
+from evedrop.loading import load
+from evedrop.memory.simulation import Simulation
+from tests.conftest import Evedrop
+
+PAGE = Path(__file__).parents[2] / "docs" / "schemes" / "quantised-schedule.md"
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    """The scenario of the scheme's page."""
+    found = re.search(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert found is not None
+    path = tmp_path / "quantised.toml"
+    path.write_text(found[1])
+    return path
+
+
+def test_the_budget_is_met_exactly(scenario: Path) -> None:
+    """The energy of the threshold found is the budget, and so is that of a run, within five standard errors."""
+    changes = {"energy": {"packet": 3.0, "bit": 0.5, "encryption": 4.0}}
+    design = design_budget(scenario, 10.0, changes=changes)
+    assert design.in_clear == 3.0 + 0.5 * 11
+    assert design.encrypted == design.in_clear + 4.0
+    assert design.best.energy == pytest.approx(10.0)
+    assert 1.0 < design.best.threshold < 2.0
+    made = load(scenario, {**changes, "encoding.threshold": design.best.threshold, "slots": 200})
+    simulation = Simulation(made, range(200))
+    for _ in simulation.chunks():
+        pass
+    shares = simulation.packets.encrypted / 200
+    expected = (199 * design.best.encrypted_fraction + 1.0) / 200  # slot 0 is encrypted
+    assert abs(shares.mean() - expected) < 5.0 * shares.std() / 200**0.5
+
+
+def test_errors_are_those_of_runs(scenario: Path, tmp_path: Path) -> None:
+    """The limits of user and eavesdropper are those of the threshold's own scenario."""
+    design = design_budget(scenario, 1.4)
+    made = load(scenario, {"encoding.threshold": design.best.threshold})
+    peers = montecarlo(made, trials=300, out=tmp_path / "run").summary["peers"]
+    for name, limit in (("legitimate", design.user), ("listener", design.best.eavesdroppers["listener"])):
+        error = peers[name]["standard_errors"]["mean_squared_error"]
+        assert abs(peers[name]["mean_squared_error"] - limit) < 5.0 * error + 0.01 * limit  # the first slots differ
+    energies = [one.energy for one in design.others]
+    assert energies == sorted(energies, reverse=True)
+
+
+@pytest.mark.parametrize(("budget", "threshold"), [(2.0, 1.0), (7.5, 1.0), (1.28, 2.0), (1.0784, 3.0)])
+def test_the_table_has_the_threshold(evedrop: Evedrop, scenario: Path, budget: float, threshold: float) -> None:
+    """As its own row, marked, and as the line to paste; the JSON is the same."""
+    done = evedrop("design", str(scenario), "--budget", str(budget))
+    assert done.status == 0
+    (marked,) = [line for line in done.out.splitlines() if "the budget's" in line]
+    assert float(marked.split()[0]) == pytest.approx(threshold, abs=1e-6)
+    assert done.out.splitlines()[-1].startswith("threshold = ")
+    found = json.loads(evedrop("design", str(scenario), "--budget", str(budget), "--json").out)
+    assert found["best"]["threshold"] == pytest.approx(threshold)
+    assert set(found) == {"budget", "in_clear", "encrypted", "user", "best", "others"}
+
+
+def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> None:
+    """A process that does not forget needs more and more bits; an eavesdropper without a closed form is left out."""
+    spy = 'eavesdroppers.spy={strategy = "naive", link = {quality = 0.5}}'
+    words = ("design", str(scenario), "--budget", "1.5", "--set", "process.A=[[1.0, 0.3], [0.0, 0.8]]", "--set", spy)
+    done = evedrop(*words)
+    assert "the user's is ∞" in done.out
+    assert "left out: spy (naive)" in done.out
+    found = json.loads(evedrop(*words, "--json").out)
+    assert found["user"] is None
+    assert found["best"]["eavesdroppers"] == {"listener": None}
+    assert found["left_out"] == {"spy": "naive"}
+
+
+@pytest.mark.parametrize(
+    ("budget", "changes", "why"),
+    [
+        (1.0, {}, r"no threshold up to \d+ keeps the budget 1: packets in clear cost 1 .* such as --budget 1.5"),
+        (0.2, {}, "no threshold"),
+        (1.5, {"acknowledgements.link.quality": 0.0}, "no acknowledgement arrives, so nothing less than 2 is enough"),
+        (float("nan"), {}, "expected a finite number"),
+        (1.5, {"legitimate.link.delay": {"model": "constant", "value": 1.0}}, "independent losses"),
+        (1.5, {"encoding": {"scheme": "encrypted-schedule", "threshold": 2}}, "of the scheme quantised-schedule"),
+    ],
+)
+def test_budgets_that_cannot_be_kept_are_refused(
+    scenario: Path, budget: float, changes: dict[str, object], why: str
+) -> None:
+    """With the reason, and what to do."""
+    with pytest.raises(UsageError, match=why):
+        design_budget(scenario, budget, changes=changes)
