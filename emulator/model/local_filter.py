@@ -8,11 +8,12 @@ Source: docs/mathematics.md, a filter at the sensor.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.kernels.elementary import inverse, semidefinite_factor
+from evedrop.kernels.elementary import cholesky, inverse, semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
 from evedrop.streams import Ahead, Batch, BlockReader
@@ -38,6 +39,8 @@ class FilterStep(NamedTuple):
     """Covariance of x − x̂ˢ, (n, n)."""
     innovation: Floats
     """K S Kᵀ, (n, n): the covariance of the measurement's contribution to x̂ˢ."""
+    expected: Floats
+    """S, (p, p): the covariance of the innovation y − C x̂ˢ⁻ itself."""
 
 
 @final
@@ -65,7 +68,7 @@ class Steps:
         after = 0.5 * (after + after.T)
         predicted = product(product(self._A, after), _transposed(self._A)) + self._W
         innovation = product(product(K, S), _transposed(K))
-        step = FilterStep(K, after, 0.5 * (innovation + innovation.T))
+        step = FilterStep(K, after, 0.5 * (innovation + innovation.T), 0.5 * (S + S.T))
         self.settled = bool(np.abs(predicted - P).max() <= _SETTLED * np.abs(predicted).max())
         self._predicted, self._last = predicted, step
         return step
@@ -96,16 +99,27 @@ def settled(process: Process, plant: Plant) -> FilterStep:
 class LocalFilter:
     """The estimates of a batch, slot by slot.
 
-    key: the key of the stream `measurement`.
+    key: the key of the stream `measurement`; spoofing: changes the measurements of a slot, (p, R), before the filter gets them.
     """
 
-    def __init__(self, process: Process, plant: Plant, key: bytes, batch: Batch) -> None:
+    def __init__(
+        self,
+        process: Process,
+        plant: Plant,
+        key: bytes,
+        batch: Batch,
+        spoofing: Callable[[int, Floats], Floats] | None = None,
+    ) -> None:
         self._process = process
         self._steps = Steps(process, plant)
         self._C, V = _measured(plant)
         factor = semidefinite_factor(V)
         reader = BlockReader(key, batch, len(self._C))
         self._noise = Ahead(reader.ahead, lambda slots: product(factor, reader.normals(slots)))
+        self._spoofing = spoofing
+        self._step: FilterStep
+        self._whitening: tuple[FilterStep, Floats] | None = None
+        self._innovation: Floats
         self.x: Floats = np.zeros((process.n, batch.trials))
         """x̂ˢ of the last slot, (n, R)."""
         self.predicted: Floats = self.x
@@ -116,8 +130,18 @@ class LocalFilter:
         self.predicted = self._process.predict(self.x) if k else self.x
         before = self.predicted + pushed
         y = product(self._C, x) + self._noise.at(k)
-        self.x = before + product(self._steps.next().gain, y - product(self._C, before))
+        if self._spoofing is not None:
+            y = self._spoofing(k, y)
+        self._step, self._innovation = self._steps.next(), y - product(self._C, before)
+        self.x = before + product(self._step.gain, self._innovation)
         return self.x
+
+    @property
+    def normalised(self) -> Floats:
+        """The innovation of the last slot divided by the lower triangular factor of its covariance S, (p, R)."""
+        if self._whitening is None or self._whitening[0] is not self._step:
+            self._whitening = self._step, inverse(cholesky(self._step.expected))
+        return product(self._whitening[1], self._innovation)
 
 
 def _measured(plant: Plant) -> tuple[Floats, Floats]:

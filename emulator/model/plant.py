@@ -54,6 +54,10 @@ class Plant:
         """Whether any input of u (…, m, R) is beyond its limits, (…, R)."""
         return np.asarray(((u < self._lower) | (u > self._upper)).any(axis=-2))
 
+    def entering(self, u: Floats, e: Floats) -> Floats:
+        """What a watermark e adds to the inputs u, (m, R): e itself, except where the limits clip it."""
+        return self.limited(u + e) - self.limited(u)
+
     def moved(self, u: Floats) -> Floats:
         """B u, (n, R), with the inputs u (m, R) clipped to their limits."""
         return product(self.input_matrix, self.limited(u))
@@ -82,14 +86,27 @@ class Drive:
         self._drift = drift
         self._start = plant.start[:, None]
         self._u: Floats | None = None
+        self._moved: Floats
+        self._e: Floats | None = None
 
     def hold(self, u: Floats) -> None:
         """Apply the inputs u (m, R) from now on, until others come."""
-        self._u = self._plant.moved(u)
+        self._u, self._moved = u, self._plant.moved(u)
+
+    def mark(self, e: Floats) -> None:
+        """Add the watermark e, (m, R), to the inputs from now on, until there is another one."""
+        self._e = e
+
+    @property
+    def entered(self) -> Floats | None:
+        """What the watermark adds to the inputs, (m, R); None without a watermark, or before the first inputs."""
+        return None if self._u is None or self._e is None else self._plant.entering(self._u, self._e)
 
     def pushed(self, k: int) -> Floats:
-        """What is added to A x and w in slot k, (n, R) or (n, 1): B u_{k−1} + B_d d_{k−1}; for k = 0 the start."""
+        """What is added to A x and w in slot k, (n, R) or (n, 1): B (u + e)_{k−1} + B_d d_{k−1}; for k = 0 the start."""
         if k == 0:
             return self._start
         drift: Floats = self._drift[k - 1, :, None]
-        return drift if self._u is None else self._u + drift
+        if self._u is None:
+            return drift
+        return (self._moved if self._e is None else self._plant.moved(self._u + self._e)) + drift

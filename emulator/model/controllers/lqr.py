@@ -25,6 +25,14 @@ def gain(assignment: Assignment) -> Floats:
 
     Raises ValueError if no input keeps the weighted states from growing.
     """
+    return riccati(assignment)[0]
+
+
+def riccati(assignment: Assignment) -> tuple[Floats, Floats]:
+    """K, as `gain`, and the solution Π of the Riccati equation, (n + m, n + m): [x; u′]ᵀ Π [x; u′] is the cost from there on.
+
+    Raises ValueError as `gain`.
+    """
     A, B = held(assignment)
     n, m = B.shape
     weight_u, weight_r = np.diag(assignment.input_weights), np.diag(assignment.rate_weights)
@@ -41,7 +49,7 @@ def gain(assignment: Assignment) -> Floats:
     carried = product(_transposed(G_u), P)
     K = product(inverse(both + product(carried, G_u)), product(carried, F))
     K[:, n:] -= share
-    return K
+    return K, P
 
 
 def held(assignment: Assignment, entry: Floats | None = None) -> tuple[Floats, Floats]:

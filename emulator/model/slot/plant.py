@@ -59,3 +59,13 @@ class PlantCore:
         """Apply the inputs u (m, R) from the next slot on, until others come."""
         if self._drive is not None:
             self._drive.hold(u)
+
+    def mark(self, e: Floats) -> None:
+        """Add the watermark e, (m, R), to the inputs from the next slot on, until there is another one."""
+        if self._drive is not None:
+            self._drive.mark(e)
+
+    @property
+    def entered(self) -> Floats | None:
+        """What the watermark added to the inputs that led into the last slot, (m, R); None if there was none."""
+        return None if self._drive is None else self._drive.entered

@@ -10,6 +10,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from evedrop.model.integrity.monitor import Monitor, MonitoredSlots
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
@@ -26,6 +27,8 @@ class Sent(NamedTuple):
     x: Floats
     """The states that packets are made from, (c, n, R): the true ones, or the estimates of the sensor's filter."""
     packets: PacketBlock
+    monitored: MonitoredSlots | None = None
+    """The detector beside the filter; None without one."""
 
     @classmethod
     def joined(cls, parts: Sequence[Sent]) -> Sent:
@@ -33,18 +36,22 @@ class Sent(NamedTuple):
         if len(parts) == 1:
             return parts[0]
         packets = PacketBlock.joined([part.packets for part in parts])
-        return cls(np.concatenate([part.true for part in parts]), np.concatenate([part.x for part in parts]), packets)
+        true, x = (np.concatenate(arrays) for arrays in zip(*((part.true, part.x) for part in parts), strict=True))
+        monitored = [part.monitored for part in parts if part.monitored is not None]
+        return cls(true, x, packets, MonitoredSlots.joined(monitored) if monitored else None)
 
     def rows(self, some: slice) -> Sent:
         """Some of the slots."""
-        return Sent(self.true[some], self.x[some], self.packets.rows(some))
+        monitored = None if self.monitored is None else self.monitored.rows(some)
+        return Sent(self.true[some], self.x[some], self.packets.rows(some), monitored)
 
 
 @final
 class SensorCore:
     """Makes the packets of many slots at once; or of one slot at a time, if the next packet depends on what comes back.
 
-    watch: over the acknowledgements, None if it does not watch them.
+    watch: over the acknowledgements, None if it does not watch them. monitor: of the filter's innovations; it needs inputs in
+    every slot, so slots are made one at a time.
     """
 
     def __init__(
@@ -53,9 +60,10 @@ class SensorCore:
         plant: PlantCore,
         local: LocalFilter | None = None,
         watch: CusumBatch | None = None,
+        monitor: Monitor | None = None,
     ) -> None:
         self._encoder, self._plant = encoder, plant
-        self._local, self._watch = local, watch
+        self._local, self._watch, self._monitor = local, watch, monitor
 
     @property
     def watches(self) -> bool:
@@ -71,7 +79,15 @@ class SensorCore:
         """The next slots, at least one."""
         states = self._plant.advance(slots)
         x, predicted = self._filtered(slots, states)
-        return Sent(states.x, x, self._encoder.encode_block(slots, x, predicted))
+        monitored = None if self._monitor is None else self._monitored(slots.start, self._monitor)
+        return Sent(states.x, x, self._encoder.encode_block(slots, x, predicted), monitored)
+
+    def _monitored(self, k: int, monitor: Monitor) -> MonitoredSlots:
+        """Test the filter's innovation of slot k, and mark the input of this slot."""
+        assert self._local is not None  # noqa: S101 - a monitor is there only with a filter
+        monitor.take(k, self._local.normalised, self._plant.entered)
+        self._plant.mark(monitor.watermark)
+        return MonitoredSlots(monitor.statistic[None], monitor.watermark[None])
 
     def _filtered(self, slots: range, states: States) -> tuple[Floats, Floats]:
         """The states to transmit, and the predictions that their innovations refer to."""
