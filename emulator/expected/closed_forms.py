@@ -27,9 +27,9 @@ from evedrop.model.theory.closed_forms import (
     always_sent,
     encrypted_schedule,
     reference_covariances,
+    reference_limit,
     scheduled,
 )
-from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.noise_taken import NoiseTaken
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.names import LEGITIMATE
@@ -124,9 +124,7 @@ class Closed(ClosedForm):
         if self.bound:
             # After the first critical slot it knows less and less, in the end no more than a receiver that hears nothing.
             return theory.limit_trace(self.process, theory.NOBODY)
-        if self.acknowledged[1] > 0.0:
-            return float("inf")
-        return theory.limit_trace(self.process, Outcomes.plain(self.received))
+        return reference_limit(self.process, self.received, self.acknowledged)
 
     @cached_property
     def infinite_variance(self) -> bool:

@@ -25,8 +25,11 @@ from evedrop.scenario.across import lacking_streams
 from evedrop.scenario.events.effects import Jamming
 from evedrop.scenario.words import listed, near
 
-ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge"}
+ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge", "flips": "flip"}
 """Adversary → its attack on acknowledgements."""
+
+_FLIP = 0.1
+"""The probability with which `flips` flips an acknowledgement, unless the scenario has one."""
 
 _WAY_BACK = {"link": {"quality": 1.0}}
 
@@ -189,9 +192,10 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
     tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
     way_back = tables.pop("acknowledgements", _WAY_BACK)
     if SCHEMES[scheme].needs_acknowledgements:
+        flip = way_back.get("flip", _FLIP)
         way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer", "flip")}
-        jammer = {"jammer": matches[0].receiver} if attack == "critical" else {}
-        tables["acknowledgements"] = {**way_back, "attack": attack, **jammer}
+        needs = {"critical": {"jammer": matches[0].receiver if matches else None}, "flip": {"flip": flip}}
+        tables["acknowledgements"] = {**way_back, "attack": attack, **needs.get(attack, {})}
     return checked(tables, scenario.title)
 
 

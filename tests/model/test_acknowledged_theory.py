@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 
+from evedrop.expected.expectations import expectations_of
+from evedrop.loading import checked
 from evedrop.model.process import Process
 from evedrop.model.reference_floor import reference_floor
 from evedrop.model.schemes.acknowledged import Acknowledged
@@ -82,3 +85,21 @@ def test_the_papers_example(initial: np.ndarray, honest: float) -> None:
     for acknowledged in ((0.0, 0.0), (0.81, 0.0)):
         blocked = np.trace(reference_covariances(process, 0.9, acknowledged, 41)[40])
         assert blocked == pytest.approx(user, rel=1e-12)
+
+
+def test_an_error_that_is_bounded_is_expected_to_be() -> None:
+    """With L = A and a stable process, what the eavesdropper and a user of forged acknowledgements lost is forgotten."""
+    tables: dict[str, Any] = {
+        "title": "Forged",
+        "slots": 400,
+        "process": {"A": STABLE.A.tolist(), "Q": STABLE.Q.tolist(), "initial_covariance": np.eye(2).tolist()},
+        "encoding": {"scheme": "open-loop"},
+        "acknowledgements": {"link": {"quality": 0.9}, "attack": "flip", "flip": 0.1},
+        "legitimate": {"link": {"quality": 0.8}},
+        "eavesdroppers": {"eve": {"strategy": "reference", "link": {"quality": 0.6}}},
+    }
+    for expected in expectations_of(checked(tables, "it")).values():
+        assert not expected.infinite_variance
+        assert expected.limit == pytest.approx(expected.traces(400)[-1], rel=1e-9)
+    tables |= {"slots": 100, "process": {**tables["process"], "A": MIXED.A.tolist()}}
+    assert {expected.limit for expected in expectations_of(checked(tables, "it")).values()} == {np.inf}

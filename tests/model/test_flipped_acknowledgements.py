@@ -20,7 +20,8 @@ from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.threshold_code import forged_share
-from evedrop.model.theory.closed_forms import reference_covariances
+from evedrop.model.theory.closed_forms import reference_covariances, reference_limit
+from evedrop.model.theory.covariances import Outcomes, expected_covariances
 from evedrop.streams import Batch
 from tests.builders import UNSTABLE, digests_of
 from tests.model.acknowledged_runs import MIXED, carried
@@ -165,6 +166,30 @@ def test_the_upper_bound_holds_in_simulation() -> None:
         bound = np.trace(reference_covariances(STABLE, quality, acknowledged, 100, alpha, code.at)[50:].mean(axis=0))
         assert found.mean() + 5.0 * found.std() / 20.0 < bound
         assert bound < 3.0 * found.mean()
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.5])
+def test_the_limit_of_the_upper_bound(alpha: float) -> None:
+    """With L = A: that of the recursion, unbounded from the factor 1 on, and that of `plain` if no acknowledgement is forged."""
+    for process in (STABLE, MIXED, UNSTABLE):
+        for quality, acknowledged in ((0.8, (0.72, 0.02)), (0.6, (0.444, 0.296))):
+            found = reference_limit(process, quality, acknowledged, alpha)
+            late = np.trace(reference_covariances(process, quality, acknowledged, 400, alpha)[[300, 399]], 0, 1, 2)
+            if np.isinf(found):
+                assert process is not STABLE
+                assert late[1] > 1.01 * late[0]
+            else:
+                assert late[1] == pytest.approx(found, rel=1e-9)
+    spared = expected_covariances(UNSTABLE, Outcomes.plain(0.8), 400)[-1]
+    assert reference_limit(UNSTABLE, 0.8, (0.8, 0.0), alpha) == pytest.approx(np.trace(spared))
+
+
+def test_a_limit_that_is_too_large_is_not_computed() -> None:
+    """An operator of more than 512 rows; what has no bound has none in any size."""
+    n = 17
+    for factor, limit in ((0.9, np.nan), (1.0, np.inf)):
+        process = Process(factor * np.eye(n), np.eye(n), np.eye(n))
+        assert reference_limit(process, 0.8, (0.72, 0.02)) == pytest.approx(limit, nan_ok=True)
 
 
 def test_without_states_in_clear_the_bound_is_the_expectation() -> None:

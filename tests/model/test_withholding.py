@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -43,3 +44,16 @@ def test_the_limit_is_the_papers() -> None:
     """(1 − μp) S(μp)."""
     found = limit(UNSTABLE, Withholding(UNSTABLE, 0.8).outcomes(0.9))
     assert np.allclose(found, (1.0 - 0.72) * lyapunov(UNSTABLE, 1.0 - 0.72), rtol=1e-12)
+
+
+@pytest.mark.parametrize("p", [0, 0.0, -0.0])
+def test_a_sensor_that_never_sends_is_refused(p: float) -> None:
+    """With the bound, and what to write instead; the least number above 0 is allowed."""
+    (found,) = Withholding.mistakes({"state_probability": p})
+    assert found[0] == "state_probability"
+    assert found[1].startswith(f"is {p}, so nothing is sent after slot 0")
+    assert found[1].endswith("expected a number above 0, up to 1")
+    assert Withholding.mistakes({"state_probability": 5e-324}) == []
+    for other in (-0.1, 1.1, "0", False):
+        (found,) = Withholding.mistakes({"state_probability": other})
+        assert found[1].endswith("expected a number from 0 to 1")

@@ -37,6 +37,20 @@ def test_the_scenario_says_what_it_says_and_the_rest_is_documented() -> None:
     assert (attacked.attack, attacked.jammer) == ("critical", "reference")
 
 
+def test_flips_have_the_probability_of_the_scenario() -> None:
+    """Its own if it flips acknowledgements, else one in ten; schemes without acknowledgements have nothing to flip."""
+    for name, changes, flip in (("flipped", {"acknowledgements.flip": 0.2}, 0.2), ("acknowledged", {}, 0.1)):
+        matchups = matchups_of(load(name, changes), ["threshold-code", "plain"], ["flips", "forges"])
+        groups = {group.name: group.scenario.acknowledgements for group in matchups.groups}
+        assert {file: table and (table.attack, table.flip) for file, table in groups.items()} == {
+            "threshold-code": ("none", None),
+            "threshold-code-forges": ("forge", None),
+            "threshold-code-flips": ("flip", flip),
+            "plain": None,
+        }
+        assert {match.adversary for match in matchups.undefined if match.scheme == "plain"} == {"flips", "forges"}
+
+
 @pytest.mark.parametrize("name", ["numerical", "vehicle", "fading", "colluding", "restart", "late", "driving-away"])
 def test_shipped_scenarios_can_be_compared(name: str) -> None:
     """Whatever their links, events and eavesdroppers are."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.checks import probability_mistakes
+from evedrop.model.checks import as_toml, is_number, probability_mistakes
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Receiver
 from evedrop.model.schedule import Schedule
@@ -47,7 +47,11 @@ class Withholding(Scheme):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """P is a probability."""
+        """A number that is not a probability, or 0."""
+        if is_number(given.get("state_probability"), 0.0, 0.0):
+            what = f"is {as_toml(given['state_probability'])}, so nothing is sent after slot 0, and the user knows no more than "
+            what += "an eavesdropper that hears nothing; expected a number above 0, up to 1"
+            return [("state_probability", what)]
         return probability_mistakes(given, "state_probability")
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.process import Floats, Process
-from evedrop.model.theory.covariances import radius
+from evedrop.model.theory.covariances import LARGEST_OPERATOR, MARGINAL, Outcomes, limit_trace, radius
 from evedrop.model.theory.quantisation import QuantisationError
 
 
@@ -72,6 +72,25 @@ def reference_covariances(
                 break
             found[k] = P
     return found
+
+
+def reference_limit(process: Process, received: float, acknowledged: tuple[float, float], plain: float = 0.0) -> float:
+    """Trace of the limit of `reference_covariances` with L = A; inf if it is unbounded, NaN if it is too large to compute.
+
+    Source: docs/mathematics.md, acknowledged references, flipped acknowledgements.
+    """
+    heard, unheard = acknowledged
+    if unheard == 0.0:
+        return limit_trace(process, Outcomes.plain(received))
+    carried = np.array([[1.0 - received, received * (1.0 - plain)], [unheard, 1.0 - unheard - plain * heard]])
+    if np.abs(np.linalg.eigvals(carried)).max() * radius(process) ** 2 >= 1.0 - MARGINAL:
+        return float("inf")
+    n = process.n
+    if 2 * n * n > LARGEST_OPERATOR:
+        return float("nan")
+    source = np.concatenate([(1.0 - received) * process.Q.reshape(-1), unheard * process.Q.reshape(-1)])
+    operator = np.kron(carried, np.kron(process.A, process.A))
+    return float(np.trace(np.linalg.solve(np.eye(2 * n * n) - operator, source)[: n * n].reshape(n, n)))
 
 
 @dataclass(frozen=True)
