@@ -10,8 +10,9 @@ Source: docs/mathematics.md, random numbers.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Generic, TypeVar, final
 
@@ -82,6 +83,42 @@ def normals(raw: Words) -> Floats:
     return kernels.normals(raw.reshape(1, -1, 1), 1).reshape(raw.shape)
 
 
+@final
+@dataclass(frozen=True)
+class Lineage:
+    """Whose random numbers each trial of a batch reads: its ancestors' up to the last split, and its own from then on.
+
+    A trial is a function of its random numbers, so one that reads those of another up to some slot is a copy of it up to
+    there, with whatever memory links, packets and receivers have.
+
+    Source: docs/mathematics.md, splitting.
+    """
+
+    stops: tuple[int, ...] = ()
+    """The first slot after each split, ascending."""
+    columns: tuple[NDArray[np.intp], ...] = ()
+    """For each of these stretches of slots, the place in the batch of the trial that is read, (R,)."""
+
+    def split(self, stop: int, ancestors: NDArray[np.intp]) -> Lineage:
+        """Replace each trial by a copy of one of the trials, (R,), in all slots before this one."""
+        return Lineage((*self.stops, stop), (*(one[ancestors] for one in self.columns), ancestors))
+
+    def read(self, slots: range, drawn: Words) -> Words:
+        """The words that the trials read, from those that each would draw by itself, both (c, R, m)."""
+        if not self.stops or slots.start >= self.stops[-1]:
+            return drawn
+        found = drawn.copy()
+        for row, k in enumerate(slots):
+            stretch = bisect_right(self.stops, k)
+            if stretch < len(self.stops):
+                np.take(drawn[row], self.columns[stretch], axis=0, out=found[row])
+        return found
+
+
+OWN = Lineage()
+"""The lineage of trials that are copies of none."""
+
+
 @dataclass(frozen=True)
 class Batch:
     """The slots and trials a process draws for: slots 0 … slots−1, trials first_trial … first_trial+trials−1."""
@@ -89,6 +126,7 @@ class Batch:
     slots: int
     trials: int
     first_trial: int = 0
+    lineage: Lineage = field(default=OWN, compare=False)
 
     @property
     def trial_range(self) -> range:
@@ -123,12 +161,15 @@ class BlockReader:
     def _converted(self, slots: range, convert: Callable[[Words, int], Floats]) -> Floats:
         """Convert a block at a time, so that intermediate arrays stay in the cache, and the allocator keeps its pages."""
         if len(slots) <= self._length:
-            return convert(self._stream.whole_blocks(slots), self._per_trial)
+            return convert(self._words(slots), self._per_trial)
         numbers = np.empty((len(slots), self._per_trial, self._batch.trials))
         for start in range(0, len(slots), self._length):
             some = slice(start, start + self._length)
-            numbers[some] = convert(self._stream.whole_blocks(slots[some]), self._per_trial)
+            numbers[some] = convert(self._words(slots[some]), self._per_trial)
         return numbers
+
+    def _words(self, slots: range) -> Words:
+        return self._batch.lineage.read(slots, self._stream.whole_blocks(slots))
 
 
 @final

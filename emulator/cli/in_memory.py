@@ -41,4 +41,4 @@ def plan_of(options: argparse.Namespace) -> Plan:
     from evedrop.memory.montecarlo import Plan
     from evedrop.memory.simulation import Mode
 
-    return Plan(Mode(options.mode), options.workers, options.scheduler)
+    return Plan(Mode(options.mode), options.workers, options.scheduler, rare=getattr(options, "rare", False))

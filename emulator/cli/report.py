@@ -29,7 +29,7 @@ from evedrop.figures.text import estimate, figure_text
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
-from evedrop.score.summary import RARE_SHARE, ControllerSummary, LinkSummary, Summary
+from evedrop.score.summary import RARE_SHARE, ControllerSummary, LinkSummary, PeerSummary, Summary
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -164,22 +164,55 @@ def closing_table(summary: Summary, width: int) -> Table:
     if wide:
         table.add_column("digest", no_wrap=True)
     for name, peer in summary.peers.items():
+        figures, errors, z, marked = _with_rare_estimate(peer)
         table.add_row(
             name,
             *(
                 estimate(
-                    shown_figure(peer.all_figures, names),
-                    shown_figure(peer.standard_errors, names)
-                    if wide or not compared.keys().isdisjoint(names)
-                    else None,
+                    shown_figure(figures, names),
+                    shown_figure(errors, names) if wide or not compared.keys().isdisjoint(names) else None,
                     column.format,
                 )
+                + (_MARK if marked and not set(_SPLIT).isdisjoint(names) else "")
                 for column, names in shown.items()
             ),
-            *([figure_text(shown_figure(peer.z, list(compared)), "+.1f")] if compared else []),
+            *([figure_text(shown_figure(z, list(compared)), "+.1f") + (_MARK if marked else "")] if compared else []),
             *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
+
+
+_Figures = Mapping[str, float | None]
+_MARK = "*"
+_SPLIT = ("mean_squared_error", "mean_actual_trace_covariance")
+"""The figures that splitting estimates; a run has one of them."""
+
+
+def _with_rare_estimate(peer: PeerSummary) -> tuple[_Figures, _Figures, _Figures, bool]:
+    """The figures of a receiver, their standard errors and z, and whether its mean error is that of splitting."""
+    rare = peer.rare_estimate
+    given = peer.all_figures, peer.standard_errors, peer.z
+    if rare is None or rare.mean_error is None:
+        return *given, False
+    values = (rare.mean_error, rare.standard_error, rare.z)
+    figures, errors, z = ({**old, **dict.fromkeys(_SPLIT, new)} for old, new in zip(given, values, strict=True))
+    return figures, errors, z, True
+
+
+def _split_lines(summary: Summary) -> Iterator[str]:
+    """A line for each receiver whose mean error was estimated by splitting, or should have been."""
+    for name, peer in summary.peers.items():
+        rare = peer.rare_estimate
+        if rare is None:
+            continue
+        if rare.mean_error is None:
+            yield f"{name}: splitting gives no estimate that can be trusted: {rare.doubt}"
+            continue
+        plain = estimate(shown_figure(peer.all_figures, _SPLIT), shown_figure(peer.standard_errors, _SPLIT))
+        yield (
+            f"{_MARK} {name}: by splitting, {rare.populations} populations of {rare.trials:,} trials, copied after "
+            f"{rare.splits} slots; the mean over the {summary.trials:,} trials is {plain}"
+        )
 
 
 def print_summary(summary: Summary, folder: str, replay: str | None = None) -> None:
@@ -188,6 +221,8 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
     if summary.ended != "complete":
         console.print(f"{summary.ended.splitlines()[0]}; the results so far:")
     console.print(closing_table(summary, console.width))
+    for line in _split_lines(summary):
+        console.print(line)
     for name, why in unloadable_figures().items():
         console.print(f"the figure {name} is left out{why}")
     for line in _link_lines(summary.links):
@@ -240,6 +275,7 @@ def _rare_lines(summary: Summary) -> Iterator[str]:
                 f"{name}: {100 * rare.share:.2g} % of its expected error is carried by events of which {summary.trials:,} trials "
                 f"contain fewer than one on average, so its mean and standard error are probably too small; {enough} would "
                 f"leave {100 * RARE_SHARE:.2g} %"
+                + ("; montecarlo --rare estimates it by splitting" if peer.rare_estimate is None else "")
             )
 
 

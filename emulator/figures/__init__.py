@@ -33,7 +33,7 @@ FIGURES: Registry[Figure] = Registry(
 )
 """Name in the summary → figure."""
 
-_TAKEN = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "digest")
+_TAKEN = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "rare_estimate", "digest")
 """The other entries of a receiver in the summary, which no figure can be named after."""
 
 

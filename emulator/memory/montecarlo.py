@@ -20,6 +20,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import expected_traces_of
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode
+from evedrop.memory.splitting import rare_estimates, work_of
 from evedrop.memory.trials import BatchResult, Task, tasks_of
 from evedrop.memory.workers import REACH_SECONDS, connected, in_processes, in_this_process, on_cluster
 from evedrop.model.digest import RunDigest, block_starts
@@ -55,6 +56,8 @@ class Plan:
     """Address of a Dask scheduler whose cluster then does the work."""
     patience: float = REACH_SECONDS
     """Seconds for the scheduler to answer."""
+    rare: bool = False
+    """Whether to estimate means that rare events carry by splitting, too."""
 
     def workers_for(self, scenario: Scenario) -> int:
         """The number of workers. Raises UsageError if it is not positive."""
@@ -99,6 +102,10 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
                 if merger.trials:
                     merger.write(writer)
                     summary = merger.summary(ending(how))
+                    if plan.rare and how == "complete":
+                        told = teller(tell, work_of(scenario))
+                        estimates = rare_estimates(scenario, _split_mode(scenario), stop.is_set, told)
+                        summary = summary.with_rare_estimates(estimates)
                     writer.settle(merger.at, summary)
             if not merger.trials:
                 shutil.rmtree(held.now)
@@ -108,7 +115,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
                 tell(FolderMoved(str(held.now)))
     if failure is not None:
         raise failure
-    if not merger.complete:
+    if not merger.complete or (plan.rare and stop.is_set()):
         raise Interrupted
     if summary.ended != how:  # a figure failed
         raise RunError(summary.ended)
@@ -155,6 +162,17 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
                 f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
                 f"give --slots {beyond[0]} or fewer, or remove {name} from the scenario"
             )
+
+
+def _split_mode(scenario: Scenario) -> Mode:
+    """The mode in which trials are split: covariances alone scatter less than errors, where events determine them."""
+    if scenario.plant is not None:
+        return Mode.EXACT
+    try:
+        check_mode(scenario, Mode.COVARIANCE_ONLY)
+    except UsageError:
+        return Mode.EXACT
+    return Mode.COVARIANCE_ONLY
 
 
 def _check_scheme(scenario: Scenario, mode: Mode) -> None:

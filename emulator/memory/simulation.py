@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import StrEnum
 from itertools import pairwise
 from typing import final
@@ -36,7 +36,7 @@ from evedrop.plugins import look_in
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.closed_loop_tally import SolveTimes
-from evedrop.streams import Batch
+from evedrop.streams import OWN, Batch, Lineage
 
 _CHUNK_NUMBERS = 64  # slots of a chunk times states: with 2000 trials side by side, a megabyte for each array
 
@@ -51,12 +51,23 @@ class Mode(StrEnum):
 
 @final
 class Simulation:
-    """Simulates all slots of a range of trials; `chunks` can be read only once."""
+    """Simulates all slots of a range of trials; `chunks` can be read only once.
 
-    def __init__(self, scenario: Scenario, trials: range, mode: Mode = Mode.EXACT) -> None:
+    lineage: whose random numbers they read; leaving out: eavesdroppers that are not simulated, which changes nothing else.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        trials: range,
+        mode: Mode = Mode.EXACT,
+        *,
+        lineage: Lineage = OWN,
+        leaving_out: Collection[str] = (),
+    ) -> None:
         self._scenario = scenario
         self._mode = mode
-        self._batch = Batch(scenario.slots, len(trials), trials.start)
+        self._batch = Batch(scenario.slots, len(trials), trials.start, lineage)
         self._process = scenario.process.process
         self._keys = StreamKeys.of(scenario)
         if scenario.modules is not None:
@@ -71,6 +82,8 @@ class Simulation:
                 LEGITIMATE: self._informed(guard.estimator(self._shared.estimator()))
             }
         for name in scenario.eavesdroppers:
+            if name in leaving_out:
+                continue
             with guard.asking(name, range(1)):
                 self._receivers[name] = guard.eavesdropper(name, self._eavesdropper(name))
         self._betrayed = {
@@ -100,7 +113,7 @@ class Simulation:
     def chunks(self) -> Iterator[Chunk]:
         """Simulate all slots, up to 64 at a time."""
         slots = self._batch.slots
-        names = self._scenario.receivers
+        names = tuple(self._receivers)
         schedules = {name: self._scenario.schedule(name) for name in names}
         links = {name: LinkCore(one, name, self._keys.link(name, one), self._batch) for name, one in schedules.items()}
         play = {
@@ -225,7 +238,8 @@ class Simulation:
     def _misled(self) -> set[str]:
         """Receivers that may take an innovation for the state."""
         found = set()
-        for name, table in self._scenario.eavesdroppers.items():
+        for name in self._receivers.keys() & self._scenario.eavesdroppers.keys():
+            table = self._scenario.eavesdroppers[name]
             outcomes = eavesdropper_outcomes(self._scheme, table.strategy, table.parameters)
             if outcomes is not None and outcomes(1.0).misled > 0.0:
                 found.add(name)

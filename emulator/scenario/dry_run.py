@@ -6,7 +6,6 @@ Source: docs/your-own.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import astuple
 from functools import partial
 from typing import Any
 
@@ -81,7 +80,8 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
     process = (public.A, public.Q, public.initial_covariance, public.singular_noise)
     registry = "STRATEGIES" if entry == "strategy" else "READERS"
     try:
-        found = ANSWERS.ask(name, "dry_run", registry, table.strategy, table.parameters, spec, process, astuple(batch))
+        drawn = (batch.slots, batch.trials, batch.first_trial)
+        found = ANSWERS.ask(name, "dry_run", registry, table.strategy, table.parameters, spec, process, drawn)
         if found is None:
             _ask_for_theory(scenario, table)
     except NoAnswer as error:

@@ -9,7 +9,7 @@ Source: docs/results.md, summary.json.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,27 @@ class RareEvents:
 
 
 @dataclass(frozen=True)
+class RareEstimate:
+    """A receiver's mean error by splitting, which contains the rare events that carry it."""
+
+    mean_error: float | None
+    """None: not to be trusted, for the reason in `doubt`."""
+    standard_error: float | None
+    z: float | None
+    """How many standard errors it is above its expectation by theory; None if that is unknown."""
+    populations: int
+    trials: int
+    """The trials of each population."""
+    splits: int
+    """After how many slots trials were copied."""
+    counting: float
+    """The least share of trials that counted in a slot, in the mean over populations."""
+    doubt: str | None
+    slots: Mapping[str, Sequence[float]]
+    """`mean_error` and `standard_error` of every slot; empty if they are not to be trusted."""
+
+
+@dataclass(frozen=True)
 class PeerSummary:
     """The entry of a receiver."""
 
@@ -59,6 +80,8 @@ class PeerSummary:
     """Name of a figure that theory expects → how many standard errors it is above its expectation; None if that is unknown."""
     rare_events: RareEvents | None = None
     """None: unknown."""
+    rare_estimate: RareEstimate | None = None
+    """None, and left out of the entry: not asked for."""
 
     @property
     def all_figures(self) -> dict[str, float | None]:
@@ -71,11 +94,12 @@ class PeerSummary:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of summary.json."""
-        own = {name: _entry(getattr(self, name)) for name in _PEER}
+        left_out = {"rare_estimate"} if self.rare_estimate is None else set[str]()
+        own = {name: _entry(getattr(self, name)) for name in _PEER if name not in left_out}
         return {**self.figures, **own, **self.mode_figures}
 
 
-_PEER = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "digest")
+_PEER = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "rare_estimate", "digest")
 
 
 @dataclass(frozen=True)
@@ -263,6 +287,11 @@ class Summary:
     def failed_expectations(self) -> int:
         """The number of expectations that did not hold."""
         return [one.held for one in self.expectations].count(False)
+
+    def with_rare_estimates(self, estimates: Mapping[str, RareEstimate]) -> Summary:
+        """The same with the estimates of some receivers."""
+        peers = {name: replace(peer, rare_estimate=estimates.get(name)) for name, peer in self.peers.items()}
+        return replace(self, peers=peers)
 
     def as_dict(self) -> dict[str, Any]:
         """The contents of summary.json, with infinite and undefined numbers as floats."""

@@ -32,4 +32,12 @@ def montecarlo(options: argparse.Namespace) -> int:
     return status
 
 
-COMMANDS = (Command("montecarlo", montecarlo, "the same trials in memory (default 1000)", (scenario, *MEMORY)),)
+def _rare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rare",
+        action="store_true",
+        help="estimate mean errors that rare events carry, too: trials with large errors are split (docs/montecarlo.md)",
+    )
+
+
+COMMANDS = (Command("montecarlo", montecarlo, "the same trials in memory (default 1000)", (scenario, *MEMORY, _rare)),)
