@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evedrop.errors import UsageError
+from evedrop.literature.crimson2023 import Crimson2023
 from evedrop.literature.kennedy2022 import Kennedy2022
 from evedrop.literature.luecke2022 import Luecke2022
 from evedrop.literature.paper import Paper, Progress
@@ -17,6 +18,7 @@ from evedrop.model.registry import near
 PAPERS: Mapping[str, type[Paper]] = {
     "kennedy2022": Kennedy2022,
     "luecke2022": Luecke2022,
+    "crimson2023": Crimson2023,
 }
 """Name on the command line → paper, in the order of the list."""
 
