@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.process import Floats, Process
-from evedrop.model.theory.covariances import LARGEST_OPERATOR, MARGINAL, Outcomes, limit_trace, radius
+from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes, limit_trace, radius
 from evedrop.model.theory.quantisation import QuantisationError
 
 
@@ -83,7 +83,7 @@ def reference_limit(process: Process, received: float, acknowledged: tuple[float
     if unheard == 0.0:
         return limit_trace(process, Outcomes.plain(received))
     carried = np.array([[1.0 - received, received * (1.0 - plain)], [unheard, 1.0 - unheard - plain * heard]])
-    if np.abs(np.linalg.eigvals(carried)).max() * radius(process) ** 2 >= 1.0 - MARGINAL:
+    if np.abs(np.linalg.eigvals(carried)).max() * radius(process) ** 2 >= 1.0 - 1e-12:
         return float("inf")
     n = process.n
     if 2 * n * n > LARGEST_OPERATOR:
