@@ -27,6 +27,7 @@ LEARNS_AT = 7
 PARAMETERS: dict[str, dict[str, Any]] = {
     **{name: {} for name in STRATEGIES},
     "suspicious": {"use_state": USE_STATE, "use_innovation": USE_INNOVATION},
+    "learning-em": {"knows": [], "keeps": 16},
     "colluding": {"reads_as": "smart"},
     "replay-informed": {"reads_as": "bayesian", "learns_at": LEARNS_AT},
 }
@@ -187,7 +188,16 @@ def test_who_looks_at_packets_says_so(name: str) -> None:
     one, gamma = receiver(name, Batch(2, 3)), np.ones(3, bool)
     follows = STRATEGIES[name].follows_gamma(PARAMETERS[name])
     assert follows == (name in {*TAKERS, "colluding"})
-    if name in {"bayesian", "likelihood", "power-test", "reference", "selective", "tracker", "replay-informed"}:
+    if name in {
+        "bayesian",
+        "learning-em",
+        "likelihood",
+        "power-test",
+        "reference",
+        "selective",
+        "tracker",
+        "replay-informed",
+    }:
         with pytest.raises(NotImplementedError, match="γ alone does not tell its action"):
             one.act(0, gamma)
     else:
