@@ -26,7 +26,7 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
                                                      "links.1.quality: is missing; expected quality = 0.9, or a loss"]),
         ({**POOL, "link": {"quality": 0.5}}, ["link: is set, but the strategy colluding has no such parameter; its ent"]),
         ({**POOL, "reads_as": None}, ['reads_as: is missing; the strategy colluding needs it; expected reads_as = "sm']),
-        ({**POOL, "reads_as": "colluding"}, ['reads_as: is "colluding"; expected bayesian, constant, genie, learning-em, likelihood']),
+        ({**POOL, "reads_as": "colluding"}, ['reads_as: is "colluding"; expected bayesian, constant, genie, learning-em']),
         ({**POOL, "reads_as": "suspicious", "use_state": 0.5}, ["use_innovation: is missing; the strategy colluding ne"]),
         ({**SPY, "learns_at": None}, ["learns_at: is missing; the strategy replay-informed needs it; expected learns_at"]),
         ({**SPY, "learns_at": -1}, ["learns_at: is -1; expected a number at least 0, such as 40"]),

@@ -72,6 +72,7 @@ class LearningEm(PacketReader):
         ("innovation", "plain"),
         "learns from packets each of which is the state or an innovation, and others would mislead it",
     )
+    inverts_noise = True  # if it knows Q
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
