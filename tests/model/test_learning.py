@@ -131,8 +131,8 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
         part = slice(r, r + 1)
         own = [slot._replace(z=slot.z[:, part], gamma=slot.gamma[part]) for slot in heard]
         alone = last_of(learner(process, Batch(K, 1), keeps=16), own)
-        pairs = [*zip(among[:3], alone[:3], strict=True), *zip(learned_by(among), learned_by(alone), strict=True)]
-        assert all(one[..., part].tobytes() == two.tobytes() for one, two in pairs)
+        sets = [(one.x_hat, one.P, one.action, *learned_by(one)) for one in (among, alone)]
+        assert all(one[..., part].tobytes() == two.tobytes() for one, two in zip(*sets, strict=True))
 
 
 @pytest.mark.parametrize(("process", "mu_e"), [(EXAMPLE, 0.9), (EXAMPLE, 0.2), (MARGINAL, 0.02)])

@@ -139,12 +139,10 @@ class LearningEm(PacketReader):
         """What is known after a slot, and the probability that its packet is the state."""
         course, theta, moments, scale = learned
         after = advanced(k, self.known, theta, course, gamma, z)
-        if self.known.everything:
-            pass
-        elif age < self._climbs[0]:
+        if age < self._climbs[0]:
             scale = np.where((course.packets == 0.0) & gamma, scale_of(gamma[None], z[None]), scale)
             theta = self.known.start(NARROW[0] * scale)
-        elif after.last is not None:
+        elif not self.known.everything:
             share = np.where(gamma, 1.0 - 1.0 / (age + 1.0), 1.0)
             moments = moments.faded(share).added(theta.A, z, gamma.astype(np.float64), after.last)
             moments, theta = moments.most_likely(theta, scale, self.known.names)

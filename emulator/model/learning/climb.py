@@ -16,7 +16,7 @@ from evedrop.kernels.elementary import Floats
 from evedrop.kernels.factored import Factors, orthogonalised
 from evedrop.kernels.mixtures import Mixture
 from evedrop.model.learning.moments import Moments
-from evedrop.model.learning.posterior import Parameters, Transition, begun, weighed
+from evedrop.model.learning.posterior import Parameters, Transition, begun, nothing, weighed
 from evedrop.model.receiver import Flags
 
 CAPACITY = 6
@@ -99,8 +99,8 @@ class Advanced(NamedTuple):
     """Probability that the packet is the state, (R,)."""
     evidence: Floats
     """Logarithm of the packet's density, (R,)."""
-    last: Transition | None
-    """The transition to the slot; None for slot 0."""
+    last: Transition
+    """The transition to the slot; of no component in slot 0."""
 
 
 def unheard(known: Known, scale: Floats) -> Course:
@@ -116,7 +116,7 @@ def unheard(known: Known, scale: Floats) -> Course:
 def advanced(k: int, known: Known, theta: Parameters, course: Course, gamma: Flags, z: Floats) -> Advanced:
     """The posterior after slot k; gamma (R,); z (n, R), 0 where nothing was received."""
     mixture, sigma, packets = course.mixture, course.sigma, course.packets
-    evidence, last = np.zeros(len(gamma)), None
+    evidence, last = np.zeros(len(gamma)), nothing(*z.shape)
     if k:
         mixture, sigma, evidence, state, last = weighed(theta, sigma, mixture, gamma, z, CAPACITY)
     else:
@@ -192,6 +192,6 @@ def _passed(
     for k, (heard, packet) in enumerate(zip(gamma, z, strict=True), first):
         course, _, density, last = advanced(k, known, theta, course, heard, packet)
         evidence = evidence + density
-        if last is not None:
+        if k:
             moments = moments.added(theta.A, packet, heard.astype(np.float64), last)
     return course, moments, evidence

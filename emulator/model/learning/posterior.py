@@ -68,6 +68,15 @@ class Weighed(NamedTuple):
     """The transition to slot k."""
 
 
+def nothing(n: int, trials: int) -> Transition:
+    """The transition of no component."""
+    return Transition(
+        np.zeros((0, trials)),
+        np.zeros((n, 0, trials)),
+        Factors(np.zeros((n * (n - 1) // 2, 0, trials)), np.zeros((n, 0, trials))),
+    )
+
+
 def begun(of: Mixture, gamma: Flags, z: Floats, capacity: int) -> tuple[Mixture, Floats]:
     """The mixture after slot 0, in which every packet is the state, and the probability of that, (R,).
 
@@ -87,7 +96,7 @@ def weighed(theta: Parameters, sigma: Factors, of: Mixture, gamma: Flags, z: Flo
     carried, noise = _carried(theta.A, of.spread), theta.noise.unit()
     of_noise, of_remaining = (_over(part.diagonal, of.weight) for part in (theta.noise, remaining))
     joint = orthogonalised(
-        _beside(carried, noise) + _beside(of.spread.unit(), _nothing(len(z))), [*of.diagonal, *of_noise]
+        _beside(carried, noise) + _beside(of.spread.unit(), _zero(len(z))), [*of.diagonal, *of_noise]
     )
     predicted, gain, spread = _parts(joint)
     informed = orthogonalised(_beside(carried, remaining.unit()), [*of.diagonal, *of_remaining])
@@ -111,7 +120,7 @@ def weighed(theta: Parameters, sigma: Factors, of: Mixture, gamma: Flags, z: Flo
 def _leak(theta: Parameters, sigma: Factors) -> tuple[Factors, list[list[Floats]], Factors]:
     """Σ_k, the matrix QΣ_k⁻¹ U_k as entries, and M_k, from Σ_{k−1}; see `evedrop.model.theory.leak`."""
     noise = theta.noise.unit()
-    rows = _beside(_carried(theta.A, sigma), noise) + _beside(_nothing(len(noise)), noise)
+    rows = _beside(_carried(theta.A, sigma), noise) + _beside(_zero(len(noise)), noise)
     new, told, remaining = _parts(orthogonalised(rows, [*sigma.diagonal, *theta.noise.diagonal]))
     return Factors(new.lower, np.minimum(new.diagonal, _LARGEST * _LARGEST)), told, remaining
 
@@ -177,7 +186,7 @@ def _beside(left: list[list[Entry]], right: list[list[Entry]]) -> list[list[Entr
     return [[*one, *other] for one, other in zip(left, right, strict=True)]
 
 
-def _nothing(n: int) -> list[list[Entry]]:
+def _zero(n: int) -> list[list[Entry]]:
     """The matrix 0."""
     return [[0.0] * n for _ in range(n)]
 
