@@ -39,23 +39,21 @@ def print_comparison(found: Comparison, folder: str) -> None:
 
 
 def _schemes(found: Comparison) -> Table:
-    table = _table(
-        "scheme", ("legitimate", "theory", "ACKs", "sent", "bits/slot", "energy", "secret", "once", "clear", "leak")
-    )
+    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits/slot", "energy", "secret", "clear", "leak"))
     for head in ("closest adversary", "verdict"):
         table.add_column(head, no_wrap=True)
     for name, one in found.schemes.items():
         cell, needs = one.closest, one.needs
+        once = f" + {needs.initial_secret_bits}" if needs.initial_secret_bits else ""
         table.add_row(
             name,
             simulated(one.legitimate),
             theory(one.legitimate),
             "yes" if needs.acknowledgements else "–",
             f"{needs.sent_fraction:.3g}",
-            estimate(needs.bits_per_slot, needs.standard_errors["bits_per_slot"] or None, ".4g"),
+            f"{needs.bits_per_slot:.4g}",
             estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
-            f"{needs.secret_bits_per_slot}" if needs.secret_bits_per_slot else "–",
-            f"{needs.initial_secret_bits}" if needs.initial_secret_bits else "–",
+            f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–",
             *(
                 ("–", "–")
                 if one.leak is None
@@ -133,7 +131,7 @@ def _undefined(found: Comparison) -> Iterator[str]:
 def _remarks(found: Comparison) -> Iterator[str]:
     yield (
         "sent: the share of slots with a packet; bits/slot, energy: what the sensor sends, headers included, and spends in a "
-        "slot on average; secret: the most bits that a slot uses; once: bits that a trial uses once; "
+        "slot on average; secret: the most bits that a slot uses, + bits that a trial uses once; "
         "clear: the share of slots whose packet is the state itself; leak: the bits about the path of states that another packet "
         "reveals without the secret"
     )

@@ -85,11 +85,7 @@ class ExactSimulation:
         )
         way_back = way_back_of(scenario)
         self._jammer = None if way_back is None else way_back.jammer
-        self._way_back = (
-            None
-            if way_back is None
-            else AckChannel(way_back.attack, way_back.quality, keys.way_back, batch, way_back.spans, way_back.flip)
-        )
+        self._way_back = None if way_back is None else AckChannel.of(way_back, keys.way_back, batch)
         self._steering = None
         if scenario.controller is not None and scenario.assignment is not None:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)

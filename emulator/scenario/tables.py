@@ -24,7 +24,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from evedrop.model.acknowledgements import ATTACKS
+from evedrop.model.acknowledgements import ATTACKS, OVERHEARING
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
 from evedrop.model.energy import EnergyModel
@@ -122,7 +122,7 @@ class AcknowledgementsTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes in the entries of attacks: `critical` needs a jammer with a link of its own, `flip` a probability."""
+        """Mistakes in the entries of attacks: two need a jammer with a link of its own, `flip` a probability."""
         attack, jammer, flip = table.get("attack", "none"), table.get("jammer"), table.get("flip")
         if attack == "flip" and flip is None:
             return [
@@ -133,11 +133,11 @@ class AcknowledgementsTable(Table):
             ]
         if attack != "flip" and flip is not None:
             return [("flip", f"is set, but the attack {as_toml(attack)} flips nothing; remove the line")]
-        if attack == "critical" and jammer is None:
+        if attack in OVERHEARING and jammer is None:
             return [
-                ("jammer", "is missing; the attack critical needs the eavesdropper that blocks the packets it missed")
+                ("jammer", f"is missing; the attack {attack} needs the eavesdropper that it serves, by what that hears")
             ]
-        if attack != "critical" and jammer is not None:
+        if attack not in OVERHEARING and jammer is not None:
             return [
                 (
                     "jammer",

@@ -5,6 +5,7 @@ Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import final
 
@@ -19,6 +20,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.score.summary import DetectionSummary
 
+_ALIKE = 1e-9  # relative difference of two rates that differ by rounding only
 _ATTACK_LOOKED_FOR = "all"  # by the sensor of a scenario without an attack
 
 
@@ -27,7 +29,9 @@ def way_back_of(scenario: Scenario) -> WayBackSpec | None:
     table = scenario.acknowledgements
     if table is None:
         return None
-    return WayBackSpec(table.link.quality, table.attack, table.jammer, scenario.timeline.jams, table.flip or 0.0)
+    overheard = 1.0 if table.jammer is None else scenario.quality[table.jammer]
+    spans, flip = scenario.timeline.jams, table.flip or 0.0
+    return WayBackSpec(table.link.quality, table.attack, table.jammer, spans, flip, overheard)
 
 
 def chart_of(scenario: Scenario) -> Chart | None:
@@ -43,6 +47,8 @@ def chart_of(scenario: Scenario) -> Chart | None:
     mu, mu_e = quality[LEGITIMATE], 1.0 if table.jammer is None else quality[table.jammer]
     flip = table.flip or 0.0
     normal, attacked = (rates_of(name, mu, mu_e, table.link.quality, flip).arrives for name in ("none", attack))
+    if math.isclose(normal, attacked, rel_tol=_ALIKE):
+        return None
     if normal == 1.0 and attacked < 1.0:
         return Chart(acknowledged=0, missing=1, threshold=1)
     try:

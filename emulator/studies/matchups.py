@@ -14,6 +14,7 @@ from typing import Any
 
 from evedrop.errors import NotRegistered, ScenarioError, UsageError
 from evedrop.loading import checked
+from evedrop.model.acknowledgements import OVERHEARING
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.readers import RESERVED
 from evedrop.model.registry import Registry
@@ -25,7 +26,13 @@ from evedrop.scenario.across import lacking_streams
 from evedrop.scenario.events.effects import Jamming
 from evedrop.scenario.words import listed, near
 
-ATTACKERS: Mapping[str, str] = {"blocks-critical": "critical", "blocks-all": "all", "forges": "forge", "flips": "flip"}
+ATTACKERS: Mapping[str, str] = {
+    "blocks-critical": "critical",
+    "blocks-all": "all",
+    "forges": "forge",
+    "flips": "flip",
+    "hijacks": "hijack",
+}
 """Adversary → its attack on acknowledgements."""
 
 _FLIP = 0.1
@@ -194,8 +201,10 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
     if SCHEMES[scheme].needs_acknowledgements:
         flip = way_back.get("flip", _FLIP)
         way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer", "flip")}
-        needs = {"critical": {"jammer": matches[0].receiver if matches else None}, "flip": {"flip": flip}}
-        tables["acknowledgements"] = {**way_back, "attack": attack, **needs.get(attack, {})}
+        more = {"flip": flip} if attack == "flip" else {}
+        if attack in OVERHEARING:
+            more = {"jammer": matches[0].receiver}
+        tables["acknowledgements"] = {**way_back, "attack": attack, **more}
     return checked(tables, scenario.title)
 
 

@@ -16,6 +16,7 @@ from evedrop.live.protocol.brief_parts import RouterPart, SensorPart
 from evedrop.loading import checked
 from evedrop.memory.montecarlo import check_mode
 from evedrop.memory.simulation import Mode, Simulation
+from evedrop.model.acknowledgements import OVERHEARING
 from evedrop.model.numeric.detection import Chart
 from evedrop.model.schemes import scheme_of
 from evedrop.scenario import Scenario
@@ -41,7 +42,14 @@ RUNS: dict[str, dict[str, Any]] = {
         "event": [PAUSE],
     },
     "open-loop": {"A": MIXED, "attack": {"attack": "forge"}, "event": [JAM, PAUSE]},
-    "quantised-schedule": {"A": STABLE, "threshold": 1.5, "bits": 4, "deviations": 6.0, "event": [PAUSE]},
+    "quantised-schedule": {
+        "A": STABLE,
+        "threshold": 1.5,
+        "bits": 4,
+        "deviations": 6.0,
+        "attack": {"attack": "hijack", "jammer": "ref"},
+        "event": [PAUSE],
+    },
     "scheduled": {"A": STABLE, "threshold": 3, "attack": {"attack": "all"}, "event": [JAM]},
     "twin-track": {"A": UNSTABLE, "reads_as": "tracker"},
     "withholding": {"A": STABLE, "state_probability": 0.5},
@@ -208,6 +216,7 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
         ("scheduled", "legitimate", "none"),
         ("scheduled", "naive", "critical"),
         ("scheduled", "ref", "critical"),
+        ("scheduled", "ref", "hijack"),
         ("scheduled", "legitimate", "forge"),
         ("encrypted-schedule", "sel", "critical"),
         ("encrypted-schedule", "legitimate", "none"),
@@ -218,7 +227,7 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
 )
 def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, attack: str) -> None:
     """At no time the mean error of 3000 trials is 5 standard errors off, whichever receiver jams."""
-    jam = {"attack": attack, **({"jammer": "ref"} if attack == "critical" else {})}
+    jam = {"attack": attack, **({"jammer": "ref"} if attack in OVERHEARING else {})}
     table = {"acknowledgements": {"link": {"quality": 0.9}, **jam}} if scheme in NEEDS else {}
     eavesdroppers = tables_of(scheme)["eavesdroppers"]
     eavesdroppers["sel"] = {"strategy": "selective", "link": {"quality": 0.8}}

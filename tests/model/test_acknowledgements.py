@@ -34,6 +34,7 @@ def test_attacks_are_what_their_names_say() -> None:
         "critical": [True, False, False, False],
         "forge": [True] * 4,
         "flip": [True, False, False, True],
+        "hijack": [True, True, False, False],
     }
     assert {name: attack(gamma, gamma_e, flips).tolist() for name, attack in ATTACKS.items()} == expected
 
@@ -43,7 +44,7 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     """Counted over a million packets, each rate lies within binomial bounds at 1e-6 confidence."""
     mu, mu_e, quality, slots, trials = 0.8, 0.6, 0.7, 100, 10_000
     batch = Batch(slots, trials)
-    way = AckChannel(attack, quality, KEY, batch, flip=0.2)
+    way = AckChannel(attack, quality, KEY, batch, flip=0.2, overheard=mu_e)
     gamma, gamma_e = coins(mu, slots, trials, 1), coins(mu_e, slots, trials, 2)
     arrived = np.array([way.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
     rates = rates_of(attack, mu, mu_e, quality, 0.2)
@@ -73,7 +74,7 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
     """Mean believed trace after a few slots, user's and eavesdropper's, by the recursion, at 5 standard errors."""
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
-    way = AckChannel(attack, 0.9, KEY, batch)
+    way = AckChannel(attack, 0.9, KEY, batch, overheard=mu_e)
     eve = STRATEGIES["reference"](Knowledge(UNSTABLE, 1.0, {}, {}), batch)
     played = play(
         Acknowledged(UNSTABLE),

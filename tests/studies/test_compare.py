@@ -31,6 +31,7 @@ VERDICTS = {
     ("acknowledged", "reference"): SecrecyKept.PERFECT,
     ("acknowledged", "blocks-critical"): SecrecyKept.BROKEN,
     ("acknowledged", "blocks-all"): SecrecyKept.BROKEN,
+    ("acknowledged", "hijacks"): SecrecyKept.PERFECT,  # no acknowledgement is lost
     ("open-loop", "reference"): SecrecyKept.PERFECT,
     ("open-loop", "forges"): SecrecyKept.BROKEN,
     ("twin-track", "naive"): SecrecyKept.PERFECT,

@@ -176,7 +176,7 @@ class WayBackLink:
 
     def __init__(self, brief: AnyBrief, session: ProcessSession, spec: WayBackSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
-        self._way = AckChannel(spec.attack, spec.quality, key, brief.batch, spec.spans, spec.flip)
+        self._way = AckChannel.of(spec, key, brief.batch)
         self._jammer = spec.jammer
         self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged

@@ -60,6 +60,7 @@ _WAY_BACK: Check = maybe(
             "jammer": maybe(text),
             "spans": maybe(listed(row(SLOT, SLOT))),
             "flip": number,
+            "overheard": number,
         }
     )
 )
