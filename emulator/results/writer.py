@@ -217,8 +217,6 @@ class ResultsWriter:
         count, trials = len(expected), sums.trials
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             mean = sums.error / trials
-            variance = np.maximum(0.0, sums.error_squared / trials - mean * mean) * trials / (trials - 1.0)
-            standard_error = np.where(trials > 1, np.sqrt(variance / trials), np.nan)
             columns = [sums.trace / trials, expected, sums.received / trials, sums.used / trials]
         self._slots = max(self._slots, first + count)
         nothing = np.full(count, np.nan)
@@ -231,7 +229,7 @@ class ResultsWriter:
                 trials.astype(np.int64),
                 nothing if covariance_only else mean,
                 mean if covariance_only else nothing,
-                standard_error,
+                sums.standard_errors,
                 *columns,
                 *spread.T,
             ],

@@ -51,6 +51,16 @@ class SlotSums:
         for one in fields(self):
             getattr(self, one.name)[rows] += getattr(other, one.name)
 
+    @property
+    def standard_errors(self) -> Floats:
+        """The standard error of the mean error in each slot, (c,); NaN for one trial."""
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            mean = self.error / self.trials
+            variance = np.maximum(0.0, self.error_squared / self.trials - mean * mean)
+            variance = variance * self.trials / (self.trials - 1.0)
+            found: Floats = np.where(self.trials > 1, np.sqrt(variance / self.trials), np.nan)
+        return found
+
     def measured(self) -> SlotSums:
         """Only the slots that some trial reached: a run that was cut short lacks the last ones."""
         rows = slice(0, int(np.count_nonzero(self.trials)))

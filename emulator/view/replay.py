@@ -112,6 +112,7 @@ def _peer(results: Results, name: str) -> PeerSlots:
         P=P.reshape(-1, n, n),
         action=np.array([_CODES[word] for word in words], np.uint8),
         squared_error=means["mean_squared_error"].to_numpy(),
+        standard_error=means["standard_error"].to_numpy(),
         trace=means["mean_trace_covariance"].to_numpy(),
         expected_trace=means["expected_trace_covariance"].to_numpy(),
     )

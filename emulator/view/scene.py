@@ -68,6 +68,8 @@ class PeerSlots:
     """`Action` in the first recorded trial, (c,)."""
     squared_error: Floats
     """|x − x̂|², mean over trials, (c,)."""
+    standard_error: Floats
+    """The standard error of this mean, (c,); NaN for one trial."""
     trace: Floats
     """tr P that it believes, mean over trials, (c,)."""
     expected_trace: Floats

@@ -70,6 +70,7 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], s
             P=receiver.P[:, :, :, 0],
             action=receiver.action[:, 0],
             squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
+            standard_error=scored[name].sums.standard_errors,
             trace=receiver.trace[:, 0] / slots.trials,
             expected_trace=scored[name].expected,
         )

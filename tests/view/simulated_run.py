@@ -48,6 +48,7 @@ class Simulated:
                     p.P[part],
                     p.action[part],
                     p.squared_error[part],
+                    p.standard_error[part],
                     p.trace[part],
                     p.expected_trace[part],
                 )
@@ -84,17 +85,19 @@ def simulate(
         for name, (_, receiver) in receivers.items():
             gamma = arrivals.random(trials) < qualities[name]
             beliefs[name] = b = receiver.step(k, beliefs[name], Reception(gamma, z))
-            error = np.sum((x - b.x_hat) ** 2, axis=0).mean()
+            errors = np.sum((x - b.x_hat) ** 2, axis=0)
+            spread = errors.std(ddof=1) / np.sqrt(trials) if trials > 1 else np.float64(np.nan)
             trace = np.trace(b.P).mean()
-            seen[name].append((b.x_hat[:, 0], b.P[:, :, 0], b.action[0], error, trace))
+            seen[name].append((b.x_hat[:, 0], b.P[:, :, 0], b.action[0], errors.mean(), spread, trace))
     shown = tuple(
         Shown(name, "legitimate" if i == 0 else "eavesdropper", strategy, qualities[name])
         for i, (name, (strategy, _)) in enumerate(receivers.items())
     )
     peers = {}
     for s in shown:
-        x_hat, P, action, error, trace = (np.array(column) for column in zip(*seen[s.name], strict=True))
-        peers[s.name] = PeerSlots(x_hat, P, action.astype(np.uint8), error, trace, expected(process, s, slots))
+        x_hat, P, action, error, spread, trace = (np.array(column) for column in zip(*seen[s.name], strict=True))
+        theory = expected(process, s, slots)
+        peers[s.name] = PeerSlots(x_hat, P, action.astype(np.uint8), error, spread, trace, theory)
     scene = Scene(
         "Simulated", f"simulated-{seed}-{slots}", slots, trials, process.n, pace, shown, float(np.trace(process.Q))
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from evedrop.view.panels.error import SquaredError
 from evedrop.view.panels.state_plane import frames, stride
 from evedrop.view.recording import Scene, ViewRecording
 from tests.conftest import LIMIT
@@ -55,6 +56,28 @@ def test_curves_are_logarithms_at_full_rate(run: Simulated, rrd: Path) -> None:
                 lowest.append(curve.min())
                 assert (np.log10(np.maximum(values[~above], 1e-300)) <= curve.min()).all()
     assert max(lowest) == min(lowest)
+
+
+def test_bands_of_several_trials(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """Their edges are 1.96 standard errors from the mean, in every slot; a single trial has none."""
+    several, alone = simulated(30, trials=12), simulated(30)
+    record(several, tmp_path / "several.rrd")
+    for name, peer in several.slots.peers.items():
+        means = rows(tmp_path / "several.rrd", f"error/{name}", "Scalars:scalars")
+        floor = min(value[0] for value in means.values())
+        for side, sign in (("low", -1), ("high", 1)):
+            shown = rows(tmp_path / "several.rrd", f"band/{name}/{side}", "Scalars:scalars")
+            edge = peer.squared_error + sign * 1.96 * peer.standard_error
+            assert sorted(shown) == list(range(30))
+            np.testing.assert_allclose(
+                np.maximum([shown[k][0] for k in range(30)], floor), np.log10(np.maximum(edge, 10.0**floor)), rtol=1e-9
+            )
+        assert (peer.standard_error > 0.0).any()
+    assert any("band" in path for path in SquaredError(several.scene).styles())
+    assert not any("band" in path for path in SquaredError(alone.scene).styles())
+    assert {column.path for column in SquaredError(alone.scene).columns(alone.slots)} == {
+        f"error/{name}" for name in alone.slots.peers
+    }
 
 
 def test_lanes_tell_what_happened(run: Simulated, rrd: Path) -> None:

@@ -1,4 +1,4 @@
-"""The panel of the squared error of each receiver, mean over trials."""
+"""The panel of the squared error of each receiver, mean over trials, with the band of its standard error."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from typing import final
 import rerun as rr
 
 from evedrop.view.column import Column
-from evedrop.view.palette import colour
+from evedrop.view.palette import colour, dim
 from evedrop.view.panels.curves import LARGEST, logarithms, receivers_view, recent_slots, whole_run
 from evedrop.view.panels.panel import PlacedView, ViewPanel
 from evedrop.view.scene import SceneSlots
 
-_PATH = "error"
+_PATH, _BAND = "error", "band"
+_NO_NAME = " "
+"""The name of curves in the legend, which the receivers' own curves explain."""
+_SIDES = {"low": -1.96, "high": 1.96}
+"""The edges of the band, in standard errors from the mean: 19 of 20 bands contain the expectation."""
 
 
 @final
@@ -25,22 +29,37 @@ class SquaredError(ViewPanel):
         title = "Squared error |x − x̂|²   log10"
         if self.scene.moving:
             legend = not any(panel.with_beliefs for panel in self.scene.panels)
-            yield PlacedView(receivers_view(title, [_PATH], whole_run(self.scene), legend=legend), "right")
+            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene), legend=legend), "right")
         else:
-            title += ", bottom: exact"
-            yield PlacedView(receivers_view(title, [_PATH], recent_slots(self.scene), legend=True), "left")
+            title += ", bottom: exact" + (", dim: ± 1.96 standard errors" if self._with_bands else "")
+            yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene), legend=True), "left")
+
+    @property
+    def _with_bands(self) -> bool:
+        return self.scene.trials > 1
+
+    @property
+    def _paths(self) -> list[str]:
+        return [_PATH, _BAND] if self._with_bands else [_PATH]
 
     def styles(self) -> dict[str, rr.SeriesLines]:
-        """Each curve in its receiver's colour."""
-        return {
-            f"{_PATH}/{shown.name}": rr.SeriesLines(
+        """Each curve in its receiver's colour, and the edges of its band dim."""
+        found = {}
+        for i, shown in enumerate(self.scene.receivers):
+            found[f"{_PATH}/{shown.name}"] = rr.SeriesLines(
                 names=shown.name, colors=colour(i), widths=1.5, aggregation_policy=LARGEST
             )
-            for i, shown in enumerate(self.scene.receivers)
-        }
+            for side in _SIDES if self._with_bands else ():
+                found[f"{_BAND}/{shown.name}/{side}"] = rr.SeriesLines(
+                    names=_NO_NAME, colors=dim(colour(i), 0.5), widths=1.0, aggregation_policy=LARGEST
+                )
+        return found
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """A curve for each receiver."""
+        """A curve for each receiver, and two for the edges of its band."""
         for shown in self.scene.receivers:
-            error = slots.peers[shown.name].squared_error
-            yield from logarithms(self.scene, f"{_PATH}/{shown.name}", slots.numbers, error)
+            peer = slots.peers[shown.name]
+            yield from logarithms(self.scene, f"{_PATH}/{shown.name}", slots.numbers, peer.squared_error)
+            for side, distance in _SIDES.items() if self._with_bands else ():
+                edge = peer.squared_error + distance * peer.standard_error
+                yield from logarithms(self.scene, f"{_BAND}/{shown.name}/{side}", slots.numbers, edge)
