@@ -83,6 +83,8 @@ def _class(kind: type[Eavesdropper]) -> dict[str, Any]:
         "parameters": dict(kind.parameters),
         "pools_links": bool(kind.pools_links),
         "inverts_noise": bool(kind.inverts_noise),
+        "reads_leaks": bool(kind.reads_leaks),
+        "tests_range": bool(kind.tests_range),
         "only_against": kind.only_against,
         "takes": takes,
         "own_outcomes": getattr(kind.outcomes, "__func__", None) is not inherited,

@@ -74,7 +74,8 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
     if process.singular_noise and is_singular(process.Q):
         found.append(
             "process.Q is singular: apart from A, inputs and disturbances, consecutive states differ only "
-            "within its range, which reveals the type of packets to anybody who looks"
+            "within its range, so anybody who knows A and Q recognises, with certainty, two states in a row, and an "
+            "innovation after a state"
         )
     return found
 

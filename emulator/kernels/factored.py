@@ -57,6 +57,11 @@ class Factors(NamedTuple):
             )
         )
 
+    def rounded(self, rounding: Floats) -> Factors:
+        """The same with D of at least rounding (n,)."""
+        least = rounding.reshape(-1, *(1 for _ in self.diagonal.shape[1:]))
+        return Factors(self.lower, np.where(self.diagonal > least, self.diagonal, least))
+
     def unit(self) -> list[list[Entry]]:
         """U as rows of entries."""
         n = len(self.diagonal)

@@ -36,20 +36,25 @@ class Weighing(NamedTuple):
     """The most components of a trial."""
 
 
-def step(model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak | None) -> tuple[Mixture, Floats]:
+def step(
+    model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak | None, rounding: Floats
+) -> tuple[Mixture, Floats]:
     """The mixture one slot later, and the probability that the packet is the state, (R,).
 
-    gamma (R,); z (n, R), 0 where nothing was received; leak: None in slot 0, in which a packet is the state.
+    gamma (R,); z (n, R), 0 where nothing was received; leak: None in slot 0, in which a packet is the state; rounding (n,): the
+    least variance of packets about their prediction.
     """
     if leak is None:
         state = gamma.astype(np.float64)
         of = Mixture(np.where(gamma, 0.0, of.weight), *(part.copy() for part in of[1:]))
     else:
-        of, state = _weighed(model, of, gamma, z, leak)
+        of, state = _weighed(model, of, gamma, z, leak, rounding)
     return opened(pruned(of), state, z, model.capacity), state
 
 
-def _weighed(model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak) -> tuple[Mixture, Floats]:
+def _weighed(
+    model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak, rounding: Floats
+) -> tuple[Mixture, Floats]:
     """The components one slot later, without the packet's own, and the probability that the packet is the state, (R,).
 
     The costly steps skip empty places, which usually are half of all.
@@ -60,10 +65,13 @@ def _weighed(model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak)
     white, heard = leak.white(z), _taken(gamma, trial)
     mean = product(model.A, some.mean)
     predicted, informed = grown(model.A, some.spread, model.noise, leak.remaining_factor)
-    squared = squared_length(predicted, list(_taken(z, trial) - mean))
+    seen = predicted.rounded(rounding)
+    squared = squared_length(seen, list(_taken(z, trial) - mean))
     alone = _taken(_squared(white), trial)
     ratios = np.zeros(of.weight.shape)
-    ratios.reshape(-1)[there] = _weighed_ratios(heard, some.weight, squared, predicted.diagonal, alone, leak)
+    ratios.reshape(-1)[there] = _weighed_ratios(
+        heard, some.weight, squared, np.where(predicted.diagonal > 0.0, seen.diagonal, predicted.diagonal), alone, leak
+    )
     state, other = _type_probabilities(model.state_probability, summed(ratios), gamma)
     mean += _taken(np.where(gamma, leak.innovation(white), 0.0), trial)
     for after, known in zip(predicted, informed, strict=True):
@@ -105,7 +113,8 @@ def _weighed_ratios(
 ) -> Floats:
     """π_j N(z; m_j, P_j) / N(z; 0, Σ_k) of components whose trial received z, (N,); 0 for all others.
 
-    weight: π, (N,); squared: (z − m)ᵀ P⁻¹ (z − m), (N,); diagonal: D of P's factors, (n, N); alone: zᵀ Σ_k⁻¹ z, (N,).
+    weight: π, (N,); squared: (z − m)ᵀ P⁻¹ (z − m), (N,); diagonal: D of P's factors, (n, N); alone: zᵀ Σ_k⁻¹ z, (N,). A packet in
+    the range of a singular P has an infinite density, for which 1e300 stands.
     """
     exponent = 0.5 * (alone - squared)
     # Most packets are far from the threshold, and need no exponential.
@@ -115,5 +124,7 @@ def _weighed_ratios(
         determinant *= D[some] / state
     likely = exp(np.minimum(exponent[some], _CERTAIN))
     ratios = np.zeros(weight.shape)
-    ratios[some] = weight[some] * likely / np.sqrt(determinant)
+    with np.errstate(divide="ignore", over="ignore"):
+        found = weight[some] * likely / np.sqrt(determinant)
+    ratios[some] = np.where(found > _SURE, _SURE, found)
     return ratios

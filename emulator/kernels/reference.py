@@ -221,6 +221,7 @@ def follow_mixture(
     A: Floats,
     G: Floats,
     leaks: Floats,
+    rounding: Floats,
     before: tuple[Floats, ...],
     gamma: Flags,
     z: Floats,
@@ -230,8 +231,9 @@ def follow_mixture(
 ) -> tuple[Floats, Floats, Codes, Floats, Floats, Floats, Floats]:
     """The Bayesian eavesdropper: estimates (c, n, R), covariances (c, n, n, R), actions (c, R), and the mixture after c slots.
 
-    G (n, n): lower triangular, G Gᵀ = Q; leaks (c, 2n, 2n), see `Leak`; before: the mixture before these slots, with at most
-    `capacity` components, see `Mixture`; gamma (c, R); z (c, n, R): packets, read where they are received.
+    G (n, n): lower triangular, G Gᵀ = Q; leaks (c, 2n, 2n), see `Leak`; rounding (c, n): the least variance of packets about
+    their prediction; before: the mixture before these slots, with at most `capacity` components, see `Mixture`; gamma (c, R);
+    z (c, n, R): packets, read where they are received.
     initial: the first slot is slot 0, in which a packet is the state.
     """
     model = posterior.Weighing(A, Factor.of_triangular(G.tolist()), state_probability, capacity)
@@ -239,7 +241,7 @@ def follow_mixture(
     x_hat, P, action = np.empty(z.shape), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8)
     for row, heard in enumerate(gamma):
         leak = None if initial and row == 0 else Leak(leaks[row])
-        mixture, state = posterior.step(model, mixture, heard, np.where(heard, z[row], 0.0), leak)
+        mixture, state = posterior.step(model, mixture, heard, np.where(heard, z[row], 0.0), leak, rounding[row])
         x_hat[row], P[row] = mixtures.moments(mixture)
         action[row] = np.where(heard, np.where(state > 0.5, np.uint8(_STATE), np.uint8(_INNOVATION)), np.uint8(0))
     return x_hat, P, action, *mixture

@@ -41,6 +41,8 @@ class FilterStep(NamedTuple):
     """K S Kᵀ, (n, n): the covariance of the measurement's contribution to x̂ˢ."""
     expected: Floats
     """S, (p, p): the covariance of the innovation y − C x̂ˢ⁻ itself."""
+    predicted: Floats
+    """Covariance of x − x̂ˢ before the next measurement, (n, n)."""
 
 
 @final
@@ -68,7 +70,13 @@ class Steps:
         after = 0.5 * (after + after.T)
         predicted = product(product(self._A, after), _transposed(self._A)) + self._W
         innovation = product(product(K, S), _transposed(K))
-        step = FilterStep(K, after, 0.5 * (innovation + innovation.T), 0.5 * (S + S.T))
+        step = FilterStep(
+            K,
+            after,
+            0.5 * (innovation + innovation.T),
+            0.5 * (S + S.T),
+            0.5 * (predicted + predicted.T),
+        )
         self.settled = bool(np.abs(predicted - P).max() <= _SETTLED * np.abs(predicted).max())
         self._predicted, self._last = predicted, step
         return step

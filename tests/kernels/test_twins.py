@@ -269,10 +269,11 @@ def mixture(random: np.random.Generator, places: int, n: int, trials: int) -> tu
 def posterior_arguments(
     random: np.random.Generator, sizes: tuple[int, int, int], capacity: int, odd: bool
 ) -> list[Any]:
-    """A, G, leaks, a mixture, γ and packets, in numbers of a size at which types are in doubt; odd: some of any size."""
+    """A, G, leaks, rounding, a mixture, γ and packets, at which types are in doubt; odd: some numbers are of any size."""
     slots, n, trials = sizes
     A, before = entries(random, n, n), mixture(random, int(random.integers(0, capacity + 1)), n, trials)
     G, leaks = np.tril(entries(random, n, n)), np.tril(entries(random, slots, 2 * n, 2 * n))
+    rounding = np.abs(entries(random, slots, n)) * 10.0 ** random.integers(-340, 1, (slots, n))
     z = entries(random, *sizes) * 10.0 ** random.uniform(-1, 2)
     gamma = random.random((slots, trials)) < random.random() * 1.3
     if odd:
@@ -281,7 +282,7 @@ def posterior_arguments(
     else:
         for L in (G, *leaks):
             np.fill_diagonal(L, np.exp(random.standard_normal(len(L))))
-    return [A, G, leaks, before, gamma, z]
+    return [A, G, leaks, rounding, before, gamma, z]
 
 
 @settings(max_examples=150, deadline=None)
@@ -296,11 +297,12 @@ def test_posteriors_are_the_same(
 def test_places_that_become_empty_are_left_out() -> None:
     """An infinite weight leaves nothing for the other component, whose place is dropped."""
     random = np.random.default_rng(1)
-    A, G, leaks, _, gamma, z = posterior_arguments(random, (1, 2, 5), 4, odd=False)
+    A, G, leaks, rounding, _, gamma, z = posterior_arguments(random, (1, 2, 5), 4, odd=False)
     _, *parts = mixture(random, 2, 2, 5)
     weight = np.array([[np.inf], [0.5]]) * np.ones(5)
-    assert compiled.follow_mixture(A, G, leaks, (weight, *parts), gamma & False, z, 0.5, 4)[3].shape == (1, 5)
-    twins("follow_mixture", A, G, leaks, (weight, *parts), gamma & False, z, 0.5, 4)
+    arguments = (A, G, leaks, rounding, (weight, *parts), gamma & False, z, 0.5, 4)
+    assert compiled.follow_mixture(*arguments)[3].shape == (1, 5)
+    twins("follow_mixture", *arguments)
 
 
 def test_a_mixture_with_too_many_places_is_refused() -> None:
@@ -308,8 +310,8 @@ def test_a_mixture_with_too_many_places_is_refused() -> None:
     random = np.random.default_rng(1)
     with pytest.raises(ValueError, match="3 places; expected at most 2"):
         compiled.follow_mixture(
-            np.eye(2), np.eye(2), np.zeros((1, 4, 4)), mixture(random, 3, 2, 1), np.ones((1, 1), np.bool_),
-            np.zeros((1, 2, 1)), 0.5, 2,
+            np.eye(2), np.eye(2), np.zeros((1, 4, 4)), np.zeros((1, 2)), mixture(random, 3, 2, 1),
+            np.ones((1, 1), np.bool_), np.zeros((1, 2, 1)), 0.5, 2,
         )  # fmt: skip
 
 

@@ -244,7 +244,8 @@ def test_kernels_agree_on_mixtures_of_states_and_noise(given: Any) -> None:
     assert isinstance(one, Bayesian)
     beliefs, _ = one.follow(range(30), one.prior(), gamma, z)
     leaks = Leaks(STABLE, NoiseLaw(given)).block(range(30))
-    found = reference.follow_mixture(STABLE.A, cholesky(STABLE.Q), leaks, one.prior().memory, gamma, z, 0.4, 12, True)
+    exact, before = np.zeros((30, STABLE.n)), one.prior().memory
+    found = reference.follow_mixture(STABLE.A, cholesky(STABLE.Q), leaks, exact, before, gamma, z, 0.4, 12, True)
     assert np.array_equal(beliefs.x_hat, found[0])
     assert np.array_equal(beliefs.P, found[1])
     assert np.array_equal(beliefs.action, found[2])

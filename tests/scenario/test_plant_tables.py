@@ -210,14 +210,14 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "unseen": (
         {"plant__output_matrix": [[1.0, 0.0]], "plant__measurement_noise": [[0.01]]},
-        "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state",
+        "plant.output_matrix: shows only 1 of 2 directions of a mode that does not decay, an eigenvalue of A of modulus 1",
     ),
     "inverse of Q": (
         {
             "process__singular_noise": True,
-            "eavesdroppers": {"eve": {"strategy": "bayesian", "link": {"quality": 0.5}}},
+            "eavesdroppers": {"eve": {"strategy": "tracker", "link": {"quality": 0.5}}},
         },
-        "eavesdroppers.eve.strategy: is bayesian, which uses the inverse of Q, and Q may be singular",
+        "eavesdroppers.eve.strategy: is tracker, which uses the inverse of Q, and Q may be singular",
     ),
     "reserved": (
         {"eavesdroppers": {"controller": {"strategy": "smart", "link": {"quality": 0.5}}}},

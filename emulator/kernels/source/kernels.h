@@ -73,7 +73,7 @@ int kernels_carried_factors(int64_t n, int64_t slots, const double *A, const dou
    x_hat (slots, n, trials), P (slots, n, n, trials) and action (slots, trials) are those after each slot. Returns how many places
    are in use, or -1 where memory is short. */
 int64_t kernels_follow_mixture(int64_t slots, int64_t n, int64_t trials, int64_t before, int64_t capacity, int initial,
-                               const double *A, const double *G, const double *leaks, double state_probability,
-                               const double *weight, const double *mean, const double *lower, const double *diagonal,
+                               const double *A, const double *G, const double *leaks, const double *rounding,
+                               double state_probability, const double *weight, const double *mean, const double *lower, const double *diagonal,
                                const uint8_t *gamma, const double *z, double *x_hat, double *P, uint8_t *action,
                                double *weight_after, double *mean_after, double *lower_after, double *diagonal_after);

@@ -31,14 +31,14 @@ static inline __attribute__((always_inline)) LANES NAME(exponential, SET)(LANES 
 /* A mixture of WIDTH trials, place by place, and work space; all of one allocation. */
 typedef struct {
   LANES *weight, *mean, *lower, *diagonal;                          /* (C,), (C, n), (C, n (n-1)/2), (C, n) */
-  LANES *z, *white, *told, *apart, *e, *lower_after, *diagonal_after; /* of a slot, and of a component after it */
+  LANES *z, *white, *told, *apart, *e, *seen, *lower_after, *diagonal_after; /* of a slot, and of a component after it */
   ENTRY *A, *noise_unit, *noise, *known_unit, *known;               /* (n, n), (n, n), (n,), (n, n), (n,) */
   ENTRY *carried, *products, *rows, *weights, *weighted, *first;    /* (n, n), (n,), (n, 2n + 1), (2n + 1,) twice, (n,) */
 } NAME(mixture, SET);
 #define MIXTURES NAME(mixture, SET)
 
 static int NAME(new_mixture, SET)(int64_t n, int64_t capacity, MIXTURES *m) {
-  int64_t below = BELOW(n, 0), lanes = capacity * (1 + 2 * n + below) + 6 * n + below, entries = 6 * n * n + 10 * n + 2;
+  int64_t below = BELOW(n, 0), lanes = capacity * (1 + 2 * n + below) + 7 * n + below, entries = 6 * n * n + 10 * n + 2;
   m->weight = calloc(1, (size_t)lanes * sizeof(LANES));
   m->A = calloc(1, (size_t)entries * sizeof(ENTRY));
   if (!m->weight || !m->A) return -1;
@@ -50,7 +50,8 @@ static int NAME(new_mixture, SET)(int64_t n, int64_t capacity, MIXTURES *m) {
   m->told = m->white + n;
   m->apart = m->told + n;
   m->e = m->apart + n;
-  m->diagonal_after = m->e + n;
+  m->seen = m->e + n;
+  m->diagonal_after = m->seen + n;
   m->lower_after = m->diagonal_after + n;
   m->noise_unit = m->A + n * n;
   m->known_unit = m->noise_unit + n * n;
@@ -66,9 +67,10 @@ static int NAME(new_mixture, SET)(int64_t n, int64_t capacity, MIXTURES *m) {
 }
 
 /* One component one slot later, and its part in the packet's ratio of densities. heard: where there is a component, and a packet;
-   joint: the slot's [[L, 0], [gain, M]]. */
+   joint: the slot's [[L, 0], [gain, M]]; rounding: the least variance of packets about their prediction, (n,). */
 static inline __attribute__((always_inline)) LANES NAME(component, SET)(int64_t n, const double *A, const double *joint,
-                                                                        MASKS heard, LANES alone, LANES weight,
+                                                                        const double *rounding, MASKS heard, LANES alone,
+                                                                        LANES weight,
                                                                         LANES *mean, LANES *lower, LANES *diagonal,
                                                                         MIXTURES *m) {
   LANES ratio = {0.0};
@@ -83,18 +85,24 @@ static inline __attribute__((always_inline)) LANES NAME(component, SET)(int64_t 
   NAME(grown, SET)(n, m->carried, m->products, diagonal, m->noise_unit, m->noise, m->rows, m->weights, m->weighted, m->first,
                    m->lower_after, m->diagonal_after);
   if (NAME(any, SET)(heard)) {
-    for (int64_t i = 0; i < n; i++) m->apart[i] = m->z[i] - mean[i];
-    LANES exponent = 0.5 * (alone - NAME(squared_length, SET)(n, m->lower_after, m->diagonal_after, m->apart, m->e));
+    for (int64_t i = 0; i < n; i++) {
+      LANES least = NAME(splat, SET)(rounding[i]), D = m->diagonal_after[i];
+      m->apart[i] = m->z[i] - mean[i];
+      m->seen[i] = SELECT((MASKS)(D > least), D, least);
+    }
+    LANES exponent = 0.5 * (alone - NAME(squared_length, SET)(n, m->lower_after, m->seen, m->apart, m->e));
     MASKS some = (MASKS)(exponent > NAME(splat, SET)(IMPOSSIBLE)) & heard;
     if (NAME(any, SET)(some)) {
-      LANES determinant = NAME(splat, SET)(1.0), most = NAME(splat, SET)(CERTAIN), root;
+      LANES determinant = NAME(splat, SET)(1.0), most = NAME(splat, SET)(CERTAIN), sure = NAME(splat, SET)(SURE), root;
       for (int64_t i = 0; i < n; i++) {
         double pivot = joint[i * (2 * n + 1)];
-        determinant *= m->diagonal_after[i] / (pivot * pivot);
+        LANES none = {0.0}, D = m->diagonal_after[i];
+        determinant *= SELECT((MASKS)(D > none), m->seen[i], D) / (pivot * pivot);
       }
       exponent = (LANES)(some & (MASKS)SELECT((MASKS)(exponent > most), most, exponent));
       for (int t = 0; t < WIDTH; t++) root[t] = sqrt(determinant[t]);
-      ratio = (LANES)(some & (MASKS)(weight * NAME(exponential, SET)(exponent) / root));
+      ratio = weight * NAME(exponential, SET)(exponent) / root;
+      ratio = (LANES)(some & (MASKS)SELECT((MASKS)(ratio > sure), sure, ratio));
     }
     for (int64_t i = 0; i < n; i++) mean[i] = mean[i] + m->told[i];
     /* `lower` and `diagonal` are still those before the slot. */
@@ -228,6 +236,7 @@ static inline __attribute__((always_inline)) void NAME(moments, SET)(int64_t n, 
 static inline __attribute__((always_inline)) int64_t NAME(mixture_slot, SET)(int64_t n, int64_t trials, int64_t w,
                                                                              int64_t capacity, int64_t places,
                                                                              const double *A, const double *joint,
+                                                                             const double *rounding,
                                                                              double state_probability, const uint8_t *gamma,
                                                                              const double *z, double *x_hat, double *P,
                                                                              uint8_t *action, MIXTURES *m) {
@@ -255,7 +264,7 @@ static inline __attribute__((always_inline)) int64_t NAME(mixture_slot, SET)(int
     for (int64_t p = 0; p < places; p++) {
       MASKS there = (MASKS)(m->weight[p] != none);
       if (NAME(any, SET)(there))
-        ratios += NAME(component, SET)(n, A, joint, heard & there, alone, m->weight[p], m->mean + p * n,
+        ratios += NAME(component, SET)(n, A, joint, rounding, heard & there, alone, m->weight[p], m->mean + p * n,
                                        m->lower + p * BELOW(n, 0), m->diagonal + p * n, m);
     }
     if (state_probability == 1.0) {
@@ -295,7 +304,7 @@ static inline __attribute__((always_inline)) int64_t NAME(mixture_slot, SET)(int
 
 static inline __attribute__((always_inline)) int64_t NAME(follow_mixture_of, SET)(
     int64_t slots, int64_t n, int64_t trials, int64_t before, int64_t capacity, int initial, const double *A, const double *G,
-    const double *leaks, double state_probability, const double *weight, const double *mean, const double *lower,
+    const double *leaks, const double *rounding, double state_probability, const double *weight, const double *mean, const double *lower,
     const double *diagonal, const uint8_t *gamma, const double *z, double *x_hat, double *P, uint8_t *action,
     double *weight_after, double *mean_after, double *lower_after, double *diagonal_after, MIXTURES *m) {
   LANES none = {0.0};
@@ -312,7 +321,7 @@ static inline __attribute__((always_inline)) int64_t NAME(follow_mixture_of, SET
     }
     for (int64_t p = before; p < capacity; p++) m->weight[p] = none;
     for (int64_t s = 0; s < slots; s++)
-      places = NAME(mixture_slot, SET)(n, trials, w, capacity, places, A, initial && s == 0 ? NULL : leaks + 4 * s * n * n,
+      places = NAME(mixture_slot, SET)(n, trials, w, capacity, places, A, initial && s == 0 ? NULL : leaks + 4 * s * n * n, rounding + s * n,
                                        state_probability, gamma + s * trials + r, z + s * n * trials + r,
                                        x_hat + s * n * trials + r, P + s * n * n * trials + r, action + s * trials + r, m);
     for (int64_t p = 0; p < capacity; p++) {
@@ -331,7 +340,7 @@ static inline __attribute__((always_inline)) int64_t NAME(follow_mixture_of, SET
 }
 
 static int64_t NAME(follow_mixture, SET)(int64_t slots, int64_t n, int64_t trials, int64_t before, int64_t capacity, int initial,
-                                         const double *A, const double *G, const double *leaks, double state_probability,
+                                         const double *A, const double *G, const double *leaks, const double *rounding, double state_probability,
                                          const double *weight, const double *mean, const double *lower,
                                          const double *diagonal, const uint8_t *gamma, const double *z, double *x_hat, double *P,
                                          uint8_t *action, double *weight_after, double *mean_after, double *lower_after,
@@ -339,11 +348,11 @@ static int64_t NAME(follow_mixture, SET)(int64_t slots, int64_t n, int64_t trial
   MIXTURES m = {0};
   int64_t places = NAME(new_mixture, SET)(n, capacity, &m);
   if (places == 0 && n == 2)
-    places = NAME(follow_mixture_of, SET)(slots, 2, trials, before, capacity, initial, A, G, leaks, state_probability, weight,
+    places = NAME(follow_mixture_of, SET)(slots, 2, trials, before, capacity, initial, A, G, leaks, rounding, state_probability, weight,
                                           mean, lower, diagonal, gamma, z, x_hat, P, action, weight_after, mean_after,
                                           lower_after, diagonal_after, &m);
   else if (places == 0)
-    places = NAME(follow_mixture_of, SET)(slots, n, trials, before, capacity, initial, A, G, leaks, state_probability, weight,
+    places = NAME(follow_mixture_of, SET)(slots, n, trials, before, capacity, initial, A, G, leaks, rounding, state_probability, weight,
                                           mean, lower, diagonal, gamma, z, x_hat, P, action, weight_after, mean_after,
                                           lower_after, diagonal_after, &m);
   free(m.weight);

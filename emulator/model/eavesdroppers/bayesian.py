@@ -36,26 +36,29 @@ class Bayesian(PacketReader):
         ("innovation", "noise"),
         "weighs states against innovations, and there are none: it is the same as naive here",
     )
-    inverts_noise = True
+    reads_leaks = tests_range = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
         self._capacity = capacity
-        self._leaks, self._noise = Leaks(knowledge.process, knowledge.noise_law), cholesky(knowledge.process.Q)
+        self._leaks = Leaks(knowledge.process, knowledge.noise_law)
+        self._stairs = self._leaks.stairs
+        """The coordinates of `Belief.memory`."""
 
     def prior(self, first: int = 0) -> Belief:
         """One component, without any reception."""
         belief = super().prior(first)
         n, trials = belief.x_hat.shape
-        spread = Factors.alike(Factor.of_triangular(cholesky(belief.P[:, :, 0]).tolist()), (1, trials))
+        factor = cholesky(self._stairs.inward_covariance(belief.P[:, :, :1])[:, :, 0])
+        spread = Factors.alike(Factor.of_triangular(factor.tolist()), (1, trials))
         return belief._replace(memory=Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *spread))
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """One component with covariance 0."""
         belief, (n, trials) = super().knowing(k, x, belief), x.shape
         nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
-        return belief._replace(memory=Mixture(np.ones((1, trials)), x[:, None, :], *nothing))
+        return belief._replace(memory=Mixture(np.ones((1, trials)), self._stairs.inward(x)[:, None, :], *nothing))
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Predict every component, weight it by the packet and add the packet's own; returns their common mean and covariance."""
@@ -63,13 +66,15 @@ class Bayesian(PacketReader):
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """The same in many slots at once."""
-        mixture, parts = belief.memory, []
+        mixture, parts, stairs = belief.memory, [], self._stairs
+        z = stairs.inward(z)
         for some in equal_slots(self._mu_d, slots):
             rows = slice(some.start - slots.start, some.stop - slots.start)
             x_hat, P, action, *parted = kernels.follow_mixture(
-                self.process.A,
-                self._noise,
+                stairs.process.A,
+                stairs.process.noise_factor,
                 self._leaks.block(some),
+                self._leaks.rounding(some),
                 mixture,
                 gamma[rows],
                 z[rows],
@@ -78,6 +83,6 @@ class Bayesian(PacketReader):
                 some.start == 0,
             )
             mixture = Mixture(*parted)
-            parts.append(Beliefs(x_hat, P, action))
+            parts.append(Beliefs(stairs.outward(x_hat), stairs.outward_covariance(P), action))
         found = Beliefs.joined(parts)
         return found, found.last._replace(memory=mixture)

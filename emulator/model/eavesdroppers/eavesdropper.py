@@ -54,6 +54,10 @@ class Eavesdropper(Receiver):
     """The only scheme, or schemes, that `evedrop compare` sets it against, and what it would be against any other; None: all."""
     inverts_noise: ClassVar[bool] = False
     """Whether it uses the inverse of Q, so that Q must not be singular."""
+    reads_leaks: ClassVar[bool] = False
+    """Whether it uses what innovations leak, so that A and Q must not both be singular."""
+    tests_range: ClassVar[bool] = False
+    """Whether it tests packets against the range of a singular Q, so that nothing may move the state out of this range."""
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge.process, batch.trials)

@@ -24,7 +24,7 @@ class Genie(PacketReader):
     """
 
     only_against = ("innovation", "uses what innovations leak, and there are none")
-    inverts_noise = True
+    reads_leaks = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
@@ -51,11 +51,16 @@ class Genie(PacketReader):
         state, innovation = gamma & ~nu, gamma & nu
         x_hat, P = belief.x_hat, belief.P
         if k:
-            leak, carried, predicted = self._leaks.at(k), self.process.carry(P), self.process.predict(x_hat)
-            x_hat = select(innovation, lambda: predicted + leak.innovation(leak.white(heard.z)), lambda: predicted)
+            leak, stairs = self._leaks.at(k), self._leaks.stairs
+            carried, predicted = self.process.carry(P), self.process.predict(x_hat)
+            x_hat = select(
+                innovation,
+                lambda: predicted + stairs.outward(leak.innovation(leak.white(stairs.inward(heard.z)))),
+                lambda: predicted,
+            )
             P = select(
                 innovation,
-                lambda: carried + leak.remaining[:, :, None],
+                lambda: carried + stairs.outward_covariance(leak.remaining[:, :, None]),
                 lambda: self.process.diffuse(carried),
             )
         return Belief(

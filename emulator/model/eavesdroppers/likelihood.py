@@ -12,13 +12,14 @@ import numpy as np
 
 from evedrop.kernels.elementary import cholesky, log
 from evedrop.kernels.factored import Factor, Factors, covariance, grown, squared_length
-from evedrop.kernels.leak import Leak
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.schedule import in_slot
 from evedrop.model.theory.leak import Leaks
 from evedrop.streams import Batch
+
+_NO_VARIANCE = 1e-300  # a packet in the range of a singular covariance is the state, unless it is 20 deviations away
 
 
 class Likelihood(PacketReader):
@@ -31,18 +32,19 @@ class Likelihood(PacketReader):
         ("innovation", "noise"),
         "tests states against innovations, and there are none: it is the same as naive here",
     )
-    inverts_noise = True
+    reads_leaks = tests_range = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
         self._leaks = Leaks(knowledge.process, knowledge.noise_law)
-        self._noise = Factor.of_triangular(cholesky(knowledge.process.Q).tolist())
+        self._stairs = self._leaks.stairs
+        self._noise = Factor.of_triangular(self._stairs.process.noise_factor.tolist())
 
     def prior(self, first: int = 0) -> Belief:
         """The belief without any reception."""
         belief = super().prior(first)
-        factor = Factor.of_triangular(cholesky(belief.P[:, :, 0]).tolist())
+        factor = Factor.of_triangular(cholesky(self._stairs.inward_covariance(belief.P[:, :, :1])[:, :, 0]).tolist())
         return belief._replace(memory=Factors.alike(factor, (self.trials,)))
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
@@ -53,26 +55,31 @@ class Likelihood(PacketReader):
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for a state, (A x̂ + QΣ⁻¹z, A P Aᵀ + Q − QΣ⁻¹Q) for an innovation."""
-        gamma, z = heard.gamma, np.where(heard.gamma, heard.z, 0.0)
-        x_hat, P, state = belief.x_hat, Factors(*belief.memory), gamma
+        gamma, received, stairs = heard.gamma, np.where(heard.gamma, heard.z, 0.0), self._stairs
+        z, x_hat = stairs.inward(received), stairs.inward(belief.x_hat)
+        P, state = Factors(*belief.memory), gamma
         if k:
             leak = self._leaks.at(k)
-            white, x_hat = leak.white(z), self.process.predict(x_hat)
-            predicted, informed = grown(self.process.A, P, self._noise, leak.remaining_factor)
-            state = gamma & self._is_state(in_slot(self._mu_d, k), z - x_hat, predicted, white, leak)
+            white, x_hat = leak.white(z), stairs.process.predict(x_hat)
+            predicted, informed = grown(stairs.process.A, P, self._noise, leak.remaining_factor)
+            state = gamma & self._is_state(k, z - x_hat, predicted, white)
             innovation = gamma & ~state
             x_hat = np.where(innovation, x_hat + leak.innovation(white), x_hat)
             P = Factors(*(np.where(innovation, *pair) for pair in zip(informed, predicted, strict=True)))
         P = Factors(np.where(state, 0.0, P.lower), np.where(state, 0.0, P.diagonal))
         action = np.where(gamma, np.where(state, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0))
-        return Belief(np.where(state, z, x_hat), covariance(P), action, P)
+        found = np.where(state, received, stairs.outward(x_hat))
+        return Belief(found, stairs.outward_covariance(covariance(P)), action, P)
 
-    def _is_state(self, mu_d: float, d: Floats, P: Factors, white: Floats, leak: Leak) -> Flags:
+    def _is_state(self, k: int, d: Floats, P: Factors, white: Floats) -> Flags:
+        mu_d = in_slot(self._mu_d, k)
         if mu_d in {0.0, 1.0}:
             return np.full(self.trials, mu_d == 1.0)
         odds = mu_d / (1.0 - mu_d)
-        evidence = -squared_length(P, list(d))
-        for row, D, state in zip(white, P.diagonal, leak.state_diagonal, strict=True):
+        seen = P.rounded(self._leaks.rounding(range(k, k + 1))[0])
+        evidence = -squared_length(seen, list(d))
+        diagonal = np.where(P.diagonal > 0.0, seen.diagonal, _NO_VARIANCE)
+        for row, D, state in zip(white, diagonal, self._leaks.at(k).state_diagonal, strict=True):
             evidence = evidence + row * row - log(D / state)
         flags: Flags = evidence > -2.0 * float(log(np.array([odds]))[0])
         return flags

@@ -26,7 +26,7 @@ class PowerTest(PacketReader):
     """
 
     only_against = ("noise", "compares the power of noise packets with that of states, and there are no noise packets")
-    inverts_noise = True
+    reads_leaks = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
@@ -47,7 +47,7 @@ class PowerTest(PacketReader):
         mu_d = in_slot(self._mu_d, k)
         if mu_d in {0.0, 1.0}:
             return np.full(self.trials, mu_d == 1.0)
-        states, noise = self._states.at(k), self._noise.at(k)
+        states, noise, z = self._states.at(k), self._noise.at(k), self._states.stairs.inward(z)
         evidence = np.full(self.trials, 2.0 * float(log(np.array([mu_d / (1.0 - mu_d)]))[0]))
         for a, b in zip(noise.white(z), states.white(z), strict=True):
             evidence = evidence + (a * a - b * b)

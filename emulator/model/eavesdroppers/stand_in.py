@@ -41,7 +41,7 @@ class StandIns:
         said = {
             "parameters": parameters,
             "pools_links": facts.get("pools_links") is True,
-            "inverts_noise": facts.get("inverts_noise") is True,
+            **{name: facts.get(name) is True for name in ("inverts_noise", "reads_leaks", "tests_range")},
             "only_against": _only_against(facts.get("only_against")),
             "_own_outcomes": facts.get("own_outcomes") is not False,
             "_ask": staticmethod(lambda do, *given: self.answers.ask(name, do, self._registry, *given)),

@@ -40,7 +40,7 @@ def leaked_bits(process: Process, slots: int) -> Floats:
 def _leaked_bits(dynamics: bytes, factor: bytes, initial: bytes, n: int, slots: int) -> Floats:
     """The same from A, Q^½ and Σ0 as bytes; not to be changed. A study asks for the same ones for each block of its trials."""
     A, noise, start = (np.frombuffer(one).reshape(n, n) for one in (dynamics, factor, initial))
-    largest = _AS_GOOD_AS_INFINITE * float(np.abs(noise).max())
+    largest = _AS_GOOD_AS_INFINITE * float(np.abs(noise).max()) or math.inf
     length = block_length(A)
     found = np.zeros(max(slots, 1))
     carried, k = product(A, cholesky(start)), 1

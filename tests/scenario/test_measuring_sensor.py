@@ -1,0 +1,183 @@
+"""A sensor that measures and filters, and a singular Q: what `evedrop check` refuses, and why."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.errors import ScenarioError
+from evedrop.loading import checked, shipped
+from evedrop.model.local_filter import settled
+from evedrop.scenario import Scenario
+
+MEASURED = {**tomllib.loads(shipped()["measured"].read_text(encoding="utf-8")), "expect": []}
+FORCE = [[2.5e-5, 5e-4], [5e-4, 1e-2]]
+
+
+def changed(**changes: Any) -> dict[str, Any]:
+    """The shipped scenario with entries by dotted key, `__` for the dot; None leaves an entry out."""
+    tables: dict[str, Any] = copy.deepcopy(MEASURED)
+    for key, value in changes.items():
+        *path, last = key.split("__")
+        table = tables
+        for name in path:
+            table = table.setdefault(name, {})
+        table[last] = value
+        if value is None:
+            del table[last]
+    return tables
+
+
+def mistakes(**changes: Any) -> list[str]:
+    """The mistakes that are found."""
+    try:
+        checked(changed(**changes), "file")
+    except ScenarioError as error:
+        return [line.strip() for line in str(error).splitlines()[1:]]
+    return []
+
+
+def scenario_of(**changes: Any) -> Scenario:
+    """The scenario, checked."""
+    return checked(changed(**changes), "file")
+
+
+EVE = {"eve": {"strategy": "bayesian", "link": {"quality": 0.9}}}
+NO_PLANT: dict[str, Any] = {
+    "plant": None,
+    "process__Q": FORCE,
+    "process__singular_noise": True,
+    "process__initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+}
+STEERED = {
+    "plant__inputs": ["force"],
+    "plant__input_matrix": [[0.005], [0.1]],
+    "controller": {"strategy": "lqr", "state_weights": [1.0, 1.0], "input_weights": [1.0]},
+}
+
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "the velocity alone": (
+        {"plant__output_matrix": [[0.0, 1.0]]},
+        "plant.output_matrix: shows only 1 of 2 directions of a mode that does not decay, an eigenvalue of A of modulus 1, so "
+        "the filter's error grows without bound",
+    ),
+    "nothing": (
+        {"plant__output_matrix": [[0.0, 0.0]]},
+        "plant.output_matrix: is 0, so that the measurements show nothing",
+    ),
+    "an unstable mode unseen": (
+        {
+            "process__A": [[1.2, 0.0], [0.0, 0.5]],
+            "plant__output_matrix": [[0.0, 1.0]],
+            "plant__noise": [[1.0, 0.0], [0.0, 1.0]],
+        },
+        "plant.output_matrix: shows only 1 of 2 directions of a mode that does not decay, an eigenvalue of A of modulus 1.2",
+    ),
+    "no noise": (
+        {"plant__noise": [[0.0, 0.0], [0.0, 0.0]]},
+        "plant.noise: moves only 1 of 2 directions of a mode that neither decays nor grows, an eigenvalue of A of modulus 1",
+    ),
+    "a stable plant at rest": (
+        {"process__A": [[0.9, 0.1], [0.0, 0.9]], "plant__noise": [[0.0, 0.0], [0.0, 0.0]]},
+        "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state that",
+    ),
+    "not settled": (
+        {"process__initial_covariance": [[1.0, 0.0], [0.0, 1.0]], "eavesdroppers": EVE},
+        "eavesdroppers.eve.strategy: is bayesian, which tests packets against the range of Q, but the sensor's filter moves its "
+        "estimate out of it until it has settled",
+    ),
+    "inputs": (
+        {**STEERED, "eavesdroppers": {"eve": {**EVE["eve"], "strategy": "likelihood"}}},
+        "eavesdroppers.eve.strategy: is likelihood, which tests packets against the range of Q, but plant.input_matrix moves the "
+        "state out of it",
+    ),
+    "another noise": (
+        {
+            "plant": {"noise": [[1e-4, 0.0], [0.0, 1e-4]]},
+            "process__Q": FORCE,
+            "process__singular_noise": True,
+            "process__initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+        },
+        "eavesdroppers.bayesian.strategy: is bayesian, which tests packets against the range of Q, but plant.noise moves the "
+        "state out of it",
+    ),
+    "singular twice": (
+        {**NO_PLANT, "process__A": [[1.0, 1.0], [1.0, 1.0]], "slots": 20},
+        "eavesdroppers.genie.strategy: is genie, which uses what innovations leak, but A is singular to double precision, and so "
+        "is Q",
+    ),
+    "a track of its own": (
+        {**NO_PLANT, "eavesdroppers": {"eve": {"strategy": "tracker", "link": {"quality": 0.9}}}},
+        "eavesdroppers.eve.strategy: is tracker, which uses the inverse of Q, and Q may be singular; expected another strategy",
+    ),
+    "too near": (
+        {
+            **NO_PLANT,
+            "process__A": [[2.0, 0.0], [1.5, 0.5]],
+            "process__Q": [[1.0, 1.0], [1.0, 1.0]],
+            "slots": 44,
+        },
+        "slots: is 44; from slot ",
+    ),
+    "too long": (
+        {**NO_PLANT, "process__A": [[2.0, 0.0], [1.5, 0.5]], "process__Q": [[1.0, 1.0], [1.0, 1.0]], "slots": 100},
+        "slots: is 100; this process (spectral radius 2) can be followed up to slot ",
+    ),
+    "no filter": (
+        {"plant": None},
+        'process.initial_covariance: is "filter", but the sensor has none; expected a matrix, or output_matrix and '
+        "measurement_noise in [plant]",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_mistake_says_where_what_and_what_instead(case: str) -> None:
+    """Path, what was found, what was expected."""
+    changes, sentence = WRONG[case]
+    assert any(line.startswith(sentence) for line in mistakes(**changes)), mistakes(**changes)
+
+
+RIGHT: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "a genie before the filter has settled": {
+        "process__initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+        "eavesdroppers": {"eve": {**EVE["eve"], "strategy": "genie"}},
+    },
+    "a stable mode that is not seen": {
+        "process__A": [[1.0, 0.0], [0.0, 0.5]],
+        "plant__noise": [[1e-2, 0.0], [0.0, 1e-2]],
+    },
+    "without a plant": NO_PLANT,
+    "no inverse of Q": {**NO_PLANT, "process__Q": [[1e-3, 0.0], [0.0, 1e-3]], "eavesdroppers": EVE},
+    "a plant of its own": {**NO_PLANT, "plant": {"noise": FORCE}},
+    "many slots": {"slots": 3000},
+}
+
+
+@pytest.mark.parametrize("case", RIGHT)
+def test_what_is_right_is_not_refused(case: str) -> None:
+    """Neither the eavesdroppers nor the filter."""
+    assert mistakes(**RIGHT[case]) == []
+
+
+def test_a_filter_may_begin_settled() -> None:
+    """`initial_covariance = "filter"` is the covariance before a measurement in the steady state, and Q its innovations' own."""
+    scenario = scenario_of()
+    process, plant = scenario.process.process, scenario.driven
+    assert plant is not None
+    assert plant.output_matrix is not None
+    assert plant.measurement_noise is not None
+    A, C, P = process.A, plant.output_matrix, process.initial_covariance
+    gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + plant.measurement_noise)
+    after = P - gain @ C @ P
+    assert np.allclose(A @ after @ A.T + plant.noise, P, rtol=1e-12)
+    assert np.allclose(gain @ (C @ P @ C.T + plant.measurement_noise) @ gain.T, process.Q, rtol=1e-12)
+    assert process.singular_noise
+    begun = settled(process, plant)
+    assert np.allclose(begun.gain, gain, rtol=1e-12)
+    assert np.array_equal(begun.innovation, process.Q)
